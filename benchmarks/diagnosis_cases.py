@@ -29,7 +29,7 @@ from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
 from yid_ocp.diagnosis.blind import finer_chain_parameters
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.transfer_check import failed_transfer_checks
+from yid_ocp.diagnosis.verdict import failed_transfer_checks
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import VirtualExperiment

@@ -135,6 +135,21 @@ def to_plain_data(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def attributes_to_json(value: Any, names: str) -> dict[str, Any]:
+    """Some attributes of an object as JSON data, by name or as `key=name`, separated by blanks."""
+    pairs = [name.partition("=") for name in names.split()]
+    return {key: finite_json(getattr(value, name or key)) for key, _, name in pairs}
+
+
+def finite_json(value: Any) -> Any:
+    """Numbers, texts and their containers as JSON data; what is not finite becomes None."""
+    if isinstance(value, Mapping):
+        return {key: finite_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite_json(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:
     """Dataclass instance restored from the data that `to_plain_data` returned."""
     return kind(**{name: _value(hint, data[name]) for name, hint in _hints(typing.cast(typing.Hashable, kind)).items()})

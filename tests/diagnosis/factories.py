@@ -5,13 +5,13 @@ Every constructor of the package that the tests of rules need is called here, so
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from made_series import seeing
 
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
@@ -26,14 +26,20 @@ from yid_ocp.diagnosis.screening import (
 )
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.transfer_check import TransferCheck
+from yid_ocp.diagnosis.verdict import TransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
-from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult, _ResidualWindow
+from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult
 from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
 from yid_ocp.inference.smoother_model import UnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.problem.evaluation import Evaluation, ResidualRows
+from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
+
+
+def cases(names: str, rows: Mapping[str, object]):
+    """Parametrise a test by a table of named rows."""
+    return pytest.mark.parametrize(names, list(rows.values()), ids=list(rows))
+
 
 # -- effects ----------------------------------------------------------------------------------------------------------
 
@@ -83,10 +89,6 @@ def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTe
     return NullTestResult(chi2, degrees, p, dict(channels), dict.fromkeys(channels, 0.5), tuple(windows))
 
 
-def window(begin, end, flagged=True, z=5.0) -> _ResidualWindow:
-    return _ResidualWindow("run", "points.tip", begin, end, z, flagged)
-
-
 # -- screening --------------------------------------------------------------------------------------------------------
 
 
@@ -99,7 +101,7 @@ def signature(of: EffectBase, columns, noise=None, **shapes: float) -> EffectSig
 
 
 def point(residual, *signatures: EffectSignature) -> CandidateLinearization:
-    return CandidateLinearization(np.asarray(residual, float), signatures, {})
+    return CandidateLinearization(np.asarray(residual, float), signatures)
 
 
 def score(
@@ -153,7 +155,7 @@ def fit(
     std = dict.fromkeys(values, 0.01) | dict(std or {})
     lost = loss(1.0, 1.0) if lost is None else lost
     held = {name: std[name] for entry in effects for name in entry.amplitude_names} | dict(held or {})
-    return RefitModel(tuple(effects), problem, values, std, held, cost, evaluation([1.0]), lost, "made up")
+    return RefitModel(values, std, held, "made up", tuple(effects), problem, cost, evaluation([1.0]), lost)
 
 
 def closed(value=0.9, low=0.8, high=0.95) -> GapClosure:
@@ -256,116 +258,6 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "unknown_reason": "none" if verdict == "unknown" else "",
     }
     return DiagnosisResult(**(usual | changed))
-
-
-# -- problems ---------------------------------------------------------------------------------------------------------
-
-
-class Candidates:
-    """A candidate problem whose residual is linear in the unknowns: y + sum of column(name, theta) times value.
-
-    Parameters
-    ----------
-    effects : sequence of EffectBase
-    y : ndarray, shape (nr,)
-    column : callable
-        From a parameter's name and all values to its column.
-    nominal : mapping of str to float
-        What the nominal problem frees, and where it starts.
-    """
-
-    def __init__(self, effects, y, column, nominal):
-        self.candidate_effects, self.y, self.column = tuple(effects), y, column
-        self.nominal_parameters = tuple(nominal)
-        self.theta = dict(nominal) | {n: v for of in effects for n, v in of.neutral_values.items()}
-        self.unknown_names: tuple[str, ...] = self.nominal_parameters
-        self.weak, self.fault, self.asked, self.parts, self.warmed = 0, "", [], [], []
-
-    @property
-    def problem(self):
-        return self
-
-    def told(self, parts, problem):
-        """Keep what `residual_channels` was asked of."""
-        self.asked, self.parts = list(problem.unknown_names), parts
-        return parts
-
-    def _like(self, **changed):
-        other = copy.copy(self)
-        vars(other).update(changed)
-        return other
-
-    def with_free_subset(self, names):
-        return self._like(unknown_names=tuple(names))
-
-    def relinearized_with_effects(self, effects, at):
-        """Nothing drives its motion wrong; `places` are what was asked for."""
-        self.places = [*getattr(self, "places", []), ([effect.label for effect in effects], dict(at))]
-        return self
-
-    def with_parameter_values(self, values):
-        return self._like(theta=self.theta | dict(values))
-
-    def vector(self, values):
-        return np.array([values.get(name, self.theta[name]) for name in self.unknown_names])
-
-    def residual_at(self, values):
-        """The data's residual at some values of the unknowns."""
-        return self.y + sum(value * self.column(name, self.theta) for name, value in values.items())
-
-    data_noise_unit = 1.0
-
-    @property
-    def residual_rows(self):
-        """The data come first, weak priors after them."""
-        data = slice(0, len(self.y))
-        return SimpleNamespace(data=data, without_weak_priors=data)
-
-    def evaluate(self, x, derivatives=True, equilibrium_guesses=None):
-        self.warmed.append(equilibrium_guesses)
-        values = dict(zip(self.unknown_names, x, strict=True))
-        if self.fault == "fails":
-            return evaluation([], ok=False, message="it snaps")
-        residual = np.append(self.residual_at(values), np.full(self.weak, 7.0))
-        jacobian = np.stack([self.column(name, self.theta) for name in self.unknown_names], axis=1)
-        jacobian = np.vstack([jacobian, np.full((self.weak, len(x)), 5.0)])
-        return evaluation(residual, None if self.fault else jacobian)
-
-
-class Recorded:
-    """One output of one held-out recording, measured at some times (a node every tenth of a second)."""
-
-    def __init__(self, times, value, weight):
-        value, weight = np.asarray(value, float), np.asarray(weight, float)
-        node = np.rint(np.asarray(times) / 0.1).astype(int)
-        self._samples = measurements(["a"], node, np.zeros(len(node)), value, weight)
-
-    def predicted_outputs(self, prediction, slopes=None):
-        """A problem that predicts the recording so, or says why not; `asked` holds the values that it was asked at.
-
-        It has one parameter; `slopes` is what moving it adds to the prediction, nothing where absent.
-        """
-        asked = []
-        grid = SimpleNamespace(steps=len(self._samples.node), time_step=0.1)
-        held = SimpleNamespace(name="other", grid=grid, measurements=(self._samples,))
-        result = prediction
-        if not isinstance(prediction, str):
-            result = SimpleNamespace(predicted_outputs=(np.asarray(prediction, float),))
-            by = np.zeros((len(prediction), 1, 1)) if slopes is None else np.asarray(slopes, float)[:, None, None]
-        return SimpleNamespace(
-            asked=asked,
-            held_out=(held,),
-            vector=lambda values: asked.append(dict(values)),
-            shared_parameters=("k",),
-            predict_held_out=lambda x, derivatives=False: [(held, result)],
-            held_out_residual=lambda i, episode, found: self._samples.residual_block(found.predicted_outputs[0], by),
-            with_episodes=lambda episodes, held_out: SimpleNamespace(
-                episodes=episodes,
-                held_out=held_out,
-                options=SimpleNamespace(path_cutoff=math.inf),
-                residual_rows=ResidualRows.from_episodes(episodes, 0, 0),
-            ),
-        )
 
 
 # -- recordings on nodes ----------------------------------------------------------------------------------------------

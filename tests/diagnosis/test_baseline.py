@@ -11,9 +11,10 @@ from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.diagnosis.baseline import compare_with_baseline, with_baseline_prior
+from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.synthetic_recording import recording_from_prediction
@@ -120,7 +121,7 @@ def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, time
         AllCandidatesProblem(with_baseline_prior(problem.with_parameter_values(TRUTH), known), (), False), (), {}
     )
     assert both is not None
-    [shift] = compare_with_baseline(both, known, 0.01).parameter_shifts
+    [shift] = BaselineData.from_runs([known], ()).compare_with_baseline(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:
         assert shift.z_score is None  # the recording says nothing beside such a baseline

@@ -1,13 +1,17 @@
-"""One recording that begins in motion, split in blocks: both halves have one start."""
+"""What is held out: blocks of one recording, and recordings as far as the nominal model can follow them."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
 import pytest
 
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.diagnosis import diagnose
+from yid_ocp.diagnosis import diagnose, hypotheses
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, TruncatedRecording
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
@@ -54,3 +58,83 @@ def test_the_held_out_blocks_begin_where_the_others_do(swinging):
     assert finding.verdict == "effect"
     assert finding.accepted_effects[0].label == "joint_coulomb@elbow"
     assert finding.gap_locations[0].location == "elbow"
+
+
+# -- recordings that are not followed to their end --------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Held:
+    """A recording of so many steps of 10 ms, of which a model follows `until`."""
+
+    name: str
+    steps: int
+    until: int = 10**9
+
+    @property
+    def grid(self):
+        return SimpleNamespace(steps=self.steps, time_step=0.01)
+
+
+@dataclass(frozen=True)
+class Problem:
+    episodes: tuple = ("own",)
+    held_out: tuple = ()
+    tried: list = field(default_factory=list)
+    has_process_noise: bool = False
+
+    def vector(self, values):
+        return values
+
+    def with_episodes(self, episodes, held_out):
+        return replace(self, episodes=tuple(episodes), held_out=tuple(held_out))
+
+    def predict_held_out(self, x):
+        self.tried.extend((h.name, h.steps) for h in self.held_out)
+        return [(h, "it snaps" if h.steps > h.until else object()) for h in self.held_out]
+
+
+@pytest.fixture
+def followed(monkeypatch):
+    monkeypatch.setattr(hypotheses, "truncate_episode", lambda episode, steps: replace(episode, steps=steps))
+    monkeypatch.setattr(hypotheses, "_in_blocks", lambda problem: replace(problem, held_out=("blocks",)))
+    return lambda *held, margin=0.9: AllCandidatesProblem(Problem(held_out=held), (), False).truncate_held_out(
+        {}, margin
+    )
+
+
+def test_what_is_followed_to_its_end_stays(followed):
+    composed, cuts = followed(Held("a", 500))
+    assert cuts == ()
+    assert composed.problem.held_out == (Held("a", 500),)
+
+
+def test_what_is_lost_on_the_way_is_compared_until_shortly_before(followed):
+    whole, lost = Held("a", 500), Held("b", 500, until=300)
+    composed, [cut] = followed(whole, lost)
+    kept, cut_short = composed.problem.held_out
+    assert kept == whole
+    # found to a sixty-fourth of 500 steps, less a tenth
+    assert 0.9 * (300 - 8) - 1 <= cut_short.steps <= 0.9 * 300
+    assert cut == TruncatedRecording("b", cut_short.steps * 0.01, 5.0)
+    assert not composed.is_split_in_blocks
+
+
+def test_too_short_a_beginning_is_left_out(followed):
+    composed, cuts = followed(Held("a", 500), Held("b", 500, until=100))
+    assert composed.problem.held_out == (Held("a", 500),)
+    assert cuts == (TruncatedRecording("b", 0.0, 5.0),)
+    barely, _ = followed(Held("a", 500), Held("b", 500, until=130))
+    assert len(barely.problem.held_out) == 2
+
+
+def test_where_nothing_is_left_the_other_recordings_are_split(followed):
+    composed, cuts = followed(Held("b", 500, until=50))
+    assert composed.is_split_in_blocks
+    assert composed.problem.held_out == ("blocks",)
+    assert cuts == (TruncatedRecording("b", 0.0, 5.0),)
+
+
+def test_with_no_margin_nothing_of_it_is_kept(followed):
+    composed, [cut] = followed(Held("a", 500), Held("b", 500, until=450), margin=0.0)
+    assert (composed.problem.held_out, cut.kept_duration) == ((Held("a", 500),), 0.0)

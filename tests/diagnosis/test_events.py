@@ -11,7 +11,6 @@ import pytest
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import diagnose
-from yid_ocp.diagnosis.diagnosis_messages import _event_sentences
 from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, Overspeed, find_events, problem_without_events
 from yid_ocp.diagnosis.pulse_detection import DetectedPulse
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -249,23 +248,8 @@ def test_after_a_fall_nothing_counts(twin, pushed):
     t = sample_times(cleaned.episodes[0], samples)
     assert not samples.is_used[t > 3.0].any()
     assert samples.is_used[(t > 1.0) & (t < 2.0)].all()
-    assert "From 3 s on nothing is judged in run_0" in _event_sentences(
-        EventSet((), (Overspeed("run_0", "elbow", 3.0),))
-    )
 
 
 def fitted(problem: EstimationProblem):
     x = solve(problem, GaussNewton()).x
     return problem, x, problem.evaluate(x)
-
-
-def test_what_happened_is_told_one_by_one_up_to_eight():
-    event = DisturbanceEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
-    odd = DisturbanceEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
-    assert _event_sentences(EventSet()) == ""
-    assert _event_sentences(EventSet((event,))) == (
-        "One event stands beside all this, short and in one place: elbow is pushed by up to +0.5 N m from 1.00 to 1.50 "
-        "s in run (+0.12 ± 0.01 N m s)."
-    )
-    assert "points.w_T1.x is off by +0.05 m at 2.005 s in run" in _event_sentences(EventSet((event, odd)))
-    assert _event_sentences(EventSet((event,) * 10)).endswith("; and 2 more.")

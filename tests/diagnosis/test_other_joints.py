@@ -97,9 +97,7 @@ def diagnosed(side: str, extra):
     return diagnose(problem, CANDIDATES, thresholds=Thresholds(max_effects=2))
 
 
-@pytest.mark.parametrize(
-    ("side", "joint", "stiffness"), [("left", "left_s1", 20.0), ("left", "left_e1", 8.0), ("right", "right_w1", 3.0)]
-)
+@pytest.mark.parametrize(("side", "joint", "stiffness"), [("left", "left_e1", 8.0), ("right", "right_w1", 3.0)])
 def test_a_spring_is_found_at_any_joint_of_either_arm(side, joint, stiffness):
     finding = diagnosed(side, spring(joint, stiffness, -0.4))
     assert finding.verdict in ("effect", "confusable")

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from factories import amplitude, effect, shape, signature
+from factories import amplitude, cases, effect, shape, signature
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.blind import (
@@ -21,14 +21,11 @@ from yid_ocp.diagnosis.blind import (
     plan_cases,
 )
 from yid_ocp.diagnosis.blind import ensemble as module
-from yid_ocp.diagnosis.blind.ensemble import _OUT_OF_LIBRARY_SIZES, MAX_CASE_DRAWS, DetectableEffect
+from yid_ocp.diagnosis.blind.ensemble import _OUT_OF_LIBRARY_SIZES, MAX_CASE_DRAWS
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera
 from yid_ocp.virtual.injected import OUT_OF_LIBRARY_EFFECTS, InjectedEffect
 from yid_ocp.virtual.joint_motion import MultisineOptions
-from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 KV = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
 
@@ -97,20 +94,13 @@ def drawn(monkeypatch):
             signature(of, columns.get(of.kind, [[50.0]]), **({"s": 0.25} if of.shape_names else {}))
             for of in candidates
         ]
-        ensemble._detectable = tuple(DetectableEffect.from_signature(entry) for entry in signatures)
+        ensemble._detectable = tuple((s.effect, s.shape_values, s.projected_sensitivity) for s in signatures)
         return ensemble
 
     monkeypatch.setattr(module, "run_injected_experiment", experiment)
     monkeypatch.setattr(module, "random_multisine", multisine)
     build.made = made
     return build
-
-
-def test_an_ensemble_starts_where_the_recording_does(drawn):
-    ensemble = drawn()
-    assert ensemble.initial_configuration == {"s0": 0.1, "s1": 0.2, "w0": 0.3}
-    assert not ensemble.conditions.has_camera
-    assert drawn(pose=np.eye(4)).conditions.has_camera
 
 
 @pytest.mark.parametrize(
@@ -132,17 +122,17 @@ def test_what_cannot_be_simulated_is_refused(drawn, given, words):
 def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
     ensemble = drawn()
     composed = AllCandidatesProblem("by the sensors", (DAMPER,), False)
-    monkeypatch.setattr(ensemble, "nominal_problem", lambda recordings: SimpleNamespace(system="system"))
+    monkeypatch.setattr(ensemble, "_nominal_problem", lambda recordings: SimpleNamespace(system="system"))
     monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))
     weighted = SimpleNamespace(problem="by all noise", values={"k": 1.0})
     monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
     monkeypatch.setattr(module, "linearize_candidates", lambda of, base, values, grid: of)
-    assert ensemble.linearize_clean_recordings() == replace(composed, problem="by all noise")
+    assert ensemble._linearize_clean_recordings() == replace(composed, problem="by all noise")
 
 
 def test_the_truth_is_spread_about_the_start(drawn):
     ensemble = drawn()
-    found = [ensemble.draw_true_parameters(np.random.default_rng(seed)) for seed in range(200)]
+    found = [ensemble._draw_true_parameters(np.random.default_rng(seed)) for seed in range(200)]
     for name, start in (("T1.bend", 20.0), ("T2.bend", 5.0)):
         ratio = np.log([truth[name] / start for truth in found]) / math.log(1.5)
         assert -1 <= ratio.min() < -0.9
@@ -167,32 +157,6 @@ def test_a_recording_says_nothing_of_what_is_in_it(drawn):
     )
     rng = np.random.default_rng(1)
     assert [motion["seed"], made["seed"]] == [int(rng.integers(2**31)) for _ in range(2)]
-
-
-def test_several_arms_on_one_object_go_less_far(drawn):
-    together = system()
-    together.grasps = ("left", "right")
-    drawn(of=together).simulate_recording({}, (), np.random.default_rng(1), "case")
-    assert drawn.made[0]["motion"]["excitation"] == MultisineOptions(gripper_travel=0.08)
-
-
-def test_a_camera_looks_on_where_one_did(drawn):
-    drawn(pose=np.eye(4)).simulate_recording({}, (), np.random.default_rng(1), "case")
-    assert drawn.made[0]["camera"] == PointCamera()
-
-
-def test_a_finer_chain_moves_as_the_nominal_one_and_has_its_own_values(drawn, monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        module, "finer_chain_parameters", lambda nominal, finer, truth: {"finer": (nominal, finer, dict(truth))}
-    )
-    ensemble = drawn(finer=lambda times: asked.append(times) or "fine")
-    ensemble.simulate_recording({"T1.bend": 7.0}, (), np.random.default_rng(1), "case", links=2)
-    nominal = ensemble.problem.system
-    assert asked == [2]
-    assert drawn.made[0]["system"] == "fine"
-    assert drawn.made[0]["truth"] == {"finer": (nominal, "fine", {"T1.bend": 7.0})}
-    assert drawn.made[0]["motion"]["of"] is nominal
 
 
 def of_category(ensemble, category, multiple=None):
@@ -233,12 +197,6 @@ def test_a_left_out_effect_is_the_one_at_work(drawn, monkeypatch):
     assert case.excluded_kinds == (told.injected[0].kind,)
 
 
-def test_with_one_other_kind_none_is_left_out(drawn, monkeypatch):
-    ensemble = drawn(candidates=(DAMPER, FRICTION))
-    assert of_category(ensemble, "single")[0].excluded_kinds == ()
-    assert of_category(ensemble, "null")[0].excluded_kinds[0] in ("kelvin_voigt", "joint_coulomb")
-
-
 def test_a_pair_is_two_effects_of_the_largest_size(drawn, monkeypatch):
     for seed in range(6):
         ensemble = drawn(seed=seed)
@@ -247,12 +205,6 @@ def test_a_pair_is_two_effects_of_the_largest_size(drawn, monkeypatch):
         assert len(set(labels)) == len(labels) <= 2
     same, size = drawn(candidates=(DAMPER,))._injected(PlannedCase(0, "one", "pair", 10.0), np.random.default_rng(1))
     assert (len(same), size) == (1, pytest.approx(0.2 * 100 / 3.858))
-
-
-def test_outside_effects_are_in_no_library(drawn, monkeypatch):
-    _, told = of_category(drawn(), "outside")
-    assert told.injected[0].kind in OUT_OF_LIBRARY_EFFECTS
-    assert told.multiple is None
 
 
 def test_a_motion_that_cannot_be_simulated_is_drawn_anew(drawn, monkeypatch):
@@ -281,29 +233,13 @@ def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     assert drawn(conditions=RecordingConditions(purpose="calibration")).draw_case(wanted[3])[1].truth != first[3].truth
 
 
-def test_an_experiment_has_its_recordings_noise_and_step(drawn):
-    noise, simulation = ArmSensorNoise(effort_std=0.1), SimulationOptions(time_step=5e-5)
-    case, _ = of_category(drawn(conditions=RecordingConditions(3, noise, simulation)), "null")
-    assert [entry.name for entry in case.estimation_recordings] == [f"case_007_estimate_{i}" for i in range(3)]
-    assert len(drawn.made) == 4
-    assert all((made["arm_noise"], made["simulation"]) == (noise, simulation) for made in drawn.made)
-    assert len({made["seed"] for made in drawn.made}) == 4
-
-
 def test_what_is_detectable_survives_as_plain_data(drawn):
-    ensemble = drawn()
-    told = json.loads(json.dumps([entry.to_dict() for entry in ensemble.detectable_effects]))
+    told = json.loads(json.dumps(drawn().detectable_effects_to_json()))
     other = drawn(seed=5)
     other.load_detectable_effects(told)
-    for one, two in zip(ensemble.detectable_effects, other.detectable_effects, strict=True):
-        assert (one.effect, one.shape_values) == (two.effect, two.shape_values)
-        np.testing.assert_array_equal(one.sensitivity_factor, two.sensitivity_factor)
-    # the size is that of the whole signature
-    tall = signature(TILT, np.random.default_rng(0).normal(size=(50, 2)))
-    way = np.array([0.3, -0.7])
-    assert np.linalg.norm(DetectableEffect.from_signature(tall).sensitivity_factor @ way) == pytest.approx(
-        np.linalg.norm(tall.projected_sensitivity @ way)
-    )
+    assert other.detectable_effects_to_json() == told
+    assert told[0] == {"effect": "kelvin_voigt@T1", "shape": {}, "columns": [[100.0]]}
+    assert other._inside(np.random.default_rng(1), 3.0) == drawn()._inside(np.random.default_rng(1), 3.0)
 
 
 # -- the plan ---------------------------------------------------------------------------------------------------------
@@ -340,12 +276,6 @@ def test_every_sort_and_size_is_planned_and_spread_over_the_experiments():
     assert plan != plan_cases(300, 3, WEIGHTS, WHOLE, "calibration")
 
 
-def test_few_cases_have_few_experiments():
-    assert counted(plan_cases(20, 1, WEIGHTS, WHOLE), lambda e: e.experiment).keys() == {"a", "b"}
-    assert counted(plan_cases(2, 1, WEIGHTS, WHOLE), lambda e: e.experiment) == {"a": 2}
-    assert len(plan_cases(1, 1, WEIGHTS)) == 1
-
-
 def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
     found = counted(plan_cases(100, 1, {"bare": 1.0}), lambda e: e.category)
     assert found == {"null": 20, "single": 54, "pair": 10, "outside": 10, "left_out": 6}
@@ -360,13 +290,18 @@ def test_no_case_is_no_ensemble():
 
 
 def detectable(of, columns, **shapes):
-    return DetectableEffect.from_signature(signature(of, columns, **shapes))
+    made = signature(of, columns, **shapes)
+    return made.effect, made.shape_values, made.projected_sensitivity
 
 
-@pytest.mark.parametrize(
-    ("of", "column", "wanted", "largest"),
-    [(DAMPER, 100.0, 3.0, 0.2), (DAMPER, 100.0, 10.0, 0.2), (FRICTION, 0.5, 1.0, 3.0), (TILT, 50.0, 3.0, 0.5)],
-    ids=["within the range", "beyond the range", "hardly detectable", "two amplitudes"],
+@cases(
+    "of, column, wanted, largest",
+    {
+        "within the range": (DAMPER, 100.0, 3.0, 0.2),
+        "beyond the range": (DAMPER, 100.0, 10.0, 0.2),
+        "hardly detectable": (FRICTION, 0.5, 1.0, 3.0),
+        "two amplitudes": (TILT, 50.0, 3.0, 0.5),
+    },
 )
 def test_an_effect_is_so_many_times_its_detectable_size_or_as_large_as_expected(drawn, of, column, wanted, largest):
     ensemble = drawn()
@@ -392,25 +327,6 @@ def test_sizes_count_from_the_neutral_value_in_the_range_and_keep_the_shape(draw
     assert less == pytest.approx(2.0 / 3.858)
 
 
-def test_amplitudes_go_either_way(drawn):
-    ensemble = drawn()
-    made = [ensemble._sized(detectable(TILT, [[30.0, 40.0]]), np.random.default_rng(s), 1.0)[0] for s in range(20)]
-    signs = {(found.values["rx"] > 0, found.values["ry"] > 0) for found in made}
-    assert len(signs) == 4
-
-
-def test_an_effect_that_nothing_sees_has_no_size(drawn):
-    assert drawn()._sized(detectable(DAMPER, [[0.0]]), np.random.default_rng(1), 1.0) is None
-
-
-def test_what_is_detectable_is_a_threshold(monkeypatch, drawn):
-    monkeypatch.setattr(module, "make_candidate_effects", lambda *_: [DAMPER])
-    ensemble = CaseGenerator(problem(), 1, limits=Thresholds(detection_z=2.0))
-    found, multiple = ensemble._sized(detectable(DAMPER, [[100.0]]), np.random.default_rng(1), 3.0)
-    assert found.values["tau"] == pytest.approx(0.06)
-    assert multiple == pytest.approx(3.0)
-
-
 def test_the_wanted_size_or_the_nearest_that_any_effect_reaches(drawn):
     found, size = drawn()._inside(np.random.default_rng(1), 3.0)
     assert (found.kind in ("kelvin_voigt", "gravity_tilt", "standard_linear_solid"), size) == (True, 3.0)
@@ -425,37 +341,10 @@ def test_the_wanted_size_or_the_nearest_that_any_effect_reaches(drawn):
     assert near.values == short.values
 
 
-def test_the_largest_of_several_tries_is_kept(drawn):
-    other = effect("rotor_inertia@elbow", amplitude(expected=(0.0, 1.0)))
-    ensemble = drawn(candidates=(FRICTION, other))
-    found, size = ensemble._inside(np.random.default_rng(1), 30.0)
-    assert (found.kind, size) == ("rotor_inertia", pytest.approx(50.0 / 3.858))
-
-
 def test_only_kinds_that_the_other_engine_can_do_are_injected(drawn):
     ensemble = drawn(candidates=(DAMPER, ABROAD))
     kinds = {ensemble._inside(np.random.default_rng(seed), 1.0)[0].kind for seed in range(12)}
     assert kinds == {"kelvin_voigt"}
-
-
-def test_kinds_come_before_places(drawn):
-    """A kind with many places is drawn no more often than one with few."""
-    many = [effect(f"joint_coulomb@j{i}", amplitude(expected=(0.0, 99.0))) for i in range(9)]
-    ensemble = drawn(candidates=(DAMPER, *many))
-    kinds = [ensemble._inside(np.random.default_rng(seed), 1.0)[0].kind for seed in range(60)]
-    assert 18 <= kinds.count("kelvin_voigt") <= 42
-    places = {ensemble._inside(np.random.default_rng(seed), 1.0)[0].location for seed in range(60)}
-    assert len(places) > 6
-
-
-def test_single_effects_have_the_size_that_is_planned(drawn):
-    ensemble = drawn(candidates=(SOLID, TILT))
-    for size in (1.0, 3.0, 10.0):
-        wanted = PlannedCase(0, "one", "single", size)
-        sizes = [ensemble._injected(wanted, np.random.default_rng(seed))[1] for seed in range(30)]
-        assert size in sizes
-        assert max(sizes) <= size * (1 + 1e-12)
-    assert ensemble._injected(PlannedCase(0, "one", "left_out", 10.0), np.random.default_rng(1))[1] >= 3.0
 
 
 # -- outside the library ----------------------------------------------------------------------------------------------
@@ -480,26 +369,8 @@ def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
     assert all(0.05 <= f.values["size"] <= 0.15 for f in by_kind["gusts"])
 
 
-def test_a_drive_saturates_at_a_part_of_the_torque_that_was_recorded(drawn):
-    ensemble = drawn()
-    joints = ensemble.problem.episodes[0].recording.joints
-    effort = np.zeros(joints.position.shape)
-    effort[:, joints.names.index("s0")] = [5.0, -20.0]
-    recording = replace(ensemble.problem.episodes[0].recording, joints=replace(joints, effort=effort))
-    ensemble.problem.episodes = (SimpleNamespace(recording=recording),)
-    found = [ensemble._outside(np.random.default_rng(seed)) for seed in range(300)]
-    sizes = [f.values["size"] for f in found if f.kind == "saturating_drive"]
-    assert 15.0 <= min(sizes) < max(sizes) <= 18.0
-
-
 def test_every_effect_outside_the_library_has_a_size():
     assert set(_OUT_OF_LIBRARY_SIZES) == set(OUT_OF_LIBRARY_EFFECTS)
-
-
-def test_without_an_object_only_joints_misbehave(drawn):
-    ensemble = drawn(of=system(segments=(), driven=("s0",)))
-    found = {ensemble._outside(np.random.default_rng(seed)).label for seed in range(60)}
-    assert found == {f"{kind}@s0" for kind, (place, *_) in _OUT_OF_LIBRARY_SIZES.items() if place == "joint"}
 
 
 # -- finer chains -----------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,13 @@ import pytest
 
 from yid_ocp.diagnosis import Thresholds
 from yid_ocp.diagnosis.blind import CaseLabel, calibrate_thresholds, permissive_thresholds, score_case
-from yid_ocp.diagnosis.blind.score import _CALIBRATION_RULES, _conformal_quantile
+from yid_ocp.diagnosis.blind.score import (
+    _CALIBRATION_FORMAT,
+    _CALIBRATION_RULES,
+    _conformal_quantile,
+    _recommended_settings,
+)
+from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.virtual.injected import InjectedEffect
 
 DAMPER = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05})
@@ -114,15 +121,6 @@ def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
     assert few["settings"]["candidate_significance_level"] == 1e-4, "no less sure than odds that convince"
 
 
-def test_effects_that_were_named_right_set_what_must_be_explained() -> None:
-    named = [case("single", "effect", DAMPER, multiple=3.0, statistics={"explained": x}) for x in (0.8, 0.97, 1.0)]
-    missed = [case("single", "unknown", DAMPER, multiple=3.0, statistics={"explained": 0.1})]
-    strange = [case("outside", "effect", DAMPER, statistics={"explained": x}) for x in (0.3, 0.99)]
-    found = calibrated(*named, *missed, *strange)["explained"]
-    assert (found["quantile"], found["cases"], found["side"]) == (0.8, 3, "least")
-    assert found["strange_beyond"]["count"] == 1
-
-
 def test_a_tie_is_what_the_truth_may_be_behind_beyond_chance() -> None:
     def behind(error: float, **lost: float | None) -> Any:
         said = {
@@ -194,3 +192,44 @@ def test_every_rule_is_of_a_threshold() -> None:
     wide = permissive_thresholds(Thresholds(n_refit_per_round=3))
     assert wide.n_refit_per_round == 3
     assert wide.significance_level > 1 > Thresholds().significance_level
+
+
+# -- the calibration that is kept beside the code --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def kept():
+    return json.loads((files("yid_ocp") / "data" / "defaults" / "thresholds.json").read_text("utf-8"))
+
+
+def test_defaults_are_those_that_it_advises(kept):
+    assert kept["format"] == _CALIBRATION_FORMAT
+    assert kept["settings"] == {
+        rule.setting: getattr(DEFAULT_THRESHOLDS, rule.setting) for rule in _CALIBRATION_RULES.values()
+    }
+
+
+def test_its_advice_follows_from_its_samples_by_the_rules_as_they_are(kept):
+    rules = kept["rules"]
+    assert set(rules) == set(_CALIBRATION_RULES)
+    for name, rule in _CALIBRATION_RULES.items():
+        own = rules[name]
+        assert (own["setting"], own["of"], own["side"], own["limit"]) == (
+            rule.setting,
+            rule.of,
+            rule.side,
+            rule.limit,
+        )
+        sample = [float("-inf") if value is None else value for value in own["sample"]]
+        value, coverage = _conformal_quantile(sample, rule.side, kept["asked"])
+        assert own["coverage"] == coverage
+        assert own["quantile"] == (None if value == float("-inf") else value)
+    assert _recommended_settings(rules) == kept["settings"]
+
+
+def test_it_says_what_it_was_made_of(kept):
+    assert kept["cases"] >= 100
+    assert f"--seed {kept['seed']}" in kept["command"]
+    assert "--calibration" in kept["command"]
+    assert "/" not in kept["command"], "of no machine in particular"
+    assert kept["code"] == kept["code_of_cases"]

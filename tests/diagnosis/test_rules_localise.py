@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, place, smoothed, trace
+from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, cases, place, smoothed, trace
 
 from yid_ocp.diagnosis.localise import (
     attribute_gap_to_effects,
@@ -25,28 +25,30 @@ def described(places):
     return [(p.location, pytest.approx(p.gap_share), p.is_observable) for p in places]
 
 
-@pytest.mark.parametrize(
-    ("weight", "detectable", "expected"),
-    [
-        ({FORCE: 3.0, OTHER_FORCE: 1.0}, {}, [("T1", 0.75, True), ("T2", 0.25, True)]),
-        ({FORCE: 1.0, OTHER_FORCE: 3.0}, {}, [("T2", 0.75, True), ("T1", 0.25, True)]),
-        ({FORCE: 1.0, TWIST: 2.0, OTHER_FORCE: 1.0}, {}, [("T1", 0.75, True), ("T2", 0.25, True)]),
-        ({FORCE: 0.0, OTHER_FORCE: 0.0}, {FORCE: 0.5, OTHER_FORCE: 2.0}, [("T1", 0.0, True), ("T2", 0.0, False)]),
-        ({FORCE: 0.0, OTHER_FORCE: 0.0}, {FORCE: 1.0, OTHER_FORCE: 0.9}, [("T2", 0.0, True), ("T1", 0.0, False)]),
-        ({FORCE: 0.0, TWIST: 0.0}, {FORCE: 0.5, TWIST: 2.0}, [("T1", 0.0, True)]),
-        ({FORCE: 0.0, TWIST: 0.0}, {FORCE: 2.0, TWIST: 0.5}, [("T1", 0.0, True)]),
-        ({FORCE: 2.0}, {FORCE: 5.0}, [("T1", 1.0, True)]),
-    ],
-    ids=[
-        "by evidence",
-        "largest first",
-        "unknowns of one place add",
-        "none, but one would have shown",
-        "as large as its reference does not show",
-        "one of two would have shown",
-        "the other would have shown",
-        "what is there shows",
-    ],
+@cases(
+    "weight, detectable, expected",
+    {
+        "by evidence": ({FORCE: 3.0, OTHER_FORCE: 1.0}, {}, [("T1", 0.75, True), ("T2", 0.25, True)]),
+        "largest first": ({FORCE: 1.0, OTHER_FORCE: 3.0}, {}, [("T2", 0.75, True), ("T1", 0.25, True)]),
+        "unknowns of one place add": (
+            {FORCE: 1.0, TWIST: 2.0, OTHER_FORCE: 1.0},
+            {},
+            [("T1", 0.75, True), ("T2", 0.25, True)],
+        ),
+        "none, but one would have shown": (
+            {FORCE: 0.0, OTHER_FORCE: 0.0},
+            {FORCE: 0.5, OTHER_FORCE: 2.0},
+            [("T1", 0.0, True), ("T2", 0.0, False)],
+        ),
+        "as large as its reference does not show": (
+            {FORCE: 0.0, OTHER_FORCE: 0.0},
+            {FORCE: 1.0, OTHER_FORCE: 0.9},
+            [("T2", 0.0, True), ("T1", 0.0, False)],
+        ),
+        "one of two would have shown": ({FORCE: 0.0, TWIST: 0.0}, {FORCE: 0.5, TWIST: 2.0}, [("T1", 0.0, True)]),
+        "the other would have shown": ({FORCE: 0.0, TWIST: 0.0}, {FORCE: 2.0, TWIST: 0.5}, [("T1", 0.0, True)]),
+        "what is there shows": ({FORCE: 2.0}, {FORCE: 5.0}, [("T1", 1.0, True)]),
+    },
 )
 def test_places_share_the_gap_by_their_evidence(weight, detectable, expected):
     found = smoothed(weight, detectable=dict.fromkeys(weight, 0.5) | detectable)
@@ -66,25 +68,16 @@ def test_a_gap_is_there_when_an_unknown_is_surely_not_zero():
     assert strict == {"T1": (), "T2": ((0.5, 1.5),)}
 
 
-def test_any_unknown_of_a_place_tells_when_but_only_groups_at_work():
-    traces = [trace([FORCE, FORCE, TWIST], [[9.0, 0.0, 0.0], [0.0, 9.0, 0.0], [0.0, 0.0, 9.0]], np.ones((3, 3)))]
-    found = smoothed({FORCE: 3.0, TWIST: 1.0}, variance={FORCE: 1.0, TWIST: 0.0}, traces=traces)
-    assert localise_gap(found)[0].time_windows == ((0.0, 1.0),)
-    tiny = [trace([FORCE], [[1e-13], [1e-11]], np.zeros((2, 1)))]
-    assert localise_gap(smoothed({FORCE: 1.0}, traces=tiny))[0].time_windows == ((0.5, 1.0),)
-
-
-@pytest.mark.parametrize(
-    ("spans", "expected"),
-    [
-        ([], ()),
-        ([(1.0, 2.0), (0.0, 1.0)], ((0.0, 2.0),)),
-        ([(0.0, 3.0), (1.0, 2.0)], ((0.0, 3.0),)),
-        ([(0.0, 1.0), (1.0 + 1e-10, 2.0)], ((0.0, 2.0),)),
-        ([(0.0, 1.0), (1.0 + 1e-6, 2.0)], ((0.0, 1.0), (1.0 + 1e-6, 2.0))),
-        ([(2.0, 3.0), (0.0, 0.5), (2.5, 4.0)], ((0.0, 0.5), (2.0, 4.0))),
-    ],
-    ids=["none", "touching", "one in the other", "touching up to rounding", "apart", "overlapping"],
+@cases(
+    "spans, expected",
+    {
+        "none": ([], ()),
+        "touching": ([(1.0, 2.0), (0.0, 1.0)], ((0.0, 2.0),)),
+        "one in the other": ([(0.0, 3.0), (1.0, 2.0)], ((0.0, 3.0),)),
+        "touching up to rounding": ([(0.0, 1.0), (1.0 + 1e-10, 2.0)], ((0.0, 2.0),)),
+        "apart": ([(0.0, 1.0), (1.0 + 1e-06, 2.0)], ((0.0, 1.0), (1.0 + 1e-06, 2.0))),
+        "overlapping": ([(2.0, 3.0), (0.0, 0.5), (2.5, 4.0)], ((0.0, 0.5), (2.0, 4.0))),
+    },
 )
 def test_touching_spans_are_one_stretch(spans, expected):
     assert merge_intervals(spans) == expected
@@ -93,33 +86,38 @@ def test_touching_spans_are_one_stretch(spans, expected):
 # -- what effects close -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("before", "closed", "rest", "expected"),
-    [
-        ([place("T1")], {"T1": 1.0}, [], [("T1", 1.0, True)]),
-        ([place("T1")], {"T1": 0.6}, [place("T2")], [("T1", 0.6, True), ("T2", 0.4, False)]),
-        ([place("T1")], {"T1": 0.6}, [place("T1", 0.5), place("T2", 0.5)], [("T1", 0.8, True), ("T2", 0.2, False)]),
-        (
+@cases(
+    "before, closed, rest, expected",
+    {
+        "all": ([place("T1")], {"T1": 1.0}, [], [("T1", 1.0, True)]),
+        "what is left goes to its places": (
+            [place("T1")],
+            {"T1": 0.6},
+            [place("T2")],
+            [("T1", 0.6, True), ("T2", 0.4, False)],
+        ),
+        "what is left of an effect's own place": (
+            [place("T1")],
+            {"T1": 0.6},
+            [place("T1", 0.5), place("T2", 0.5)],
+            [("T1", 0.8, True), ("T2", 0.2, False)],
+        ),
+        "more than all": (
             [place("T1")],
             {"T1": 0.9, "T2": 0.3},
             [place("T3")],
             [("T1", 0.75, True), ("T2", 0.25, True), ("T3", 0, False)],
         ),
-        ([place("T1")], {"T1": 0.5}, [], [("T1", 1.0, True)]),
-        ([place("T1", observable=False)], {"T2": 0.5}, [], [("T2", 1.0, True), ("T1", 0.0, False)]),
-        ([place("T1")], {"T2": 0.5}, [], [("T2", 1.0, True), ("T1", 0.0, True)]),
-        ([place("T1")], {"world": 0.0}, [], [("T1", 0.0, True), ("world", 0.0, True)]),
-    ],
-    ids=[
-        "all",
-        "what is left goes to its places",
-        "what is left of an effect's own place",
-        "more than all",
-        "nothing is left to be seen",
-        "a place that could not be seen",
-        "a place without an effect",
-        "nothing closed",
-    ],
+        "nothing is left to be seen": ([place("T1")], {"T1": 0.5}, [], [("T1", 1.0, True)]),
+        "a place that could not be seen": (
+            [place("T1", observable=False)],
+            {"T2": 0.5},
+            [],
+            [("T2", 1.0, True), ("T1", 0.0, False)],
+        ),
+        "a place without an effect": ([place("T1")], {"T2": 0.5}, [], [("T2", 1.0, True), ("T1", 0.0, True)]),
+        "nothing closed": ([place("T1")], {"world": 0.0}, [], [("T1", 0.0, True), ("world", 0.0, True)]),
+    },
 )
 def test_places_of_effects_share_by_what_they_close(before, closed, rest, expected):
     found = described(attribute_gap_to_effects(before, closed, rest, ()))
@@ -143,30 +141,22 @@ def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals
 # -- the map ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("variance", "std", "mean", "mapped", "expected"),
-    [
-        (4.0, 1.0, 3.0, 0.5, 3.0),
-        (4.0, 1.0, 3.0, 0.75, math.nan),
-        (4.0, 1.0, 3.0, 0.74, 3.0),
-        (4.0, 0.5, 3.0, 0.5, 6.0),
-        (0.0, 1.0, 3.0, 0.5, math.nan),
-        (1.0, 0.9, 3.0, 0.5, math.nan),
-    ],
-    ids=["informed", "at the limit", "just above", "surer", "not at work", "not informed"],
+@cases(
+    "variance, std, mean, mapped, expected",
+    {
+        "informed": (4.0, 1.0, 3.0, 0.5, 3.0),
+        "at the limit": (4.0, 1.0, 3.0, 0.75, math.nan),
+        "just above": (4.0, 1.0, 3.0, 0.74, 3.0),
+        "surer": (4.0, 0.5, 3.0, 0.5, 6.0),
+        "not at work": (0.0, 1.0, 3.0, 0.5, math.nan),
+        "not informed": (1.0, 0.9, 3.0, 0.5, math.nan),
+    },
 )
 def test_only_informed_values_are_on_the_map(variance, std, mean, mapped, expected):
     found = smoothed({FORCE: 1.0}, variance={FORCE: variance}, traces=[trace([FORCE], [[mean]], [[std]])])
     edges, names, values = informed_z_scores(found, informed_fraction=mapped)
     np.testing.assert_allclose(values, [[expected]])
     assert (list(edges), names) == ([0.0, 0.5], ("T1.0",))
-
-
-def test_the_map_is_of_one_recording():
-    traces = [trace([FORCE], [[1.0]], [[0.1]]), trace([FORCE], [[2.0]], [[0.1]])]
-    found = smoothed({FORCE: 1.0}, variance={FORCE: 1.0}, traces=traces)
-    assert informed_z_scores(found)[2] == pytest.approx(10.0)
-    assert informed_z_scores(found, 1)[2] == pytest.approx(20.0)
 
 
 def test_units_of_unknowns_are_those_of_their_joints_or_metres():

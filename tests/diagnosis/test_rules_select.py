@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from factories import alike, amplitude, effect, fit, loss, point, score, shape
+from factories import alike, amplitude, cases, effect, fit, loss, point, score, shape
 from heard import Heard
 
 from yid_ocp.diagnosis import select
@@ -37,16 +37,15 @@ LIMITS = Thresholds()
 # -- losses -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("squares", "counts", "mean", "gap"),
-    [
-        ([30.0, 10.0], [10.0, 10.0], 2.0, 1.0),
-        ([30.0, 10.0], [10.0, 30.0], 1.0, 0.0),
-        ([5.0], [10.0], 0.5, 0.0),
-        ([math.inf, 1.0], [10.0, 10.0], math.inf, math.inf),
-        ([0.0], [0.0], 0.0, 0.0),
-    ],
-    ids=["above", "weighed by samples", "below noise", "failed", "empty"],
+@cases(
+    "squares, counts, mean, gap",
+    {
+        "above": ([30.0, 10.0], [10.0, 10.0], 2.0, 1.0),
+        "weighed by samples": ([30.0, 10.0], [10.0, 30.0], 1.0, 0.0),
+        "below noise": ([5.0], [10.0], 0.5, 0.0),
+        "failed": ([math.inf, 1.0], [10.0, 10.0], math.inf, math.inf),
+        "empty": ([0.0], [0.0], 0.0, 0.0),
+    },
 )
 def test_a_loss_is_a_mean_over_samples_and_a_gap_what_exceeds_one(squares, counts, mean, gap):
     found = HeldOutLoss(np.array(squares), np.array(counts), {})
@@ -54,16 +53,15 @@ def test_a_loss_is_a_mean_over_samples_and_a_gap_what_exceeds_one(squares, count
     assert found.excess_chi2 == pytest.approx(gap)
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "closed"),
-    [
-        ((3.0, 3.0), (1.0, 1.0), 1.0),
-        ((3.0, 3.0), (2.0, 2.0), 0.5),
-        ((3.0, 3.0), (3.0, 3.0), 0.0),
-        ((2.0, 2.0), (3.0, 3.0), -1.0),
-        ((3.0, 3.0), (0.5, 0.5), 1.0),
-    ],
-    ids=["all", "half", "nothing", "worse", "below noise"],
+@cases(
+    "before, after, closed",
+    {
+        "all": ((3.0, 3.0), (1.0, 1.0), 1.0),
+        "half": ((3.0, 3.0), (2.0, 2.0), 0.5),
+        "nothing": ((3.0, 3.0), (3.0, 3.0), 0.0),
+        "worse": ((2.0, 2.0), (3.0, 3.0), -1.0),
+        "below noise": ((3.0, 3.0), (0.5, 0.5), 1.0),
+    },
 )
 def test_a_closure_is_the_part_of_the_gap_that_went(before, after, closed):
     found = gap_closure(loss(*before), loss(*after))
@@ -120,13 +118,6 @@ def test_resampled_blocks_without_a_gap_do_not_count():
     assert found.ci_high <= 1.0
 
 
-def test_blocks_are_drawn_by_the_seed(noisy):
-    found, again = gap_closure(*noisy, seed=1), gap_closure(*noisy)
-    np.testing.assert_allclose([found.ci_low, found.ci_high], bootstrapped(*noisy, seed=1), rtol=1e-12)
-    assert found.fraction == again.fraction
-    assert found != again
-
-
 # -- gain -------------------------------------------------------------------------------------------------------------
 
 
@@ -137,20 +128,6 @@ def test_a_gain_has_the_standard_error_of_its_sum_over_blocks():
     # blocks differ by 10, 20 and 0: their standard deviation is 10, and there are three of them
     assert error == pytest.approx(math.sqrt(3) * 10.0 / 30.0)
     assert held_out_improvement(after, before) == pytest.approx((-gained, error))
-
-
-@pytest.mark.parametrize(
-    ("before", "after", "expected"),
-    [
-        ((2.0,), (1.0,), (1.0, math.inf)),
-        ((2.0, 2.0), (1.0, 1.0), (1.0, 0.0)),
-        ((2.0, 2.0), (math.inf, 1.0), (-math.inf, 0.0)),
-        ((math.inf, 2.0), (1.0, 1.0), (math.inf, 0.0)),
-    ],
-    ids=["one block tells nothing", "even", "cannot be predicted", "could not be predicted"],
-)
-def test_a_gain_at_its_ends(before, after, expected):
-    assert held_out_improvement(loss(*before), loss(*after)) == pytest.approx(expected)
 
 
 # -- the choice -------------------------------------------------------------------------------------------------------
@@ -170,30 +147,20 @@ def labels(fits):
     return [entry.effects[-1].label for entry in fits]
 
 
-@pytest.mark.parametrize(
-    ("small", "large", "expected"),
-    [
-        # the large one is better by 0.02 with an error of 0.1
-        ((1.1, 1.3, 1.0, 1.2), (1.2, 1.0, 1.2, 1.12), ["small@x", "large@x"]),
-        # better by 0.1 in every block alike: sure, and more than a tie
-        ((1.2, 1.2, 1.2), (1.1, 1.1, 1.1), ["large@x"]),
-        # better by 0.005 in every block alike: sure, and within a hundredth
-        ((1.005, 1.005), (1.0, 1.0), ["small@x", "large@x"]),
-        ((1.0, 1.0), (1.2, 1.2), ["small@x"]),
-    ],
-    ids=["within its error", "sure", "tie", "simplest is best"],
+@cases(
+    "small, large, expected",
+    {
+        "within its error": ((1.1, 1.3, 1.0, 1.2), (1.2, 1.0, 1.2, 1.12), ["small@x", "large@x"]),
+        "sure": ((1.2, 1.2, 1.2), (1.1, 1.1, 1.1), ["large@x"]),
+        "tie": ((1.005, 1.005), (1.0, 1.0), ["small@x", "large@x"]),
+        "simplest is best": ((1.0, 1.0), (1.2, 1.2), ["small@x"]),
+    },
 )
 def test_the_simplest_within_reach_of_the_best_comes_first(small, large, expected):
     fits = [fit([LARGE], loss(*large)), fit([SMALL], loss(*small))]
     hundredth = Thresholds(chi2_equivalence=0.01)
     assert labels(_near_best_models(fits, hundredth)) == expected
     assert labels(_near_best_models(fits[::-1], hundredth)) == expected
-
-
-def test_a_tie_is_a_part_of_the_best_loss():
-    fits = [fit([LARGE], loss(50.0, 50.0)), fit([SMALL], loss(50.4, 50.4))]
-    assert labels(_near_best_models(fits, Thresholds(chi2_equivalence=0.01))) == ["small@x", "large@x"]
-    assert labels(_near_best_models(fits, Thresholds(chi2_equivalence=0.005))) == ["large@x"]
 
 
 @pytest.mark.parametrize(
@@ -229,46 +196,32 @@ def test_an_amplitude_far_out_of_its_range_comes_last():
     assert labels(_near_best_models(fits, Thresholds(prior_range_margin=2.0))) == ["small@x", "large@x"]
 
 
-@pytest.mark.parametrize(
-    ("odd", "plain", "expected"),
-    [
-        ((1.0, 1.0), (1.04, 1.04), ["small@x"]),
-        ((1.0, 1.0), (1.2, 1.2), ["wide@x"]),
-        ((10.0, 10.0), (10.4, 10.4), ["small@x"]),
-        ((1.0, 1.0), (0.9, 0.9), ["small@x"]),
-    ],
-    ids=["another comes near", "nothing comes near", "near as a part of it", "another is better"],
+@cases(
+    "odd, plain, expected",
+    {
+        "another comes near": ((1.0, 1.0), (1.04, 1.04), ["small@x"]),
+        "nothing comes near": ((1.0, 1.0), (1.2, 1.2), ["wide@x"]),
+        "near as a part of it": ((10.0, 10.0), (10.4, 10.4), ["small@x"]),
+        "another is better": ((1.0, 1.0), (0.9, 0.9), ["small@x"]),
+    },
 )
 def test_an_unlikely_shape_counts_only_where_no_other_comes_near(odd, plain, expected):
     fits = [there(WIDE, *odd, s=9.0), there(SMALL, *plain)]
     assert labels(_near_best_models(fits)) == expected
 
 
-@pytest.mark.parametrize(
-    ("unsure", "sure", "expected"),
-    [
-        ((1.0, 1.0), (1.04, 1.04), ["small@x"]),
-        ((1.0, 1.0), (1.2, 1.2), ["large@x"]),
-        ((10.0, 10.0), (10.4, 10.4), ["small@x"]),
-    ],
-    ids=["another comes near", "nothing comes near", "near as a part of it"],
+@cases(
+    "unsure, sure, expected",
+    {
+        "another comes near": ((1.0, 1.0), (1.04, 1.04), ["small@x"]),
+        "nothing comes near": ((1.0, 1.0), (1.2, 1.2), ["large@x"]),
+        "near as a part of it": ((10.0, 10.0), (10.4, 10.4), ["small@x"]),
+    },
 )
 def test_one_that_is_not_sure_to_be_there_counts_only_where_no_other_comes_near(unsure, sure, expected):
     fits = [there(LARGE, *unsure, a=0.019, b=0.0), there(SMALL, *sure)]
     assert labels(_near_best_models(fits)) == expected
     assert labels(_near_best_models([there(LARGE, *unsure, a=0.021, b=0.0), there(SMALL, *sure)])) == ["large@x"]
-
-
-def test_how_near_another_must_come_is_a_threshold():
-    fits = [there(WIDE, 1.0, 1.0, s=9.0), there(SMALL, 1.08, 1.08)]
-    assert labels(_near_best_models(fits)) == ["wide@x"]
-    assert labels(_near_best_models(fits, Thresholds(implausible_shape_margin=0.1))) == ["small@x"]
-
-
-def test_a_model_without_effects_is_the_simplest():
-    fits = [there(SMALL, 1.0, 1.0), fit((), loss(1.0, 1.0))]
-    assert [len(entry.effects) for entry in _near_best_models(fits)] == [0, 1]
-    assert [entry.effect_parameter_count for entry in (fit(), fit([SMALL]), fit([SMALL, LARGE]))] == [0, 1, 3]
 
 
 @pytest.mark.parametrize(
@@ -290,7 +243,7 @@ def test_a_model_without_effects_is_the_simplest():
 )
 def test_a_shape_may_leave_its_range_by_a_factor_or_a_width(expected, value, odd):
     of = effect("wide@x", amplitude(), shape("s", expected=expected, lower=-math.inf))
-    assert _is_shape_outside_prior(of, {"wide@x.a": 99.0, "wide@x.s": value}) is odd
+    assert _is_shape_outside_prior(of, fit([of], values={"wide@x.s": value}, std={"wide@x.s": 0.0}), LIMITS) is odd
 
 
 def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
@@ -298,9 +251,8 @@ def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
     of = effect("wide@x", amplitude(), shape("s", expected=(0.1, 1.0), lower=-math.inf))
 
     def odd(value, std, **limits):
-        return _is_shape_outside_prior(
-            of, {"wide@x.a": 99.0, "wide@x.s": value}, Thresholds(**limits), {"wide@x.s": std}
-        )
+        found = fit([of], values={"wide@x.s": value}, std={"wide@x.s": std})
+        return _is_shape_outside_prior(of, found, Thresholds(**limits))
 
     assert [odd(3.0, std) for std in (0.49, 0.51, math.inf)] == [True, False, False]
     assert [odd(0.02, std) for std in (0.014, 0.016)] == [True, False]
@@ -320,11 +272,13 @@ def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
 )
 def test_an_amplitude_may_leave_its_range_by_its_width(value, odd):
     of = effect("wide@x", amplitude("b"), amplitude(lower=-9.0, expected=(1.0, 3.0)), shape("s"))
-    assert _is_amplitude_outside_prior(of, {"wide@x.a": value, "wide@x.b": 0.0, "wide@x.s": 99.0}) is odd
-    assert _is_shape_outside_prior(of, {"wide@x.a": 99.0, "wide@x.b": 0.0, "wide@x.s": 0.5}) is False
+    assert _is_amplitude_outside_prior(of, fit([of], values={"wide@x.a": value, "wide@x.s": 99.0}), LIMITS) is odd
 
 
 # -- the shortlist ----------------------------------------------------------------------------------------------------
+
+
+FEW = score_jointly(point([0.0]))
 
 
 def ranked(**decreases):
@@ -335,9 +289,9 @@ def ranked(**decreases):
 
 
 def shortlisted(scores, table, places=(), **limits):
-    return [
-        of.kind for of, _ in _refit_shortlist(scores, table, Thresholds(**{"n_refit_lowest_p": 0} | limits), places)
-    ]
+    screened = ScreeningResult((), tuple(scores), table, FEW)
+    limits = Thresholds(**{"n_refit_lowest_p": 0} | limits)
+    return [of.kind for (of,), _ in _refit_shortlist(screened, limits, places=places)]
 
 
 def test_the_best_are_refitted_and_those_that_can_stand_in_for_them():
@@ -359,7 +313,7 @@ def test_as_many_more_as_are_refitted_and_each_once():
     matrix[0, 2:] = matrix[1, 2:] = 0.95
     table = alike([s.effect.label for s in scores], matrix)
     assert shortlisted(scores, table, n_refit_per_round=2) == ["a", "b", "c", "d"]
-    [(of, step), *_] = _refit_shortlist(scores, table, LIMITS)
+    [((of,), step), *_] = _refit_shortlist(ScreeningResult((), tuple(scores), table, FEW), LIMITS)
     assert (of.kind, step) == ("a", {"a@x.a": 9.0})
 
 
@@ -383,7 +337,6 @@ def test_the_best_of_every_place_of_the_gap_is_refitted():
 # -- one effect after the other ---------------------------------------------------------------------------------------
 
 A, B, C = (effect(f"{name}@x", amplitude()) for name in "abc")
-FEW = score_jointly(point([0.0]))
 
 
 class Rounds:
@@ -396,9 +349,8 @@ class Rounds:
         self.absent, self.before, self.ranked_pairs, self.left = absent, before, pairs, left
         kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
         self.scores = tuple(kinds)
-        monkeypatch.setattr(select, "refit_each_candidate", self.refit_all)
+        monkeypatch.setattr(select, "refit_each", self.refit_all)
         monkeypatch.setattr(select, "refit_with_effects", self.refit)
-        monkeypatch.setattr(select, "refit_each_pair", self.refit_pairs)
         monkeypatch.setattr(select, "screen_candidates", self.screen)
 
     def fit(self, effects):
@@ -417,15 +369,10 @@ class Rounds:
     def promised(self, among):
         kinds = {of.kind: of for of in (A, B, C) if of.label in among}
         return [
-            CandidatePair((kinds[one], kinds[other]), {}, 9.0, 7.0)
+            CandidatePair((kinds[one], kinds[other]), {}, 7.0)
             for one, other in self.ranked_pairs
             if {one, other} <= set(kinds)
         ]
-
-    def refit_pairs(self, search, tried, values):
-        if tried:
-            self.refits.append((["".join(of.kind for of in pair) for pair, _ in tried], values.get("k")))
-        return [self.fit(pair) for pair, _ in tried]
 
     def screen(self, problem, base, values, limits):
         if not values and self.before is None:
@@ -434,11 +381,15 @@ class Rounds:
         return self.screened(base)
 
     def refit_all(self, search, base, tried, values, where=""):
-        self.refits.append(([of.kind for of in base], [of.kind for of, _ in tried], values.get("k")))
-        known = [(*base, of) for of, _ in tried]
+        if where == "together":
+            if tried:
+                self.refits.append((["".join(of.kind for of in pair) for pair, _ in tried], values.get("k")))
+            return [self.fit(pair) for pair, _ in tried]
+        self.refits.append(([of.kind for of in base], [of.kind for (of,), _ in tried], values.get("k")))
+        known = [(*base, of) for (of,), _ in tried]
         if where:
-            lost = {of.kind: self.before.get(of.kind, (9.0, 9.2)) for of, _ in tried}
-            pairs = [(of, loss(*lost[of.kind])) for of, _ in tried]
+            lost = {of.kind: self.before.get(of.kind, (9.0, 9.2)) for (of,), _ in tried}
+            pairs = [(of, loss(*lost[of.kind])) for (of,), _ in tried]
             there = [(of, own, 0.5 if of.kind in self.before else 2.0) for of, own in pairs]
             return [fit([of], own, cost, {"k": 7.0, f"{of.label}.a": 1.0}) for of, own, cost in there]
         return [self.fit(effects) for effects in known if "".join(sorted(e.kind for e in effects)) in self.losses]
@@ -522,7 +473,7 @@ def test_no_more_effects_than_allowed_nor_than_are_significant(monkeypatch):
 
 def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING)
-    monkeypatch.setattr(select, "_is_amplitude_outside_prior", lambda of, values, limits: of.kind == "b")
+    monkeypatch.setattr(select, "_is_amplitude_outside_prior", lambda of, fitted, limits: of.kind == "b")
     assert rounds.compose()[1] == ["a", "c"]
     # the first one may be larger, and what is in the place of one that is may be too
     alone = Rounds(monkeypatch, {**GROWING, "b": (1.0, 1.1)})
@@ -550,19 +501,18 @@ def test_a_rest_that_shows_along_a_candidate_is_not_left(monkeypatch):
     assert Rounds(monkeypatch, less, left=1e-9).compose(min_log_bayes_factor=4.0)[1] == ["a", "b"]
 
 
-@pytest.mark.parametrize(
-    ("nominal", "best", "chosen"),
-    [
-        ((3.0, 3.0, 3.0), (2.91, 2.91, 2.91), []),
-        ((3.0, 3.0, 3.0), (2.89, 2.89, 2.89), ["a"]),
-        ((3.0, 5.0, 3.0), (4.4, 2.5, 2.9), []),
-        ((0.9, 1.0, 1.0), (0.88, 0.98, 0.98), []),
-        ((0.9, 0.9, 0.9), (0.88, 0.88, 0.88), []),
-        ((1.0, 1.0, 1.0), (0.9, 0.99, 1.0), ["a"]),
-        ((1.2, 1.0, 1.0), (1.0, 1.01, 1.02), ["a"]),
-        ((2.0, 2.0, 2.0), (2.0, 2.0, 2.0), []),
-    ],
-    ids=["too little", "enough", "not sure", "no gap", "below noise", "likelier", "likelier in one block", "nothing"],
+@cases(
+    "nominal, best, chosen",
+    {
+        "too little": ((3.0, 3.0, 3.0), (2.91, 2.91, 2.91), []),
+        "enough": ((3.0, 3.0, 3.0), (2.89, 2.89, 2.89), ["a"]),
+        "not sure": ((3.0, 5.0, 3.0), (4.4, 2.5, 2.9), []),
+        "no gap": ((0.9, 1.0, 1.0), (0.88, 0.98, 0.98), []),
+        "below noise": ((0.9, 0.9, 0.9), (0.88, 0.88, 0.88), []),
+        "likelier": ((1.0, 1.0, 1.0), (0.9, 0.99, 1.0), ["a"]),
+        "likelier in one block": ((1.2, 1.0, 1.0), (1.0, 1.01, 1.02), ["a"]),
+        "nothing": ((2.0, 2.0, 2.0), (2.0, 2.0, 2.0), []),
+    },
 )
 def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best, chosen):
     worse = tuple(9.0 for _ in nominal)
@@ -571,36 +521,21 @@ def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best,
     assert (found, first[0]) == (chosen, "a")
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "sure"),
-    [
-        ((1.05, 1.0), (0.9, 1.0), True),
-        ((1.05, 1.0), (0.96, 1.0), False),
-        ((1.19, 1.0), (1.0, 1.0), True),
-        ((1.2, 1.0), (1.0, 1.0), False),
-        ((1.6, 1.3), (1.2, 1.0), False),
-        ((1.6, 1.3), (math.inf, 1.0), False),
-    ],
-    ids=[
-        "a fall by 15",
-        "a fall by 9",
-        "a fall by 19",
-        "chi2 tells enough of it",
-        "what is left is no noise",
-        "failed",
-    ],
+@cases(
+    "before, after, sure",
+    {
+        "a fall by 15": ((1.05, 1.0), (0.9, 1.0), True),
+        "a fall by 9": ((1.05, 1.0), (0.96, 1.0), False),
+        "a fall by 19": ((1.19, 1.0), (1.0, 1.0), True),
+        "chi2 tells enough of it": ((1.2, 1.0), (1.0, 1.0), False),
+        "what is left is no noise": ((1.6, 1.3), (1.2, 1.0), False),
+        "failed": ((1.6, 1.3), (math.inf, 1.0), False),
+    },
 )
 def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(before, after, sure):
     assert _lr_decisive(loss(*before), loss(*after)) is sure
     assert gap_closure(loss(*before), loss(*after)).is_decisive is sure
     assert not _lr_decisive(loss(*before), loss(*after), Thresholds(min_log_bayes_factor=20.0))
-
-
-def test_an_effect_far_less_likely_than_the_best_is_not_within_reach():
-    one, other = fit([effect("one@elbow")], loss(0.9, 1.0)), fit([effect("other@elbow")], loss(1.01, 1.0))
-    assert _near_best_models([one, other]) == [one]
-    near = fit([effect("other@elbow")], loss(0.98, 1.0))
-    assert _near_best_models([one, near]) == [one, near]
 
 
 def test_all_recordings_tell_which_effects_are_within_reach():
@@ -639,10 +574,6 @@ def test_what_all_recordings_say_is_within_reach_beyond_a_standard_error_on_thos
     assert _near_best_models(rough) == [rough[0]]
 
 
-def test_nothing_is_added_where_no_refit_succeeds(monkeypatch):
-    assert Rounds(monkeypatch, {"": (3.0, 3.0)}).compose() == ([], [], ())
-
-
 def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
     losses = GROWING | {"bc": (1.4, 1.6), "b": (4.0, 4.2)}
     rounds = Rounds(monkeypatch, losses)
@@ -679,23 +610,6 @@ def screened_with(usual, base):
     if len(base) < 2:
         return found
     return ScreeningResult((), (score(C, p=1e-9),), alike([C.label], [[1.0]]), FEW)
-
-
-def test_an_effect_stays_where_the_others_do_worse_or_cannot_be_fitted(monkeypatch):
-    rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "ac": (9.0, 9.2)}, fails=("bc",))
-    assert rounds.compose()[1] == ["a", "b", "c"]
-    assert [entry[0] for entry in rounds.refits[3:]] == [
-        "a@x and b@x and c@x without a@x",
-        "a@x and b@x and c@x without b@x",
-        ["a", "c"],
-    ]
-
-
-def test_of_two_effects_the_first_is_tried_without_and_others_in_its_place(monkeypatch):
-    losses = GROWING | {"ab": (2.0, 2.2), "b": (3.4, 3.5), "ac": (2.5, 2.7)}
-    rounds = Rounds(monkeypatch, losses)
-    assert rounds.compose(max_effects=2)[1] == ["a", "b"]
-    assert [entry[:2] for entry in rounds.refits[2:]] == [("a@x and b@x without a@x", ["b"]), (["b"], ["c"])]
 
 
 def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):
@@ -743,14 +657,6 @@ def test_a_pair_that_is_no_better_is_not_taken(monkeypatch):
     assert alone.compose()[1] == ["a"]
 
 
-def test_of_a_pair_either_stays_though_the_model_does_not_run_with_it_alone(monkeypatch):
-    rounds = Rounds(monkeypatch, HIDDEN, pairs=("bc",), fails=("b",))
-    _, chosen, added = rounds.compose(max_effects=2)
-    assert chosen == ["b", "c"]
-    assert [len(entry.refitted_model.effects) for entry in added] == [2, 2]
-    assert added[0].cumulative_closure.fraction == pytest.approx(added[1].cumulative_closure.fraction)
-
-
 @pytest.mark.parametrize("absent", ["b", "c"])
 def test_both_of_a_pair_have_to_be_there(monkeypatch, absent):
     rounds = Rounds(monkeypatch, HIDDEN, pairs=("bc",), absent=(absent,))
@@ -759,9 +665,7 @@ def test_both_of_a_pair_have_to_be_there(monkeypatch, absent):
 
 def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     kinds = {name: effect(f"{name}@x", amplitude()) for name in "abcdef"}
-    promised = [
-        CandidatePair((kinds[one], kinds[other]), {}, 9.0 - i, 7.0 - i) for i, (one, other) in enumerate(PROMISED)
-    ]
+    promised = [CandidatePair((kinds[one], kinds[other]), {}, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
     table = np.eye(6)
     table[3, 1] = 0.9  # d's signature is b's, not the other way round
     found = ScreeningResult(
@@ -790,11 +694,11 @@ def test_what_does_as_well_beside_the_others_is_a_rival(monkeypatch):
 def test_an_effect_within_two_standard_deviations_of_neutral_is_not_there(std, there):
     of = effect("wide@x", amplitude("a", neutral=1.0), amplitude("b"), shape("s"))
     found = fit([of], values={"wide@x.a": 2.0, "wide@x.b": 0.01}, std={"wide@x.a": std, "wide@x.b": 1.0})
-    assert _is_significant(of, found) is there
+    assert _is_significant(of, found, LIMITS) is there
     assert _is_significant(of, found, Thresholds(min_z=1.9)) or std > 0.52
     # a shape that is not known next to nothing makes the amplitude no less sure
     unsure = fit([of], values=found.values, std={"wide@x.a": 9.0}, held={"wide@x.a": std, "wide@x.b": 1.0})
-    assert _is_significant(of, unsure) is there
+    assert _is_significant(of, unsure, LIMITS) is there
 
 
 def test_an_effect_that_is_not_there_is_not_added(monkeypatch):
@@ -804,20 +708,27 @@ def test_an_effect_that_is_not_there_is_not_added(monkeypatch):
     assert Rounds(monkeypatch, tied, absent=("a",)).compose()[1] == ["b"], "another that does as well may be there"
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "counts"),
-    [
-        (loss(3.0, 3.0), loss(2.93, 2.93), True),
-        (loss(3.0, 3.0), loss(2.95, 2.95), False),
-        (loss(3.0, 3.0, channels={"tip": (1e-3, "m")}), loss(2.99, 2.99, channels={"tip": (0.98e-3, "m")}), True),
-        (loss(3.0, 3.0, channels={"tip": (1e-3, "m")}), loss(2.99, 2.99, channels={"tip": (0.995e-3, "m")}), False),
-        (loss(0.99, 1.04), loss(0.93, 0.98), True),
-        (loss(math.inf, 3.0), loss(2.0, 2.0), True),
-    ],
-    ids=["all channels", "too little", "one channel", "too little of one", "far likelier", "not predicted before"],
+@cases(
+    "before, after, counts",
+    {
+        "all channels": (loss(3.0, 3.0), loss(2.93, 2.93), True),
+        "too little": (loss(3.0, 3.0), loss(2.95, 2.95), False),
+        "one channel": (
+            loss(3.0, 3.0, channels={"tip": (0.001, "m")}),
+            loss(2.99, 2.99, channels={"tip": (0.00098, "m")}),
+            True,
+        ),
+        "too little of one": (
+            loss(3.0, 3.0, channels={"tip": (0.001, "m")}),
+            loss(2.99, 2.99, channels={"tip": (0.000995, "m")}),
+            False,
+        ),
+        "far likelier": (loss(0.99, 1.04), loss(0.93, 0.98), True),
+        "not predicted before": (loss(math.inf, 3.0), loss(2.0, 2.0), True),
+    },
 )
 def test_an_effect_counts_by_what_it_takes_away_of_an_error(before, after, counts):
-    assert _is_rmse_reduced(before, after) is counts
+    assert _is_rmse_reduced(before, after, LIMITS) is counts
 
 
 def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():

@@ -10,6 +10,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 from factories import (
     BIAS,
@@ -27,14 +28,23 @@ from factories import (
     outcome,
     place,
     smoothed,
+    visible,
 )
 
-from yid_ocp.diagnosis.diagnosis_messages import diagnosis_summary_text, next_experiment_text
+from yid_ocp.diagnosis.diagnosis_messages import (
+    _event_sentences,
+    _separating_experiment,
+    diagnosis_summary_text,
+    insufficient_data_message,
+    next_experiment_text,
+)
+from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, Overspeed
 from yid_ocp.diagnosis.hypotheses import TruncatedRecording
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 FILE = Path(__file__).with_name("sentences.json")
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
+SPEED, ACCELERATION, GRAVITY = "how fast it moves", "how hard it accelerates", "how it stands against gravity"
 NO_EFFECT = {"selected_effects": (), "single_effect_models": ()}
 
 
@@ -138,10 +148,25 @@ def said() -> dict[str, str]:
     for verdict, where, unseen in [
         ("insufficient_data", (), ()), ("unknown", (place("T2"),), ()), ("unknown", (place("world", 0.8),), ()),
         ("unknown", (place("camera", 0.8),), ()), ("unknown", (place("spring_1", 0.0),), ()), ("no_gap", (), ()),
-        ("no_gap", (), ("a@b",)), ("no_gap", (), tuple("abcde")), ("effect", (), ()),
+        ("no_gap", (), ("a@b",)), ("no_gap", (), tuple(f"{kind}@x" for kind in "abcde")), ("effect", (), ()),
     ]:  # fmt: skip
         case = f"next experiment: {verdict} {[p.location for p in where]} {len(unseen)} unseen"
-        found[case] = next_experiment_text(verdict, (), where, unseen)
+        found[case] = next_experiment_text(verdict, (), where, [visible(effect(label), seen=False) for label in unseen])
+    for rivals in [
+        {"joint_viscous@elbow": SPEED, "joint_coulomb@elbow": SPEED}, {"a@elbow": SPEED, "b@shoulder": SPEED},
+        {"tilt@world": GRAVITY, "mass@elbow": ACCELERATION, "a@elbow": SPEED}, {"odd@T1": ""},
+        {"melting@T1": "how hot it is", "density@T1": ACCELERATION},
+    ]:  # fmt: skip
+        alike = [SimpleNamespace(location=k.partition("@")[2], required_excitation=v) for k, v in rivals.items()]
+        found[f"next experiment: rivals {list(rivals)}"] = _separating_experiment(alike)
+    before, limits = outcome(degrees=11.6), Thresholds(min_samples_per_unknown=4.0)
+    for seen in (True, False):
+        text = insufficient_data_message("insufficient_data", before, 5, [visible(FRICTION, seen)], limits)
+        found[f"insufficient data: detectable {seen}"] = text
+    force = DisturbanceEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
+    odd = DisturbanceEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
+    for events in ((force,), (force, odd), (force,) * 10):
+        found[f"events: {len(events)}"] = _event_sentences(EventSet(events, (Overspeed("run_0", "elbow", 3.0),)))
     return found
 
 

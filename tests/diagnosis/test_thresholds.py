@@ -9,8 +9,6 @@ import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.localise import informed_z_scores, localise_gap
-from yid_ocp.diagnosis.select import _is_amplitude_outside_prior, _is_shape_outside_prior
-from yid_ocp.effects import make_effect
 from yid_ocp.options import OptionInfo
 
 KIND = "joint_coulomb@elbow"
@@ -83,13 +81,3 @@ def test_a_gap_is_there_by_so_many_standard_deviations(usual):
     assert sum(b - a for a, b in loose) > sum(b - a for a, b in strict)
     informed = [np.isfinite(informed_z_scores(usual.smoother_result, 0, mapped)[2]).sum() for mapped in (0.1, 0.999)]
     assert informed[0] > informed[1]
-
-
-def test_how_far_a_value_may_leave_its_range(bench):
-    effect = make_effect("joint_stribeck", "elbow", bench.system)
-    _, high = effect.prior_ranges["joint_stribeck@elbow.v_stribeck"]
-    values = {"joint_stribeck@elbow.tau_s": 4.1, "joint_stribeck@elbow.v_stribeck": 2.5 * high}
-    assert _is_shape_outside_prior(effect, values)
-    assert not _is_shape_outside_prior(effect, values, Thresholds(shape_range_factor=3.0))
-    assert _is_amplitude_outside_prior(effect, values)
-    assert not _is_amplitude_outside_prior(effect, values, Thresholds(prior_range_margin=1.5))

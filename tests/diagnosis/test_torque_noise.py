@@ -8,6 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from factories import cases
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import diagnose
@@ -89,7 +90,7 @@ def composed(step: Step, held_out: bool, *candidates: str) -> AllCandidatesProbl
     return AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)] if held_out else [])
 
 
-@pytest.mark.parametrize("held_out", [True, False], ids=["held_out", "in_blocks"])
+@cases("held_out", {"held_out": True, "in_blocks": False})
 def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     made = composed(step, held_out)
     weighted = made.whitened_at({"elbow.stiffness": 2.5})
@@ -108,7 +109,7 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     assert there.cost == pytest.approx(again.cost, rel=0.02)
 
 
-@pytest.mark.parametrize("held_out", [True, False], ids=["held_out", "in_blocks"])
+@cases("held_out", {"held_out": True, "in_blocks": False})
 def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out):
     """Weights are frozen once, about torques that an offset among the effects must not move."""
     made = composed(step, held_out, "effort_offset", "joint_viscous").whitened_at({"elbow.stiffness": 2.5})
@@ -286,7 +287,7 @@ def test_squares_of_innovations_are_the_least_over_all_errors(geared, step, feed
     assert recorded_torque @ recorded_torque > 2 * along @ along
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.5], ids=["explained", "not explained"])
+@cases("friction", {"explained": 0.0, "not explained": 0.5})
 def test_a_refit_is_as_sure_as_a_solution(step, friction):
     """One deviation for one parameter, whichever command says it; a misfit counts in it."""
     problem = problem_of(step, [recorded(step, 1, friction=friction)])

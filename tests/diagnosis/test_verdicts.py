@@ -10,6 +10,7 @@ import pytest
 from jsonschema import validate
 
 from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.diagnosis_messages import diagnosis_summary_text
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.verdict import is_chance_excess
 from yid_ocp.effects import make_effect
@@ -103,6 +104,15 @@ def found(bench, effects, candidates, *, held_out=True, **how):
     validate(result, SCHEMA)
     located = result["verdict"] in ("effect", "confusable", "unknown")
     assert sum(place["share"] for place in result["where"]) == pytest.approx(1.0 if located else 0.0)
+    # a stage that is not come to leaves nothing behind: neither places nor refits where there is no gap to locate
+    assert (finding.smoother_result is not None) is bool(finding.single_effect_models) is located
+    assert (result["statistics"]["closure"] is not None) is bool(result["steps"])
+    assert bool(result["effects"]) is (result["verdict"] in ("effect", "confusable"))
+    assert (result["reason"] != "") is (result["verdict"] == "unknown")
+    assert bool(result["message"]) is (result["verdict"] == "insufficient_data")
+    stages = "compose nominal events screening other_starts localisation refits carry_over remaining"
+    assert list(result["seconds"]) == stages.split()
+    assert finding.summary == diagnosis_summary_text(finding) == result["summary"]
     return finding, result
 
 
@@ -136,7 +146,6 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
 def test_a_model_that_is_right_has_no_gap(bench):
     _, result = found(bench, {}, FRICTION)
     assert result["verdict"] == "no_gap"
-    assert result["effects"] == []
     assert result["gap"]["closure"] is None
     assert result["gap"]["before"] == result["gap"]["after"]
     told = result["statistics"]

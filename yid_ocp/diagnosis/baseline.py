@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.stats
 
 from yid_ocp.analysis.estimate_history import RunEstimates, chi2_p_value, nearest_positive_definite, pool_estimates
 from yid_ocp.data.recording import Recording
+from yid_ocp.diagnosis.hypotheses import neutral_values
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefitModel
-from yid_ocp.diagnosis.select import SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, SolverError, YidError, nearest_name_hint
@@ -39,7 +40,7 @@ class ParameterShift:
 
     name: str
     unit: str
-    baseline_value: float  # by the baseline
+    baseline_value: float
     baseline_std: float
     current_value: float  # by the baseline and the recordings together
     current_std: float
@@ -62,9 +63,8 @@ class BaselineComparison:
     @property
     def changed_parameters(self) -> tuple[ParameterShift, ...]:
         """Parameters that have changed significantly, smallest p-value first."""
-        return tuple(
-            sorted((entry for entry in self.parameter_shifts if entry.has_changed), key=lambda entry: entry.p_value)
-        )
+        changed = (entry for entry in self.parameter_shifts if entry.has_changed)
+        return tuple(sorted(changed, key=lambda entry: entry.p_value))
 
 
 def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
@@ -80,260 +80,31 @@ def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
     ConfigError
         Parameters or effects that the model does not have, or that differ from recording to recording here.
     """
-    parameters = problem.system.parameters
-    for name in baseline.parameter_names:
-        if name in parameters:
-            continue
-        effect, at, _ = name.rpartition(".")
-        what = f"the effect {effect}" if at and "@" in effect else f"the parameter '{name}'"
-        raise ConfigError(
-            f"the baseline has {what}, which this model does not have",
-            where=baseline.run_name,
-            allowed="a run of the same model",
-            hint="add it under model.effects" if "@" in effect else nearest_name_hint(name, parameters.names),
-        )
-    local = [name for name in baseline.parameter_names if name in problem.options.local_parameters]
-    if local:
-        raise ConfigError(
-            f"'{local[0]}' has a value of its own in every recording, so a baseline says nothing of it",
-            where=f"parameters.{local[0]}.local",
-            hint="leave `local` out",
-        )
-    values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
-    values |= dict(zip(baseline.parameter_names, map(float, baseline.values), strict=True))
-    options = replace(
-        problem.options,
-        prior_stds={
-            name: std for name, std in problem.options.prior_stds.items() if name not in baseline.parameter_names
-        },
-        multivariate_prior=MultivariateGaussianPrior(
-            baseline.parameter_names, nearest_positive_definite(baseline.covariance)
-        ),
-    )
-    free = (*problem.free, *(name for name in baseline.parameter_names if name not in problem.free))
+    names, parameters = baseline.parameter_names, problem.system.parameters
+    for name in names:
+        if name not in parameters:
+            effect, at, _ = name.rpartition(".")
+            what = f"the effect {effect}" if at and "@" in effect else f"the parameter '{name}'"
+            raise ConfigError(
+                f"the baseline has {what}, which this model does not have",
+                where=baseline.run_name,
+                allowed="a run of the same model",
+                hint="add it under model.effects" if "@" in effect else nearest_name_hint(name, parameters.names),
+            )
+        if name in problem.options.local_parameters:
+            raise ConfigError(
+                f"'{name}' has a value of its own in every recording, so a baseline says nothing of it",
+                where=f"parameters.{name}.local",
+                hint="leave `local` out",
+            )
+    values = dict(zip(parameters.names, map(float, problem.theta), strict=True))
+    values |= dict(zip(names, map(float, baseline.values), strict=True))
+    prior = MultivariateGaussianPrior(names, nearest_positive_definite(baseline.covariance))
+    stds = {name: std for name, std in problem.options.prior_stds.items() if name not in names}
+    options = replace(problem.options, prior_stds=stds, multivariate_prior=prior)
+    free = (*problem.free, *(name for name in names if name not in problem.free))
     recordings, held_out = ([e.recording for e in group] for group in (problem.episodes, problem.held_out))
     return EstimationProblem(problem.step, recordings, free, options, values, held_out)
-
-
-def compare_with_baseline(
-    fit: RefitModel,
-    baseline: RunEstimates,
-    level: float,
-    runs: tuple[str, ...] = (),
-    apart: tuple[float, float] = (0.0, 1.0),
-) -> BaselineComparison:
-    """Return how far the parameters of a fit have moved from its baseline prior.
-
-    Parameters
-    ----------
-    level : float
-        Significance, divided by the number of parameters.
-    runs : tuple of str
-        What the baseline was put together of.
-    apart : (float, float)
-        chi2 and p-value of the differences between these runs.
-    """
-    problem, evaluation = fit.problem, fit.evaluation
-    plain = _plain_variance(problem, fit)
-    names = [name for name in baseline.parameter_names if name in problem.options.multivariate_prior.parameter_names]
-    shifts = []
-    prior = dict(
-        zip(
-            problem.options.multivariate_prior.parameter_names,
-            np.diag(problem.options.multivariate_prior.covariance),
-            strict=True,
-        )
-    )
-    for i, name in enumerate(baseline.parameter_names):
-        if name not in names:
-            continue
-        before, std, now = float(baseline.values[i]), float(baseline.std[i]), fit.values[name]
-        # in units of noise alone a problem's variances are smaller, all by one factor
-        c0 = std**2
-        c = plain[name] * c0 / float(prior[name])
-        counted = max(1.0, fit.std[name] ** 2 / c) if c > 0 and math.isfinite(fit.std[name]) else 1.0
-        weight = 1 - c / c0
-        score, p = None, 1.0
-        if weight > _MIN_INFORMED_FRACTION:
-            variance = c0 * weight + (counted - 1) * c * weight
-            score = (now - before) / math.sqrt(variance)
-            p = float(2 * scipy.stats.norm.sf(abs(score)))
-        unit = problem.system.parameters[name].unit
-        shifts.append(
-            ParameterShift(name, unit, before, std, now, fit.std[name], score, p, p < level / max(len(names), 1))
-        )
-    assert evaluation.ok
-    labels = tuple(baseline.effects)
-    return BaselineComparison(runs or (baseline.run_name,), baseline.is_fit_adequate, labels, *apart, tuple(shifts))
-
-
-def _plain_variance(problem: EstimationProblem, fit: RefitModel) -> Mapping[str, float]:
-    """Variance of every unknown by the stated noise and priors alone."""
-    evaluation = fit.evaluation
-    if evaluation.jacobian is None:
-        evaluation = problem.evaluate(problem.vector(fit.values), equilibrium_guesses=evaluation.equilibrium_guesses)
-    jacobian = residual_without_weak_priors(problem, evaluation)[1] * problem.unknown_scales
-    variance = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)) * problem.unknown_scales**2
-    return dict(zip(problem.unknown_names, map(float, variance), strict=True))
-
-
-_ParameterValues = Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class PredictionErrors:
-    """Prediction errors (RMSE by channel) on recordings no fit has used, without diagnosis and counterfactual."""
-
-    recordings: tuple[str, ...]
-    # root mean square errors without a diagnosis, and with the effects removed (or added)
-    rmse_without_diagnosis: Mapping[str, float]
-    rmse_counterfactual: Mapping[str, float]
-    channel_units: Mapping[str, str]
-    failure_message: str = ""  # why there are none
-
-    @property
-    def rmse_by_unit(self) -> dict[str, tuple[float, float]]:
-        """Root mean square over the channels of each unit: (without a diagnosis, counterfactual)."""
-        found = {}
-        for unit in dict.fromkeys(self.channel_units.values()):
-            own = [channel for channel, of in self.channel_units.items() if of == unit]
-            found[unit] = tuple(
-                float(np.sqrt(np.mean([errors[c] ** 2 for c in own])))
-                for errors in (self.rmse_without_diagnosis, self.rmse_counterfactual)
-            )
-        return {unit: (pair[0], pair[1]) for unit, pair in found.items()}
-
-    @property
-    def is_improved(self) -> bool:
-        """Whether the counterfactual prediction has the smaller RMSE in every unit."""
-        return bool(self.rmse_by_unit) and all(after < before for before, after in self.rmse_by_unit.values())
-
-
-@dataclass(frozen=True)
-class CounterfactualTest:
-    """Prediction errors with the effects removed, and with the effects added."""
-
-    # recordings made without the effects: by the diagnosed model with its effects taken out, against the
-    # nominal model as it was fitted to the recordings with them
-    effects_removed: PredictionErrors
-    # recordings made with the effects: by the model of the world without them with the effects put in, against
-    # that model alone
-    effects_added: PredictionErrors
-
-    def to_dict(self) -> dict[str, object]:
-        """Return `predict_counterfactual` of `yid-diagnosis/2`, JSON-compatible."""
-        return {name: _entry(part) for name, part in (("removed", self.effects_removed), ("added", self.effects_added))}
-
-
-def predict_counterfactual(
-    nominal: RefitModel,
-    last: RefitModel,
-    reference_recordings: Sequence[Recording],
-    baseline: RunEstimates | None = None,
-) -> CounterfactualTest:
-    """Predict reference recordings with the effects removed, and the diagnosed recordings with them added.
-
-    Parameters
-    ----------
-    nominal, last : RefitModel
-        Without and with the effects.
-    reference_recordings : sequence of Recording
-        Made without the effects; with the same sensors.
-    baseline : RunEstimates, optional
-        What is known of the world without the effects; estimated on `reference_recordings` where absent.
-
-    Returns
-    -------
-    CounterfactualTest
-        A message stands for what cannot be predicted.
-    """
-    shared = nominal.problem.shared_parameters
-    now = {name: last.values[name] for name in shared}
-    effects = {name: last.values[name] for effect in last.effects for name in effect.parameters.names}
-    held = [e.recording for e in (*last.problem.episodes, *last.problem.held_out)]
-    present = list({id(recording): recording for recording in held}.values())
-    removed = _predicted(last, reference_recordings, {name: nominal.values[name] for name in shared}, now)
-    try:
-        then = (
-            _then(last, reference_recordings, shared)
-            if baseline is None
-            else dict(zip(baseline.parameter_names, baseline.values, strict=True))
-        )
-    except YidError as error:
-        return CounterfactualTest(removed, _nothing(present, error.what))
-    return CounterfactualTest(removed, _predicted(last, present, then, {**then, **effects}))
-
-
-def _predicted(
-    last: RefitModel, recordings: Sequence[Recording], plain: _ParameterValues, other: _ParameterValues
-) -> PredictionErrors:
-    """Errors by two models; parameters that neither names are the problem's own, and effects neutral."""
-    try:
-        problem = _on(last, recordings)
-        first, units = _errors(problem, plain, last.effects)
-        second, _ = _errors(problem, other, last.effects)
-    except YidError as error:
-        return _nothing(recordings, error.what)
-    return PredictionErrors(tuple(recording.name for recording in recordings), first, second, units)
-
-
-def _nothing(recordings: Sequence[Recording], message: str) -> PredictionErrors:
-    return PredictionErrors(tuple(recording.name for recording in recordings), {}, {}, {}, message)
-
-
-def _on(last: RefitModel, recordings: Sequence[Recording]) -> EstimationProblem:
-    """The problem with its compiled step, all candidates in it, on other recordings: to predict and to estimate on."""
-    own = last.problem
-    options = replace(
-        own.options,
-        prior_stds={},
-        local_parameters=(),
-        multivariate_prior=MultivariateGaussianPrior(),
-        known_initial_states={},
-    )
-    values = dict(zip(own.system.parameters.names, map(float, own.theta), strict=True))
-    return EstimationProblem(own.step, recordings, own.shared_parameters, options, values, recordings)
-
-
-def _errors(
-    problem: EstimationProblem, values: _ParameterValues, effects: Sequence[EffectBase]
-) -> tuple[dict[str, float], dict[str, str]]:
-    neutral = {name: value for effect in effects for name, value in effect.neutral_values.items()}
-    if problem.has_process_noise:
-        problem = whitened_by_sensor_noise(problem)
-    found = problem.predict_held_out(problem.vector({**neutral, **values}))
-    failed = [result for _, result in found if isinstance(result, str)]
-    if failed:
-        raise SolverError(f"a recording cannot be predicted: {failed[0]}")
-    errors = rmse_by_channel([r for _, r in found if not isinstance(r, str)], [episode for episode, _ in found])
-    return {c: float(e["rmse"]) for c, e in errors.items()}, {c: str(e["unit"]) for c, e in errors.items()}
-
-
-def _then(last: RefitModel, without: Sequence[Recording], shared: Sequence[str]) -> dict[str, float]:
-    """The nominal parameters as they are estimated on the recordings without the effects."""
-    problem = _on(last, without).with_free_subset(shared)
-    outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
-    if outcome.status == Status.FAILED:
-        raise SolverError(
-            f"the nominal model cannot be fitted to the recordings without the effects: {outcome.message}"
-        )
-    return {name: problem.named_values(outcome.x)[name] for name in shared}
-
-
-def _entry(part: PredictionErrors) -> dict[str, object]:
-    return {
-        "recordings": list(part.recordings),
-        "rmse": {
-            channel: {
-                "without_diagnosis": part.rmse_without_diagnosis[channel],
-                "counterfactual": part.rmse_counterfactual[channel],
-                "unit": unit,
-            }
-            for channel, unit in part.channel_units.items()
-        },
-        "better": part.is_improved if part.channel_units else None,
-        "message": part.failure_message,
-    }
 
 
 @dataclass(frozen=True)
@@ -355,33 +126,175 @@ class BaselineData:
         return BaselineData(known, tuple(run.run_name for run in runs), chi2, chi2_p_value(chi2, degrees), without)
 
     def compare_with_baseline(self, fit: RefitModel, limits: Thresholds) -> BaselineComparison | None:
-        """Compare a fit with the earlier runs; None if there are none."""
-        if self.combined_estimates is None:
+        """Return how far the parameters of a fit have moved from its baseline prior; None if there are no runs."""
+        baseline, prior = self.combined_estimates, fit.problem.options.multivariate_prior
+        if baseline is None:
             return None
-        return compare_with_baseline(
-            fit,
-            self.combined_estimates,
-            limits.significance_level,
-            self.baseline_runs,
-            (self.between_runs_chi2, self.between_runs_p_value),
-        )
+        plain = _plain_variance(fit)
+        weighted = dict(zip(prior.parameter_names, np.diag(prior.covariance), strict=True))
+        names = [name for name in baseline.parameter_names if name in weighted]
+        shifts = []
+        for name, value, std in zip(baseline.parameter_names, baseline.values, baseline.std, strict=True):
+            if name not in names:
+                continue
+            # in units of noise alone a problem's variances are smaller, all by one factor
+            now, c0 = fit.values[name], float(std) ** 2
+            c = plain[name] * c0 / float(weighted[name])
+            counted = max(1.0, fit.std[name] ** 2 / c) if c > 0 and math.isfinite(fit.std[name]) else 1.0
+            weight = 1 - c / c0
+            score, p = None, 1.0
+            if weight > _MIN_INFORMED_FRACTION:
+                variance = c0 * weight + (counted - 1) * c * weight
+                score = (now - float(value)) / math.sqrt(variance)
+                p = float(2 * scipy.stats.norm.sf(abs(score)))
+            known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, fit.std[name])
+            shifts.append(ParameterShift(name, *known, score, p, p < limits.significance_level / len(names)))
+        between = (self.between_runs_chi2, self.between_runs_p_value)
+        labels = tuple(baseline.effects)
+        return BaselineComparison(self.baseline_runs, baseline.is_fit_adequate, labels, *between, tuple(shifts))
 
-    def changed_parameters(self, fit: RefitModel, limits: Thresholds) -> tuple[ParameterShift, ...]:
-        """Return the parameters of a fit that changed significantly since the earlier runs."""
+    def has_changed(self, fit: RefitModel, limits: Thresholds) -> bool:
+        """Whether any parameter of a fit changed significantly since the earlier runs."""
         found = self.compare_with_baseline(fit, limits)
-        return () if found is None else found.changed_parameters
+        return found is not None and bool(found.changed_parameters)
 
-    def predict_reference_recordings(
-        self, nominal: RefitModel, added: Sequence[SelectedEffect], progress: Progress
+    def predict_counterfactual(
+        self, nominal: RefitModel, last: RefitModel, progress: Progress
     ) -> CounterfactualTest | None:
-        """Predict the recordings with effects removed and added; None without effects or reference recordings."""
-        if not added or not self.reference_recordings:
+        """Predict reference recordings with the effects of `last` removed, and the diagnosed ones with them added.
+
+        A message stands for what cannot be predicted; None without effects or reference recordings. Without earlier
+        runs what is known of the world without the effects is estimated on the reference recordings.
+        """
+        without, known = self.reference_recordings, self.combined_estimates
+        if not last.effects or not without:
             return None
         progress.begin_stage("predicting the world without the effects")
-        return predict_counterfactual(
-            nominal, added[-1].refitted_model, self.reference_recordings, self.combined_estimates
+        shared = nominal.problem.shared_parameters
+        now = {name: last.values[name] for name in shared}
+        effects = {name: last.values[name] for effect in last.effects for name in effect.parameters.names}
+        held = [e.recording for e in (*last.problem.episodes, *last.problem.held_out)]
+        present = list({id(recording): recording for recording in held}.values())
+        removed = _predicted(last, without, {name: nominal.values[name] for name in shared}, now)
+        try:
+            then = (
+                _estimated_without(last, without, shared)
+                if known is None
+                else dict(zip(known.parameter_names, known.values, strict=True))
+            )
+        except YidError as error:
+            return CounterfactualTest(removed, _nothing(present, error.what))
+        return CounterfactualTest(removed, _predicted(last, present, then, {**then, **effects}))
+
+
+def _plain_variance(fit: RefitModel) -> Mapping[str, float]:
+    """Variance of every unknown by the stated noise and priors alone."""
+    problem, evaluation = fit.problem, fit.evaluation
+    if evaluation.jacobian is None:
+        evaluation = problem.evaluate(problem.vector(fit.values), equilibrium_guesses=evaluation.equilibrium_guesses)
+    jacobian = residual_without_weak_priors(problem, evaluation)[1] * problem.unknown_scales
+    variance = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)) * problem.unknown_scales**2
+    return dict(zip(problem.unknown_names, map(float, variance), strict=True))
+
+
+_ParameterValues = Mapping[str, float]
+_ChannelErrors = Mapping[str, tuple[float, str]]
+"""Root mean square error and its unit by channel."""
+
+
+@dataclass(frozen=True)
+class PredictionErrors:
+    """Prediction errors on recordings no fit has used, without diagnosis and counterfactual."""
+
+    recordings: tuple[str, ...]
+    without_diagnosis: _ChannelErrors
+    counterfactual: _ChannelErrors  # with the effects removed (or added)
+    failure_message: str = ""  # why there are none
+
+    @property
+    def rmse_by_unit(self) -> dict[str, tuple[float, float]]:
+        """Root mean square over the channels of each unit: (without a diagnosis, counterfactual)."""
+        found = {}
+        for unit in dict.fromkeys(unit for _, unit in self.without_diagnosis.values()):
+            before, after = (
+                float(np.sqrt(np.mean([e**2 for e, of in errors.values() if of == unit])))
+                for errors in (self.without_diagnosis, self.counterfactual)
+            )
+            found[unit] = (before, after)
+        return found
+
+    @property
+    def is_improved(self) -> bool:
+        """Whether the counterfactual prediction has the smaller RMSE in every unit."""
+        return bool(self.rmse_by_unit) and all(after < before for before, after in self.rmse_by_unit.values())
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in `yid-diagnosis/2`."""
+        rmse = {
+            channel: {"without_diagnosis": before, "counterfactual": self.counterfactual[channel][0], "unit": unit}
+            for channel, (before, unit) in self.without_diagnosis.items()
+        }
+        better = self.is_improved if rmse else None
+        return {"recordings": [*self.recordings], "rmse": rmse, "better": better, "message": self.failure_message}
+
+
+@dataclass(frozen=True)
+class CounterfactualTest:
+    """Prediction errors with the effects removed, and with the effects added."""
+
+    # recordings made without the effects: by the diagnosed model with its effects taken out, against the
+    # nominal model as it was fitted to the recordings with them
+    effects_removed: PredictionErrors
+    # recordings made with the effects: by the model of the world without them with the effects put in, against
+    # that model alone
+    effects_added: PredictionErrors
+
+    def to_dict(self) -> dict[str, Any]:
+        """As in `yid-diagnosis/2`."""
+        return {"removed": self.effects_removed.to_dict(), "added": self.effects_added.to_dict()}
+
+
+def _predicted(
+    last: RefitModel, recordings: Sequence[Recording], plain: _ParameterValues, other: _ParameterValues
+) -> PredictionErrors:
+    """Errors by two models; parameters that neither names are the problem's own, and effects neutral."""
+    try:
+        problem = _on(last, recordings)
+        first, second = (_errors(problem, values, last.effects) for values in (plain, other))
+    except YidError as error:
+        return _nothing(recordings, error.what)
+    return PredictionErrors(tuple(recording.name for recording in recordings), first, second)
+
+
+def _nothing(recordings: Sequence[Recording], message: str) -> PredictionErrors:
+    return PredictionErrors(tuple(recording.name for recording in recordings), {}, {}, message)
+
+
+def _on(last: RefitModel, recordings: Sequence[Recording]) -> EstimationProblem:
+    """The problem with its compiled step, all candidates in it, on other recordings: to predict and to estimate on."""
+    own, none = last.problem, MultivariateGaussianPrior()
+    options = replace(own.options, prior_stds={}, local_parameters=(), multivariate_prior=none, known_initial_states={})
+    values = dict(zip(own.system.parameters.names, map(float, own.theta), strict=True))
+    return EstimationProblem(own.step, recordings, own.shared_parameters, options, values, recordings)
+
+
+def _errors(problem: EstimationProblem, values: _ParameterValues, effects: Sequence[EffectBase]) -> _ChannelErrors:
+    if problem.has_process_noise:
+        problem = whitened_by_sensor_noise(problem)
+    found = problem.predict_held_out(problem.vector({**neutral_values(effects), **values}))
+    failed = [result for _, result in found if isinstance(result, str)]
+    if failed:
+        raise SolverError(f"a recording cannot be predicted: {failed[0]}")
+    errors = rmse_by_channel([r for _, r in found if not isinstance(r, str)], [episode for episode, _ in found])
+    return {channel: (float(entry["rmse"]), str(entry["unit"])) for channel, entry in errors.items()}
+
+
+def _estimated_without(last: RefitModel, without: Sequence[Recording], shared: Sequence[str]) -> dict[str, float]:
+    """The nominal parameters as they are estimated on the recordings without the effects."""
+    problem = _on(last, without).with_free_subset(shared)
+    outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
+    if outcome.status == Status.FAILED:
+        raise SolverError(
+            f"the nominal model cannot be fitted to the recordings without the effects: {outcome.message}"
         )
-
-
-NO_BASELINE = BaselineData(None, (), 0.0, 1.0, ())
-"""No earlier runs and no reference recordings."""
+    return {name: problem.named_values(outcome.x)[name] for name in shared}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import time
@@ -10,17 +11,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import threadpoolctl
+from numpy.typing import NDArray
 
 from yid_ocp.analysis.estimate_history import RunEstimates
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.baseline import NO_BASELINE, BaselineData, with_baseline_prior
+from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_messages import (
     diagnosis_summary_text,
     insufficient_data_message,
     next_experiment_text,
     truncation_message,
 )
-from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, nominal_parameter_changes
+from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_events, problem_without_events
 from yid_ocp.diagnosis.hypotheses import (
     TRUNCATION_FRACTIONS,
@@ -46,14 +48,15 @@ from yid_ocp.diagnosis.refit import (
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import ScreeningResult, screen_candidates
-from yid_ocp.diagnosis.select import GapClosure, SelectedEffect, gap_closure, select_effects
+from yid_ocp.diagnosis.select import NO_CLOSURE, SelectedEffect, gap_closure, select_effects
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.diagnosis.transfer_check import check_transfer, inflate_std_by_disagreement
 from yid_ocp.diagnosis.verdict import (
+    check_transfer,
     compute_explained_fraction,
     decide_verdict,
     find_unknown_reason,
     has_gap,
+    inflate_std_by_disagreement,
     is_chance_excess,
 )
 from yid_ocp.errors import DataError, SolverError
@@ -70,11 +73,12 @@ from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.measurements import subtract_estimated_biases
-from yid_ocp.progress import LoggingProgress, Progress
+from yid_ocp.progress import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.solvers.base import RESTART_FACTORS
 
 log = logging.getLogger(__name__)
+Array = NDArray[np.float64]
 
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 
@@ -101,7 +105,7 @@ def diagnose(
     held_out : sequence of Recording
         Never touched by a fit; the problem's own where absent. Where there are none, alternate blocks are held out.
     progress : Progress, optional
-        Told what is going on; the package's log when absent.
+        The package's log when absent.
     known_fits : KnownFits, optional
     baseline : RunEstimates or sequence of RunEstimates, or BaselineData, optional
         What earlier runs of the same model say of its parameters (`read_estimates`): priors, so that the question is
@@ -121,107 +125,98 @@ def diagnose(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        clock, told, known = _Clock(), progress or LoggingProgress(log), known_fits or KnownFits()
+        clock, told, known = {"": time.perf_counter()}, progress or LoggingProgress(log), known_fits or KnownFits()
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
         earlier = runs if isinstance(runs, BaselineData) else BaselineData.from_runs(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
             problem = with_baseline_prior(problem, earlier.combined_estimates)
         composed = _composed(problem, candidates, exclude, held_out, told)
-        clock.lap("compose")
+        clock["compose"] = time.perf_counter()
         search = RefitContext(composed, thresholds or DEFAULT_THRESHOLDS, told, known.store)
-        return _diagnosed(problem, search, known.solution, clock, earlier)
+        return _diagnosed(_examined(problem, search, known.solution, clock), earlier, clock)
 
 
 @dataclass(frozen=True)
 class _Examined:
     """The nominal model beside all that is no event: fit, null tests, screening, and whether there is a gap."""
 
-    search: RefitContext
+    search: RefitContext  # the weights of all hypotheses frozen at the fit
     nominal: RefitModel
     truncated: tuple[TruncatedRecording, ...]
-    whole: EstimationProblem
+    whole: EstimationProblem  # with all samples
     events: EventSet
-    smoothed: SmootherResult | None
+    smoothed: SmootherResult | None  # about the fit, on all recordings, where it was asked
     before: NullTestResult
     held: NullTestResult
     screened: ScreeningResult
-    has_enough_samples: bool
     has_gap: bool
+    has_enough_samples: bool
 
 
-def _examined(problem: EstimationProblem, search: RefitContext, solution: Solution | None, clock: _Clock) -> _Examined:
+def _examined(
+    problem: EstimationProblem, search: RefitContext, solution: Solution | None, clock: dict[str, float]
+) -> _Examined:
     limits, progress = search.thresholds, search.progress
     progress.begin_stage("fitting the nominal model")
     nominal = fit_nominal_model(problem, search.problem, solution, search.store, limits)
     search, nominal, cuts = _followed(search, nominal)
-    clock.lap("nominal")
+    clock["nominal"] = time.perf_counter()
     progress.begin_stage("looking for events")
     whole = _undivided(search.problem, problem)
-    search, nominal, happened = _without_events(search, nominal, whole)
-    about = nominal
-    clock.lap("events")
-    search, before, held, screened = _tested(search, nominal)
-    clock.lap("screening")
-    enough = before.degrees_of_freedom >= limits.min_samples_per_unknown * len(nominal.values)
-    offsets = _offsets_stated(nominal.problem)
-    gap = has_gap(before, held, limits, screened.candidate_scores, offsets)
-    if gap and enough and before.chi2_per_dof < limits.restart_chi2:
-        other = _better_nominal_fit(search, nominal)
+    search, nominal, events, smoothed = _without_events(search, nominal, whole)
+    clock["events"] = time.perf_counter()
+    found = _tested(search, nominal, cuts, whole, events, smoothed)
+    clock["screening"] = time.perf_counter()
+    if found.has_gap and found.has_enough_samples and found.before.chi2_per_dof < limits.restart_chi2:
+        other = _better_nominal_fit(found.search, nominal)
         if other is not None:
-            search, nominal, cuts = _followed(search, other, cuts)
-            search, before, held, screened = _tested(search, nominal)
-            gap = has_gap(before, held, limits, screened.candidate_scores, offsets)
-    # where nothing happened it was run on all that was fitted already
-    known = happened.smoothed if nominal is about and not search.problem.is_split_in_blocks else None
-    return _Examined(search, nominal, cuts, whole, happened.events, known, before, held, screened, enough, gap)
+            # what the smoother says is about another fit
+            found = _tested(*_followed(found.search, other, cuts), whole, events, None)
+            found = replace(found, has_enough_samples=True)
+    clock["other_starts"] = time.perf_counter()
+    return found
 
 
-def _diagnosed(
-    problem: EstimationProblem,
-    search: RefitContext,
-    solution: Solution | None,
-    clock: _Clock,
-    earlier: BaselineData = NO_BASELINE,
-) -> DiagnosisResult:
-    seen = _examined(problem, search, solution, clock)
+def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) -> DiagnosisResult:
     search, nominal, before, held, screened = seen.search, seen.nominal, seen.before, seen.held, seen.screened
-    limits, progress, enough, events = search.thresholds, search.progress, seen.has_enough_samples, seen.events
-    changed = earlier.changed_parameters(nominal, limits)
-    clock.lap("other_starts")
-    moved = bool(changed) and not seen.has_gap
+    limits, enough, scores = search.thresholds, seen.has_enough_samples, screened.candidate_scores
+    changed = earlier.has_changed(nominal, limits)
+    moved = changed and not seen.has_gap
     gap, smoothed, trusted = seen.has_gap or moved, None, None
     if gap and enough:
-        progress.begin_stage("locating the gap")
-        smoothed = _smooth_about_model(nominal, limits) if seen.smoothed is None else seen.smoothed
+        search.progress.begin_stage("locating the gap")
+        # where nothing happened it was run on all that was fitted already
+        smoothed = None if search.problem.is_split_in_blocks else seen.smoothed
+        smoothed = _smooth_about_model(nominal, limits) if smoothed is None else smoothed
         # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
         trusted = None if nominal.problem.has_process_noise else smoothed
-        gap = not is_chance_excess(trusted, screened.candidate_scores, before, held, limits)
-    clock.lap("localisation")
+        gap = not is_chance_excess(trusted, scores, before, held, limits)
+    clock["localisation"] = time.perf_counter()
+    where = () if smoothed is None else localise_gap(smoothed, limits.location_z)
     fits: tuple[RefitModel, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
-    if gap and enough and screened.candidate_scores:
-        there = () if smoothed is None else main_gap_locations(localise_gap(smoothed, limits.location_z))
-        fits, added = select_effects(search, nominal, screened, [place.location for place in there], bool(changed))
-    clock.lap("refits")
+    if gap and enough and scores:
+        places = [place.location for place in main_gap_locations(where)]
+        fits, added = select_effects(search, nominal, screened, places, changed)
+    clock["refits"] = time.perf_counter()
     carried = check_transfer(search, added[-1].refitted_model) if added else ()
     if carried:
         last = inflate_std_by_disagreement(added[-1].refitted_model, carried)
         added = (*added[:-1], replace(added[-1], refitted_model=last))
-    clock.lap("carry_over")
-    total = GapClosure(np.nan, np.nan, np.nan)
-    if added:
-        total = gap_closure(nominal.held_out_loss, added[-1].refitted_model.held_out_loss, limits=limits)
+    clock["carry_over"] = time.perf_counter()
+    last = added[-1].refitted_model if added else nominal
+    total = gap_closure(nominal.held_out_loss, last.held_out_loss, limits) if added else NO_CLOSURE
     explained = compute_explained_fraction(nominal, added, trusted)
-    gap = gap and (bool(added) or not moved)  # what parameters explain by moving is no gap
     same = all(entry.is_consistent for entry in carried)
-    verdict = decide_verdict(gap, screened.detectability, added, total, limits, enough, explained, same)
+    reason = find_unknown_reason(added, total, limits, explained, same)
+    # what parameters explain by moving is no gap
+    verdict = decide_verdict(gap and (bool(added) or not moved), enough, screened.detectability, reason, added)
     accepted = added if verdict in ("effect", "confusable") else ()
-    final = accepted[-1].refitted_model if accepted else nominal
-    remaining, where, rest_where = _after(nominal, accepted, smoothed, before, held, limits)
-    if accepted:
-        # what a better model explains was no event
-        events = _happened(seen.whole, final, limits).events
-    clock.lap("remaining")
+    final = last if accepted else nominal
+    remaining, where, rest = _after(nominal, accepted, where, before, held, limits)
+    # what a better model explains was no event
+    events = _happened(seen.whole, final, limits)[0] if accepted else seen.events
+    clock["remaining"] = time.perf_counter()
     finding = DiagnosisResult(
         verdict=verdict,
         noise_floor=channel_noise_levels(nominal.problem),
@@ -229,7 +224,7 @@ def _diagnosed(
         nominal_held_out_test=held,
         detectability=screened.detectability,
         confusability=screened.confusability,
-        candidate_scores=screened.candidate_scores,
+        candidate_scores=scores,
         smoother_result=smoothed,
         gap_locations=where,
         nominal_model=nominal,
@@ -237,21 +232,21 @@ def _diagnosed(
         selected_effects=added,
         gap_closure=total,
         remaining_test=remaining,
-        remaining_gap_locations=rest_where,
-        nominal_changes=nominal_parameter_changes(nominal, final),
-        next_experiment=next_experiment_text(verdict, accepted, where, screened.undetectable_labels),
+        remaining_gap_locations=rest,
+        nominal_changes=_changes(nominal, final),
+        next_experiment=next_experiment_text(verdict, accepted, where, screened.detectability),
         held_out_names=tuple(episode.name for episode in nominal.problem.held_out),
         is_split_in_blocks=search.problem.is_split_in_blocks,
         message=insufficient_data_message(verdict, before, len(nominal.values), screened.detectability, limits),
         thresholds=limits,
         truncated_recordings=seen.truncated,
-        unknown_reason=find_unknown_reason(added, total, limits, explained, same) if verdict == "unknown" else "",
+        unknown_reason=reason if verdict == "unknown" else "",
         explained_fraction=explained,
         transfer_checks=carried,
-        stage_seconds=clock.laps,
+        stage_seconds={name: clock[name] - clock[last] for last, name in itertools.pairwise(clock)},
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
-        counterfactual=earlier.predict_reference_recordings(nominal, accepted, progress),
+        counterfactual=earlier.predict_counterfactual(nominal, final, search.progress),
     )
     return replace(finding, summary=diagnosis_summary_text(finding))
 
@@ -263,51 +258,33 @@ def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> Es
     return composed.problem.with_episodes(episodes, () if composed.is_split_in_blocks else composed.problem.held_out)
 
 
-@dataclass(frozen=True)
-class _Happened:
-    """Events about a fit, and what the smoother says about it where it was asked."""
-
-    events: EventSet = NO_EVENTS
-    smoothed: SmootherResult | None = None
-
-
-def _happened(whole: EstimationProblem, fit: RefitModel, limits: Thresholds) -> _Happened:
-    """Events about a fit in all that was recorded; nothing where that cannot be predicted."""
+def _happened(whole: EstimationProblem, fit: RefitModel, limits: Thresholds) -> tuple[EventSet, SmootherResult | None]:
+    """Events about a fit in all that was recorded, none where that cannot be predicted, and what the smoother says."""
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
-    smoothed = None
+    smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
     if own.system.free_indices:
-        judged = whitened_at(own, x, fit.evaluation.equilibrium_guesses) if own.has_process_noise else own
-        residual = judged.evaluate(x, False, fit.evaluation.equilibrium_guesses)
+        judged = whitened_at(own, x, guesses)
+        residual = judged.evaluate(x, False, guesses)
         if not residual.ok:
-            return _Happened()
-        test = run_null_test(
-            residual_channels(judged),
-            residual.residual,
-            len(fit.values),
-            limits.significance_level,
-            limits.residual_window,
-        )
-        if any(window.is_flagged for window in test.windows):
-            evaluation = own.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
-            smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits)
-    if smoothed is None:
-        evaluation = own.evaluate(x, False, fit.evaluation.equilibrium_guesses)
+            return NO_EVENTS, None
+        is_flagged = any(window.is_flagged for window in _null_test(judged, residual.residual, fit, limits).windows)
+    evaluation = own.evaluate(x, is_flagged, guesses)
+    if is_flagged:
+        smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits)
     if not evaluation.ok:
-        return _Happened()
+        return NO_EVENTS, None
     found = find_events(own, x, evaluation, smoothed, limits)
-    pushed = found.only_force_events
-    if pushed and _excess(fit, problem_without_events(own, pushed)) > (1 - limits.min_event_chi2_fraction) * _excess(
-        fit, own
-    ):
+    pushed, share = found.only_force_events, 1 - limits.min_event_chi2_fraction
+    if pushed and _excess(fit, problem_without_events(own, pushed)) > share * _excess(fit, own):
         found = found.without_force_events
-    return _Happened(found, smoothed)
+    return found, smoothed
 
 
 def _excess(fit: RefitModel, problem: EstimationProblem) -> float:
     """r'r of a fit beyond the number of samples that count, in all of a problem's recordings that can be predicted."""
-    x, warm = problem.vector(fit.values), fit.evaluation.equilibrium_guesses
-    judged = whitened_at(problem, x, warm) if problem.has_process_noise else problem
-    evaluation = judged.evaluate(x, False, warm)
+    x, guesses = problem.vector(fit.values), fit.evaluation.equilibrium_guesses
+    judged = whitened_at(problem, x, guesses)
+    evaluation = judged.evaluate(x, False, guesses)
     if not evaluation.ok:
         return math.inf
     rows = [evaluation.residual[judged.residual_rows.data]]
@@ -320,38 +297,45 @@ def _excess(fit: RefitModel, problem: EstimationProblem) -> float:
 
 def _without_events(
     search: RefitContext, nominal: RefitModel, whole: EstimationProblem
-) -> tuple[RefitContext, RefitModel, _Happened]:
-    """All that follows without what events explain, the nominal model fitted to that, and the events about it."""
-    composed, limits = search.problem, search.thresholds
-    happened = _happened(whole, nominal, limits)
+) -> tuple[RefitContext, RefitModel, EventSet, SmootherResult | None]:
+    """All that follows without what events explain, the nominal model fitted to that, and what happened about it."""
+    first, (events, smoothed) = search.problem, _happened(whole, nominal, search.thresholds)
     for round_ in range(_MAX_EVENT_ROUNDS):
-        if not happened.events:
-            return search, nominal, happened
-        cleaned = replace(composed, problem=problem_without_events(composed.problem, happened.events))
-        search.progress.begin_stage(f"fitting the nominal model without {len(happened.events.disturbances)} events")
-        name = f"the nominal model without events, round {round_ + 1}"
-        again = _settled(cleaned, nominal.values, search.store, name, limits)
+        if not events:
+            break
+        less = replace(first, problem=problem_without_events(first.problem, events))
+        search.progress.begin_stage(f"fitting the nominal model without {len(events.disturbances)} events")
+        cleaned = replace(search, problem=less)
+        again = _settled(cleaned, nominal.values, f"the nominal model without events, round {round_ + 1}")
         if again is None:
             break
-        search, nominal, before = replace(search, problem=cleaned), again, happened.events
+        search, nominal, before = cleaned, again, events
         # what the smoother says is of all recordings, events not taken out
-        happened = replace(_happened(whole, nominal, limits), smoothed=None)
-        if happened.events.overlaps_with(before):
+        events, smoothed = _happened(whole, nominal, search.thresholds)[0], None
+        if events.overlaps_with(before):
             break
-    return search, nominal, happened
+    return search, nominal, events, smoothed
 
 
 def _tested(
-    search: RefitContext, nominal: RefitModel
-) -> tuple[RefitContext, NullTestResult, NullTestResult, ScreeningResult]:
+    search: RefitContext,
+    nominal: RefitModel,
+    cuts: tuple[TruncatedRecording, ...],
+    whole: EstimationProblem,
+    events: EventSet,
+    smoothed: SmootherResult | None,
+) -> _Examined:
     """Null tests and screening at a nominal fit, at which the weights of all hypotheses are frozen."""
     angles, limits = _largest_joint_angles(nominal), search.thresholds
     effects = tuple(effect.with_expected_ranges(angles) for effect in search.problem.candidate_effects)
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
     before, held = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
-    search.progress.begin_stage(f"screening {len(composed.candidate_effects)} candidates")
+    search.progress.begin_stage(f"screening {len(effects)} candidates")
     screened = screen_candidates(composed, (), nominal.values, limits)
-    return replace(search, problem=composed), before, held, screened
+    gap = has_gap(before, held, limits, screened.candidate_scores, _offsets_stated(nominal.problem))
+    enough = before.degrees_of_freedom >= limits.min_samples_per_unknown * len(nominal.values)
+    search = replace(search, problem=composed)
+    return _Examined(search, nominal, cuts, whole, events, smoothed, before, held, screened, gap, enough)
 
 
 def _followed(
@@ -367,33 +351,30 @@ def _followed(
             search.progress.begin_stage(truncation_message(cut))
         names = {cut.recording for cut in cuts}
         found = (*(cut for cut in found if cut.recording not in names), *cuts)
-        name = f"the nominal model beside what it can follow ({margin:g})"
-        again = _settled(composed, nominal.values, search.store, name, search.thresholds)
+        shorter = replace(search, problem=composed)
+        again = _settled(shorter, nominal.values, f"the nominal model beside what it can follow ({margin:g})")
         if again is not None:
-            search, nominal = replace(search, problem=composed), again
+            search, nominal = shorter, again
     return search, nominal, found
 
 
 def _offsets_stated(problem: EstimationProblem) -> bool:
-    driving = (
-        e.input_errors is not None and bool(np.any(e.input_errors.torque_bias_std > 0)) for e in problem.episodes
+    """Whether the size of torque offsets or of constant sensor errors is stated."""
+    return any(
+        episode.has_constant_sensor_errors
+        or (episode.input_errors is not None and bool(np.any(episode.input_errors.torque_bias_std > 0)))
+        for episode in problem.episodes
     )
-    return any(driving) or any(e.has_constant_sensor_errors for e in problem.episodes)
 
 
 def _better_nominal_fit(search: RefitContext, nominal: RefitModel) -> RefitModel | None:
-    """Return the nominal model refitted from a start that ends far likelier; None if no start does."""
+    """The nominal model refitted from a start that ends far likelier; None if no start does."""
     search.progress.begin_stage("fitting the nominal model from other starts")
     problem, limits = search.problem.problem, search.thresholds
 
     def begun(factor: float) -> RefitModel | None:
-        start = problem.named_values(
-            np.where(
-                problem.is_positive,
-                np.clip(factor * problem.initial_unknowns, *problem.bounds),
-                problem.initial_unknowns,
-            )
-        )
+        x = problem.initial_unknowns
+        start = problem.named_values(np.where(problem.is_positive, np.clip(factor * x, *problem.bounds), x))
         name = f"the nominal model from {factor:g} times its start"
         return refit_with_effects(search.problem, (), start, search.store, name, limits)
 
@@ -401,28 +382,18 @@ def _better_nominal_fit(search: RefitContext, nominal: RefitModel) -> RefitModel
     for found in map_with_batched_calls(begun, RESTART_FACTORS):
         if found is not None and found.cost < best.cost - limits.min_log_bayes_factor:
             best = found
-    if best is nominal:
-        return None
-    return _settled(search.problem, best.values, search.store, "the nominal model from a better start", limits)
+    return None if best is nominal else _settled(search, best.values, "the nominal model from a better start")
 
 
-def _settled(
-    composed: AllCandidatesProblem, start: Mapping[str, float], store: RefitStore | None, name: str, limits: Thresholds
-) -> RefitModel | None:
+def _settled(search: RefitContext, start: Mapping[str, float], name: str) -> RefitModel | None:
     """The nominal model fitted from a start, under weights that were frozen near its end."""
+    composed, limits = search.problem, search.thresholds
     if composed.problem.has_process_noise:
-        composed, start = _nearer(composed, start, limits)
         composed = composed.whitened_at(start)
-    return refit_with_effects(composed, (), start, store, name, limits)
-
-
-def _nearer(
-    composed: AllCandidatesProblem, start: Mapping[str, float], limits: Thresholds
-) -> tuple[AllCandidatesProblem, Mapping[str, float]]:
-    """The problem weighted at a start, and the nominal fit under these weights."""
-    weighted = composed.whitened_at(start)
-    first = refit_with_effects(weighted, (), start, limits=limits)
-    return weighted, start if first is None else first.values
+        first = refit_with_effects(composed, (), start, limits=limits)
+        start = start if first is None else first.values
+        composed = composed.whitened_at(start)
+    return refit_with_effects(composed, (), start, search.store, name, limits)
 
 
 def _composed(
@@ -450,13 +421,12 @@ def _composed(
 def _after(
     nominal: RefitModel,
     accepted: Sequence[SelectedEffect],
-    smoothed: SmootherResult | None,
+    where: tuple[GapLocation, ...],
     before: NullTestResult,
     held: NullTestResult,
     limits: Thresholds,
 ) -> tuple[NullTestResult, tuple[GapLocation, ...], tuple[GapLocation, ...]]:
     """The held-out null test with the effects, the places of the gap, and those of what is left of it."""
-    where = () if smoothed is None else localise_gap(smoothed, limits.location_z)
     if not accepted:
         return held, where, where
     last = accepted[-1].refitted_model
@@ -464,18 +434,23 @@ def _after(
     left = has_gap(_estimation_null_test(last, limits), remaining, limits)
     rest = localise_gap(_smooth_about_model(last, limits), limits.location_z) if left else ()
     windows = merge_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
-    return remaining, attribute_gap_to_effects(where, _closed(accepted), rest, windows), rest
+    # every effect closes what it adds to those before it
+    closed: dict[str, float] = {}
+    most = 0.0
+    for entry in accepted:
+        place, part = entry.effect.location, entry.cumulative_closure.fraction
+        closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)
+        most = max(part, most)
+    return remaining, attribute_gap_to_effects(where, closed, rest, windows), rest
 
 
-class _Clock:
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-        self.laps: dict[str, float] = {}
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = now - self._last
-        self._last = now
+def _changes(before: RefitModel, after: RefitModel) -> tuple[NominalParameterChange, ...]:
+    """How each nominal parameter changes from one model to another."""
+    parameters = before.problem.system.parameters
+    return tuple(
+        NominalParameterChange(name, parameters[name].unit, before.values[name], after.values[name], after.std[name])
+        for name in before.problem.shared_parameters
+    )
 
 
 def fit_nominal_model(
@@ -497,51 +472,48 @@ def fit_nominal_model(
         known = load_stored_refit(composed.whitened_at(known.values), (), store)
     if known is not None:
         return known
-    start = _nominal_start(problem, composed, solution)
-    fit = _settled(composed, start, store, "", limits)
+    start: Mapping[str, float] = {}
+    # a single recording that is both fitted and held out has no solution yet
+    if solution is not None or not composed.is_split_in_blocks:
+        found = solve(problem, GaussNewton(max_iterations=30)) if solution is None else solution
+        if found.evaluation is None:
+            raise SolverError(f"the nominal model cannot be fitted: {found.message}", where="diagnosis")
+        start = dict(zip(found.unknown_names, map(float, found.x), strict=True))
+    search = RefitContext(composed, limits, NULL_PROGRESS, store)
+    fit = _settled(search, start, "")
     if fit is None and start:
         # a gap may drive parameters so far that the equilibrium which the solver followed is not found again from there
-        fit = _settled(composed, {}, store, "the nominal model from its start", limits)
+        fit = _settled(search, {}, "the nominal model from its start")
     if fit is None:
         raise SolverError("the nominal model cannot be rolled out at its fit", where="diagnosis")
     return fit
 
 
-def _nominal_start(
-    problem: EstimationProblem, composed: AllCandidatesProblem, solution: Solution | None
-) -> Mapping[str, float]:
-    """Unknowns of the nominal model's solution; nothing where a single recording is both fitted and held out."""
-    if solution is None and composed.is_split_in_blocks:
-        return {}
-    found = solve(problem, GaussNewton(max_iterations=30)) if solution is None else solution
-    if found.evaluation is None:
-        raise SolverError(f"the nominal model cannot be fitted: {found.message}", where="diagnosis")
-    return dict(zip(found.unknown_names, map(float, found.x), strict=True))
-
-
 def _largest_joint_angles(fit: RefitModel) -> dict[str, float]:
-    """Return the largest joint angle of each segment in the estimation recordings [rad]."""
-    system = fit.problem.system
+    """The largest joint angle of each segment in the estimation recordings [rad]."""
+    system, states = fit.problem.system, [r.rollout.state for r in fit.evaluation.episode_predictions]
     found = {}
     for segment in system.segment_layouts:
         index = [system.mechanism.joint_index(joint) for link in segment.link_joints for joint in link]
-        found[segment.name] = max(
-            float(np.abs(r.rollout.state[:, index]).max()) for r in fit.evaluation.episode_predictions
-        )
+        found[segment.name] = max(float(np.abs(state[:, index]).max()) for state in states)
     return found
 
 
+def _null_test(
+    problem: EstimationProblem, residual: Array, fit: RefitModel | None, limits: Thresholds
+) -> NullTestResult:
+    """The null test of a residual from which a fit's parameters took their part."""
+    count = 0 if fit is None else len(fit.values)
+    return run_null_test(residual_channels(problem), residual, count, limits.significance_level, limits.residual_window)
+
+
 def _estimation_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
-    """Return the null test of a model on the estimation recordings."""
-    series = residual_channels(fit.problem)
-    return run_null_test(
-        series, fit.evaluation.residual, len(fit.values), limits.significance_level, limits.residual_window
-    )
+    return _null_test(fit.problem, fit.evaluation.residual, fit, limits)
 
 
 def _held_out_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
-    """Return the null test of a model on the held-out recordings."""
-    problem = fit.problem
+    """The null test of a model on the held-out recordings."""
+    problem, shared = fit.problem, len(fit.problem.shared_parameters)
     residuals, slopes = [], []
     for i, (episode, result) in enumerate(problem.predict_held_out(problem.vector(fit.values), True)):
         if isinstance(result, str):
@@ -553,37 +525,23 @@ def _held_out_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS
         rows = problem.held_out_residual(i, episode, result)
         assert rows.jacobian is not None
         residuals.append(rows.residual)
-        slopes.append(rows.jacobian[:, : len(problem.shared_parameters)])
-    series = residual_channels(problem.with_episodes(problem.held_out, ()))
-    spread = np.vstack(slopes) @ noise_covariance_factor(problem, fit.evaluation)[: len(problem.shared_parameters)]
+        slopes.append(rows.jacobian[:, :shared])
+    spread = np.vstack(slopes) @ noise_covariance_factor(problem, fit.evaluation)[:shared]
     residual = whiten_with_extra_errors(np.concatenate(residuals), spread)
-    return run_null_test(series, residual, 0, limits.significance_level, limits.residual_window)
+    return _null_test(problem.with_episodes(problem.held_out, ()), residual, None, limits)
 
 
-def _smooth_about_model(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> SmootherResult:
+def _smooth_about_model(fit: RefitModel, limits: Thresholds) -> SmootherResult:
     """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns."""
     problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
     if problem.has_process_noise:
         problem = whitened_by_sensor_noise(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
     if any(episode.has_constant_sensor_errors for episode in problem.episodes):
-        pairs = zip(problem.episodes, evaluation.episode_predictions, strict=True)
         less = [
             replace(e, measurements=subtract_estimated_biases(e.measurements, result.predicted_outputs))
-            for e, result in pairs
+            for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
         ]
         problem = problem.with_episodes(less, ())
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
     return run_smoother(problem, x, evaluation, limits)
-
-
-def _closed(added: Sequence[SelectedEffect]) -> dict[str, float]:
-    """What the effects at every location close, of the whole gap, each by what it adds to those before it."""
-    closed: dict[str, float] = {}
-    before = 0.0
-    for entry in added:
-        closed[entry.effect.location] = closed.get(entry.effect.location, 0.0) + max(
-            entry.cumulative_closure.fraction - before, 0.0
-        )
-        before = max(entry.cumulative_closure.fraction, before)
-    return closed

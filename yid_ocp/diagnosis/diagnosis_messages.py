@@ -14,8 +14,7 @@ from yid_ocp.diagnosis.refit import RefitModel
 from yid_ocp.diagnosis.screening import CandidateDetectability
 from yid_ocp.diagnosis.select import SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.transfer_check import failed_transfer_checks
-from yid_ocp.diagnosis.verdict import assumption_count, required_explained_fraction
+from yid_ocp.diagnosis.verdict import assumption_count, failed_transfer_checks, required_explained_fraction
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import EXCITATIONS
 from yid_ocp.inference.null_test import NullTestResult
@@ -41,8 +40,6 @@ _NEXT_EXPERIMENT_TEXTS = {
     "effect": "Repeat with other motions to see whether the effect's parameters stay.",
 }
 """Texts of the recommended next experiment, by situation."""
-
-
 _UNKNOWN_REASON_TEXTS = {
     "nothing": "No known effect explains it.",
     "none": "No known effect explains it (the best, {best}, is not sure to be there and to close a part).",
@@ -56,47 +53,36 @@ _UNKNOWN_REASON_TEXTS = {
 
 
 def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
-    """Return the experiment that separates indistinguishable effects, from what their equations depend on."""
+    """The experiment that separates indistinguishable effects, from what their equations depend on."""
     said = list(dict.fromkeys(effect.required_excitation for effect in rivals if effect.required_excitation))
     aspects = sorted(said, key=lambda aspect: EXCITATIONS.index(aspect) if aspect in EXCITATIONS else len(EXCITATIONS))
     places = list(dict.fromkeys(effect.location for effect in rivals))
-    if len(aspects) > 1:
-        return _NEXT_EXPERIMENT_TEXTS["separate"].format(aspects=" and ".join(aspects))
-    if len(places) > 1:
-        return _NEXT_EXPERIMENT_TEXTS["places"].format(places=" and ".join(places))
-    return _NEXT_EXPERIMENT_TEXTS["vary"].format(aspects=aspects[0]) if aspects else _NEXT_EXPERIMENT_TEXTS["other"]
+    case = "separate" if len(aspects) > 1 else "places" if len(places) > 1 else "vary" if aspects else "other"
+    return _NEXT_EXPERIMENT_TEXTS[case].format(aspects=" and ".join(aspects), places=" and ".join(places))
 
 
 def next_experiment_text(
-    verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], unseen: Sequence[str]
+    verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], seen: Sequence[CandidateDetectability]
 ) -> str:
     """Return the recommended next recording as text."""
-    if verdict == "insufficient_data":
-        return _NEXT_EXPERIMENT_TEXTS["insufficient_data"]
     rivals = next((entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1), ())
-    if rivals:
+    if rivals and verdict != "insufficient_data":
         return _separating_experiment(rivals)
-    if verdict == "unknown" and where and where[0].gap_share > 0 and where[0].location not in _IMMOVABLE_LOCATIONS:
-        return _NEXT_EXPERIMENT_TEXTS["unknown"].format(place=where[0].location)
-    if verdict == "unknown":
-        return _NEXT_EXPERIMENT_TEXTS["other"]
+    unseen = [entry.effect.label for entry in seen if not entry.is_detectable]
+    place = where[0].location if where and where[0].gap_share > 0 else ""
+    case = verdict if verdict in _NEXT_EXPERIMENT_TEXTS else "effect"
+    if verdict == "unknown" and place in ("", *_IMMOVABLE_LOCATIONS):
+        case = "other"
     if verdict == "no_gap" and unseen:
-        return _NEXT_EXPERIMENT_TEXTS["unseen"].format(
-            unseen=", ".join(unseen[:4]) + (", ..." if len(unseen) > 4 else "")
-        )
-    return _NEXT_EXPERIMENT_TEXTS["no_gap"] if verdict == "no_gap" else _NEXT_EXPERIMENT_TEXTS["effect"]
+        case = "unseen"
+    listed = ", ".join(unseen[:4]) + (", ..." if len(unseen) > 4 else "")
+    return _NEXT_EXPERIMENT_TEXTS[case].format(place=place, unseen=listed)
 
 
 def insufficient_data_message(
     verdict: str, before: NullTestResult, unknowns: int, seen: Sequence[CandidateDetectability], limits: Thresholds
 ) -> str:
-    """Return why the data are insufficient; empty if they suffice.
-
-    Parameters
-    ----------
-    before : NullTestResult
-        Of the nominal model, on the recordings to estimate on.
-    """
+    """Return why the data are insufficient; empty if they suffice."""
     if verdict != "insufficient_data":
         return ""
     if not any(entry.is_detectable for entry in seen):
@@ -126,7 +112,7 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
         text.append(_nameless(finding))
     text += [truncation_message(cut) for cut in finding.truncated_recordings]
     if finding.baseline_comparison is not None:
-        text.append(_since(finding.baseline_comparison, bool(finding.accepted_effects)))
+        text += _since(finding.baseline_comparison, bool(finding.accepted_effects))
     if finding.counterfactual is not None:
         text += _counterfactual(finding.counterfactual)
     if finding.is_split_in_blocks:
@@ -134,9 +120,8 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
             "No held-out recording is left" if finding.truncated_recordings else "Only one set of recordings was given"
         )
         text.append(f"{why}: alternate blocks of what is estimated on were held out.")
-    text.append(_event_sentences(finding.events))
-    text.append(f"Next experiment: {finding.next_experiment}")
-    return " ".join(part for part in text if part)
+    text += [_event_sentences(finding.events), f"Next experiment: {finding.next_experiment}"]
+    return " ".join(filter(None, text))
 
 
 def _gap(finding: DiagnosisResult) -> str:
@@ -159,49 +144,40 @@ def _gap(finding: DiagnosisResult) -> str:
 
 
 def _places(finding: DiagnosisResult) -> str:
-    """Where it lies; empty where nothing says so."""
-    shares = [(_one_of(p), round(100 * p.gap_share)) for p in main_gap_locations(finding.gap_locations)]
+    """Where it lies, places that the data cannot tell apart together; empty where nothing says so."""
+    shares = [
+        (" or ".join([p.location, *p.indistinguishable_from]), round(100 * p.gap_share))
+        for p in main_gap_locations(finding.gap_locations)
+    ]
     named = " and ".join(f"{place} ({percent} %)" for place, percent in shares if percent)
     side = "" if finding.smoother_result is None else _GAP_ORIGIN_PHRASES.get(finding.smoother_result.gap_origin, "")
-    if named:
-        return f"It lies in {named}{side}."
-    return "These data do not tell where it lies." if shares else ""
+    silent = "These data do not tell where it lies." if shares else ""
+    return f"It lies in {named}{side}." if named else silent
 
 
 def _nameless(finding: DiagnosisResult) -> str:
     """Why no effect is named, with the numbers that say so."""
-    if finding.unknown_reason == "none":
-        best = finding.single_effect_models[0] if finding.single_effect_models else None
-        return (
-            _UNKNOWN_REASON_TEXTS["nothing"]
-            if best is None
-            else _UNKNOWN_REASON_TEXTS["none"].format(best=best.effects[0].label)
-        )
-    names = " and ".join(entry.effect.label for entry in finding.selected_effects)
+    added, tried, reason = finding.selected_effects, finding.single_effect_models, finding.unknown_reason
     apart = [entry.disagreement for entry in failed_transfer_checks(finding.transfer_checks)]
-    count = assumption_count(finding.selected_effects)
-    return _UNKNOWN_REASON_TEXTS[finding.unknown_reason].format(
-        names=names,
-        s="s" if len(finding.selected_effects) == 1 else "",
-        are="is" if len(finding.selected_effects) == 1 else "are",
+    count = assumption_count(added)
+    return _UNKNOWN_REASON_TEXTS[reason if reason != "none" or tried else "nothing"].format(
+        best=tried[0].effects[0].label if tried else "",
+        names=" and ".join(entry.effect.label for entry in added),
+        s="s" if len(added) == 1 else "",
+        are="is" if len(added) == 1 else "are",
         closure=100 * finding.gap_closure.fraction,
         low=100 * finding.gap_closure.ci_low,
         least=100 * finding.thresholds.min_gap_closed,
         explained=100 * finding.explained_fraction,
         asked=f"of the former are asked of {count} assumptions" if count > 1 else "of either are asked",
-        enough=100 * required_explained_fraction(finding.selected_effects, finding.thresholds),
+        enough=100 * required_explained_fraction(added, finding.thresholds),
         apart="; ".join(apart[:2]),
     )
 
 
-def _one_of(place: GapLocation) -> str:
-    """A place and those that the data cannot tell from it."""
-    return " or ".join([place.location, *place.indistinguishable_from])
-
-
 def _effects(finding: DiagnosisResult) -> list[str]:
     """What was added, what it closes, what it cannot be told from, and what remains."""
-    last, total = finding.final_model, finding.gap_closure
+    last, total, rest = finding.final_model, finding.gap_closure, finding.remaining_test
     names = "; ".join(f"{e.label} with {_figures(e, last)}" for e in finding.accepted_effects)
     verb = "closes" if len(finding.accepted_effects) == 1 else "together close"
     odds = math.exp(finding.thresholds.min_log_bayes_factor)
@@ -214,103 +190,86 @@ def _effects(finding: DiagnosisResult) -> list[str]:
     ]
     for entry in finding.selected_effects:
         others = [r.label for r in entry.equivalent_effects if r.label != entry.effect.label]
-        if others:
-            text.append(f"Not separable from {entry.effect.label}: {', '.join(others)}.")
+        text += [f"Not separable from {entry.effect.label}: {', '.join(others)}."] if others else []
     odd = [said for effect in finding.accepted_effects for said in _out_of_range(effect, last)]
     if odd:
         text.append(f"Beyond what one would expect, and so perhaps standing in for something else: {', '.join(odd)}.")
-    text.append(_remains(finding))
+    if rest.chi2_per_dof > 1 and rest.p_value < finding.thresholds.significance_level:
+        mostly = "".join(f", most of it in {place.location}" for place in finding.remaining_gap_locations[:1])
+        text.append(f"What remains: held-out chi2 per degree of freedom {rest.chi2_per_dof:.3g}{mostly}.")
+    else:
+        text.append("What remains is noise.")
     moved = [
-        a
+        f"{a.name} goes from {a.value_before:.3g} to {a.value_after:.3g}"
         for a in finding.nominal_changes
         if abs(a.value_after - a.value_before) > _MIN_RELATIVE_CHANGE * max(abs(a.value_before), 1e-9)
     ]
-    if moved:
-        steps = (f"{a.name} goes from {a.value_before:.3g} to {a.value_after:.3g}" for a in moved[:6])
-        text.append(f"With it {', '.join(steps)}.")
-    return text
-
-
-def _since(found: BaselineComparison, effects: bool) -> str:
-    """What has moved since the baseline, and what a baseline that explained little is worth."""
-    several = len(found.baseline_runs) > 1
-    said = "Against the baseline" + (f" of {len(found.baseline_runs)} runs" if several else "")
-    if found.changed_parameters:
-        moved = (
-            f"{e.name} is {e.current_value:.3g} ± {e.current_std:.2g} {e.unit} where it was "
-            f"{e.baseline_value:.3g} ± {e.baseline_std:.2g}"
-            for e in found.changed_parameters[:4]
-        )
-        text = f"{said}, {'even with that ' if effects else ''}{', '.join(moved)}."
-    else:
-        seen = [entry for entry in found.parameter_shifts if entry.z_score is not None]
-        text = f"{said}, " + (
-            "no parameter has changed." if seen else "these recordings say nothing of the parameters."
-        )
-    if several and found.between_runs_p_value < _RUNS_DIFFER_LEVEL:
-        p_value = f"p = {found.between_runs_p_value:.2g}"
-        text += f" The runs of the baseline differ among themselves ({p_value}); their ± is wider for it."
-    if not found.is_baseline_explained:
-        text += (
-            " The model did not explain the baseline's recordings, so its ± counts that misfit and may be too small."
-        )
-    return text
-
-
-def _counterfactual(found: CounterfactualTest) -> list[str]:
-    """Whether taking the effects away predicts the world without them, and adding them the world with them."""
-    text = []
-    parts = (
-        (
-            "Taken away again, it predicts",
-            found.effects_removed,
-            "made without it",
-            "as it was fitted without a diagnosis",
-        ),
-        ("Added to what was known without it, it predicts", found.effects_added, "made with it", "without it"),
-    )
-    for begin, part, made, rival in parts:
-        if part.failure_message:
-            text.append(f"What was {made} could not be predicted ({part.failure_message}).")
-            continue
-        names = " and ".join(name.removesuffix(" (without)") for name in part.recordings[:2]) + (
-            " and others" if len(part.recordings) > 2 else ""
-        )
-        errors = ", ".join(f"{after:.2g} {unit}" for unit, (_, after) in part.rmse_by_unit.items())
-        plain = ", ".join(f"{before:.2g} {unit}" for unit, (before, _) in part.rmse_by_unit.items())
-        text.append(f"{begin} {names}, {made}, to {errors} (rms), where the model {rival} has {plain}.")
-        if not part.is_improved:
-            text.append("That is no better, so it may stand in for something else.")
-    return text
-
-
-def _remains(finding: DiagnosisResult) -> str:
-    rest = finding.remaining_test
-    if rest.chi2_per_dof > 1 and rest.p_value < finding.thresholds.significance_level:
-        place = (
-            f", most of it in {finding.remaining_gap_locations[0].location}" if finding.remaining_gap_locations else ""
-        )
-        return f"What remains: held-out chi2 per degree of freedom {rest.chi2_per_dof:.3g}{place}."
-    return "What remains is noise."
+    return [*text, f"With it {', '.join(moved[:6])}."] if moved else text
 
 
 def _figures(effect: EffectBase, fit: RefitModel) -> str:
-    parts = []
-    for name, r in fit.reported_parameters(effect).items():
-        known = f"{name} = {r.value:.3g} ± {r.std:.2g} {r.unit}".strip().removesuffix(" 1")
-        parts.append(known if math.isfinite(r.std) else f"{name} unknown")
-    return ", ".join(parts)
+    known = {
+        name: f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".strip().removesuffix(" 1")
+        if math.isfinite(r.std)
+        else "unknown"
+        for name, r in fit.reported_parameters(effect).items()
+    }
+    return ", ".join(f"{name} {said}" for name, said in known.items())
 
 
 def _out_of_range(effect: EffectBase, fit: RefitModel) -> list[str]:
     """Amplitudes beyond the range that an engineer would expect."""
     found = []
     for name in effect.amplitude_names:
-        low, high = effect.prior_ranges[name]
+        (low, high), value = effect.prior_ranges[name], fit.values[name]
         room = _PRIOR_RANGE_TOLERANCE * (high - low)
-        if not low - room <= fit.values[name] <= high + room and effect.neutral_values[name] != fit.values[name]:
-            found.append(f"{name} = {fit.values[name]:.3g} (range {low:.3g} to {high:.3g})")
+        if not low - room <= value <= high + room and effect.neutral_values[name] != value:
+            found.append(f"{name} = {value:.3g} (range {low:.3g} to {high:.3g})")
     return found
+
+
+def _since(found: BaselineComparison, effects: bool) -> list[str]:
+    """What has moved since the baseline, and what a baseline that explained little is worth."""
+    several, p_value = len(found.baseline_runs), found.between_runs_p_value
+    moved = [
+        f"{e.name} is {e.current_value:.3g} ± {e.current_std:.2g} {e.unit} where it was "
+        f"{e.baseline_value:.3g} ± {e.baseline_std:.2g}"
+        for e in found.changed_parameters[:4]
+    ]
+    seen = any(entry.z_score is not None for entry in found.parameter_shifts)
+    none = "no parameter has changed" if seen else "these recordings say nothing of the parameters"
+    what = f"{'even with that ' if effects else ''}{', '.join(moved)}" if moved else none
+    text = [f"Against the baseline{f' of {several} runs' if several > 1 else ''}, {what}."]
+    if several > 1 and p_value < _RUNS_DIFFER_LEVEL:
+        text.append(f"The runs of the baseline differ among themselves (p = {p_value:.2g}); their ± is wider for it.")
+    if not found.is_baseline_explained:
+        text.append(
+            "The model did not explain the baseline's recordings, so its ± counts that misfit and may be too small."
+        )
+    return text
+
+
+_COUNTERFACTUAL_TEXTS = (
+    ("Taken away again, it predicts", "made without it", "as it was fitted without a diagnosis"),
+    ("Added to what was known without it, it predicts", "made with it", "without it"),
+)
+"""Beginning, how the recordings were made, and what the prediction is compared with: effects removed, and added."""
+
+
+def _counterfactual(found: CounterfactualTest) -> list[str]:
+    """Whether taking the effects away predicts the world without them, and adding them the world with them."""
+    text = []
+    both = (found.effects_removed, found.effects_added)
+    for part, (begin, made, rival) in zip(both, _COUNTERFACTUAL_TEXTS, strict=True):
+        if part.failure_message:
+            text.append(f"What was {made} could not be predicted ({part.failure_message}).")
+            continue
+        names = " and ".join(name.removesuffix(" (without)") for name in part.recordings[:2])
+        names += " and others" if len(part.recordings) > 2 else ""
+        plain, errors = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in part.rmse_by_unit.items()) for i in (0, 1))
+        text.append(f"{begin} {names}, {made}, to {errors} (rms), where the model {rival} has {plain}.")
+        text += [] if part.is_improved else ["That is no better, so it may stand in for something else."]
+    return text
 
 
 # -- events ---------------------------------------------------------------------------------------------------------
@@ -319,10 +278,9 @@ _MAX_EVENTS_LISTED = 8  # maximum number of events listed one by one
 
 
 def _event_sentences(events: EventSet) -> str:
-    """Return the sentences on all events: what, where, when; empty if there are none."""
-    text = []
-    if events.disturbances:
-        count = len(events.disturbances)
+    """The sentences on all events: what, where, when; empty if there are none."""
+    text, count = [], len(events.disturbances)
+    if count:
         told = "; ".join(_said(event) for event in events.disturbances[:_MAX_EVENTS_LISTED])
         more = f"; and {count - _MAX_EVENTS_LISTED} more" if count > _MAX_EVENTS_LISTED else ""
         first = "One event stands" if count == 1 else f"{count} events stand"

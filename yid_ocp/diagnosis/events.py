@@ -1,13 +1,10 @@
-"""Events: pushes, snags and wrong samples, each in its place and window.
+"""Events: pushes, snags and wrong samples, each in its place and window; a gap that lives there is no effect's.
 
-A gap that lives in short windows is no effect of the model. Along prescribed joints whose efforts are compared the
-unknown force is measured minus needed torque, sample by sample; elsewhere it is what the smoother's linear model says
-of the force at one coordinate, everything else as the smoother has it. In both cases `detect_pulses` looks for
-what rises and falls beside a rest that follows the load. What a sensor says for one to three samples alone is an event
-of that sensor.
-
-What events explain is taken out before anything else is judged: torques act beside the recorded ones, and samples that
-a prescribed joint or a sensor has in an event's window do not count.
+Along prescribed joints whose efforts are compared the unknown force is measured minus needed torque, sample by sample;
+elsewhere it is what the smoother's linear model says of the force at one coordinate, everything else as the smoother
+has it. In both cases `detect_pulses` looks for what rises and falls beside a rest that follows the load. What a sensor
+says for one to three samples alone is an event of that sensor. What events explain is taken out before anything else is
+judged: torques act beside the recorded ones, and samples in an event's window do not count.
 """
 
 from __future__ import annotations
@@ -22,6 +19,8 @@ import threadpoolctl
 from numpy.typing import NDArray
 
 from yid_ocp.data.channel_checks import quantization_step
+from yid_ocp.diagnosis.hypotheses import hide_samples
+from yid_ocp.diagnosis.localise import force_unit, surely_not_zero
 from yid_ocp.diagnosis.pulse_detection import (
     MAX_EVENT_TIME_FRACTION,
     DetectedPulse,
@@ -31,9 +30,10 @@ from yid_ocp.diagnosis.pulse_detection import (
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects.base import robot_joints
+from yid_ocp.files import attributes_to_json
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, sample_times
 from yid_ocp.inference.smoother import SmootherResult, force_likelihood_terms
-from yid_ocp.inference.smoother_model import LinearResidualModel, linear_residual_models, sensor_bias_location
+from yid_ocp.inference.smoother_model import linear_residual_models, sensor_bias_location
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
@@ -76,20 +76,14 @@ class DisturbanceEvent:
     unit: str
     detected_pulse: DetectedPulse | None = None  # shape of a force
 
+    def overlap(self, other: DisturbanceEvent) -> float:
+        """Time for which both last, of whatever recording [s]; negative where one begins after the other."""
+        return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
+
     def to_dict(self) -> dict[str, Any]:
         """As in result.json."""
-        return {
-            "recording": self.recording,
-            "location": self.location,
-            "channel": self.channel,
-            "kind": self.kind,
-            "from": self.start_time,
-            "to": self.end_time,
-            "impulse": self.impulse,
-            "peak": self.peak_value,
-            "unit": self.unit,
-            "std": self.impulse_std,
-        }
+        names = "recording location channel kind from=start_time to=end_time impulse peak=peak_value unit"
+        return attributes_to_json(self, f"{names} std=impulse_std")
 
 
 @dataclass(frozen=True)
@@ -103,16 +97,14 @@ class Overspeed:
 
 @dataclass(frozen=True)
 class EventForceSeries:
-    """Time series of the unknown force at a coordinate with an event, for plots."""
+    """Time series of the unknown force at a coordinate with an event, for plots; shape (M,) each."""
 
     recording: str
     channel: str
     unit: str
-    # shape (M,): since the start of the recording [s]; the force beside what the model and the recording have,
-    # each point for itself, and what the model may be wrong by, in `unit`
-    t: Array
-    force: Array
-    allowed_model_error: Array
+    t: Array  # since the start of the recording [s]
+    force: Array  # beside what the model and the recording have, each point for itself, in `unit`
+    allowed_model_error: Array  # what the model may be wrong by, in `unit`
 
 
 @dataclass(frozen=True)
@@ -128,12 +120,9 @@ class EventSet:
 
     def overlaps_with(self, other: EventSet) -> bool:
         """Whether both hold events of the same channels at overlapping times."""
-        pairs = zip(self.disturbances, other.disturbances, strict=False)
         return len(self.disturbances) == len(other.disturbances) and all(
-            (a.recording, a.channel) == (b.recording, b.channel)
-            and a.start_time < b.end_time
-            and b.start_time < a.end_time
-            for a, b in pairs
+            (a.recording, a.channel) == (b.recording, b.channel) and a.overlap(b) > 0
+            for a, b in zip(self.disturbances, other.disturbances, strict=True)
         )
 
     @property
@@ -150,6 +139,10 @@ class EventSet:
         """Return the events of one recording."""
         return tuple(event for event in self.disturbances if event.recording == recording)
 
+    def _end_of(self, recording: str) -> float:
+        """Time after which a recording is ignored [s]; infinite if it is used to its end."""
+        return min((fall.start_time for fall in self.overspeeds if fall.recording == recording), default=math.inf)
+
 
 NO_EVENTS = EventSet()
 
@@ -161,24 +154,17 @@ def find_events(
     smoothed: SmootherResult | None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> EventSet:
-    """Find events in all recordings of a problem, estimation and held-out.
+    """Find events in all recordings of a problem that are more than chance, by the false-discovery rate of all windows.
 
     Parameters
     ----------
     problem : EstimationProblem
         Whitened by the sensors' noise, with all samples.
     x : ndarray, shape (nx,)
-        Its fit.
-    evaluation : Evaluation
-        At `x`, with its Jacobian.
+        Its fit, at which `evaluation` has a Jacobian where there is `smoothed`.
     smoothed : SmootherResult or None
         What the smoother found about that fit; forces that move the model are sought where it found some, in the
         recordings that were estimated on.
-
-    Returns
-    -------
-    EventSet
-        Those that are more than chance among all windows of all recordings, by the false-discovery rate.
     """
     runs: list[_RecordingRollout] = []
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
@@ -187,19 +173,13 @@ def find_events(
     for episode, outcome in problem.predict_held_out(x):
         if not isinstance(outcome, str):
             runs.append((episode, outcome, problem.predictor.episode_theta(episode, shared)))
-    falls = tuple(fall for run in runs for fall in _falls(problem, run, limits))
-    until = {fall.recording: fall.start_time for fall in falls}
-    wrong = [
-        event
-        for run in runs
-        for event in _wrong_samples(problem, run)
-        if event.end_time < until.get(event.recording, math.inf)
-    ]
+    ends = EventSet((), tuple(fall for run in runs for fall in _overspeed(problem, run, limits)))
+    wrong = [e for run in runs for e in _wrong_samples(problem, run) if e.end_time < ends._end_of(e.recording)]
     torques = InverseDynamicsModel(problem.step)
     histories = [history for run in runs for history in _read_forces(problem, run, torques, limits)]
     if smoothed is not None:
         histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques, limits)
-    cut = [entry for entry in (_before_fall(history, falls, limits) for history in histories) if entry is not None]
+    cut = [entry for entry in (_before_overspeed(history, ends) for history in histories) if entry is not None]
     found: list[tuple[ForceEstimate, DetectedPulse]] = []
     tries = 0.0
     for history in cut:
@@ -217,40 +197,36 @@ def find_events(
         forces = single
     everything = sorted([*forces, *wrong], key=lambda event: (event.recording, event.start_time, event.location))
     there = {(event.recording, event.channel) for event in forces}
-    shown = [
+    shown = tuple(
         EventForceSeries(
             h.recording, h.coordinate, h.unit, h.t, h.force_values, np.hypot(h.model_error_std, h.friction_limit)
         )
         for h in cut
         if (h.recording, h.coordinate) in there
-    ]
-    return EventSet(tuple(everything), falls, tuple(shown))
+    )
+    return EventSet(tuple(everything), ends.overspeeds, shown)
 
 
 # -- forces -----------------------------------------------------------------------------------------------------------
 
 
-def _falls(problem: EstimationProblem, run: _RecordingRollout, limits: Thresholds) -> Iterator[Overspeed]:
-    """When a joint of the robot first moves faster than `fall`."""
+def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thresholds) -> Iterator[Overspeed]:
+    """When a joint of the robot first moves too fast."""
     episode, result, _ = run
-    names = problem.system.mechanism.joint_names
-    h = episode.grid.time_step
+    names, h = problem.system.mechanism.joint_names, episode.grid.time_step
     places = [names.index(name) for name in robot_joints(problem.system)]
     if not places:
         return
     speed = np.abs(np.gradient(result.rollout.state[:, places], h, axis=0))
-    fast = np.flatnonzero(np.any(speed > limits.max_joint_speed, axis=1))
-    if len(fast):
-        yield Overspeed(episode.name, names[places[int(speed[fast[0]].argmax())]], float(fast[0] * h))
+    for at in np.flatnonzero(np.any(speed > limits.max_joint_speed, axis=1))[:1]:
+        yield Overspeed(episode.name, names[places[int(speed[at].argmax())]], float(at * h))
 
 
-def _before_fall(history: ForceEstimate, falls: Sequence[Overspeed], limits: Thresholds) -> ForceEstimate | None:
+def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
     """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
-    until = min((fall.start_time for fall in falls if fall.recording == history.recording), default=math.inf)
-    keep = np.flatnonzero(history.t <= until - effort_filter(history.filter_cutoff).settling_time)
-    if len(keep) < 10:
-        return None
-    return history.subset_at(keep)
+    until = ends._end_of(history.recording) - effort_filter(history.filter_cutoff).settling_time
+    keep = np.flatnonzero(history.t <= until)
+    return None if len(keep) < 10 else history.subset_at(keep)
 
 
 def _allowed(
@@ -262,9 +238,8 @@ def _allowed(
     joints = episode.recording.joints
     # a torque is known at no better time than that of a sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
-    return np.hypot(
-        limits.inverse_dynamics_rtol * terms.rss_torque, late * terms.torque_rate
-    ), terms.static_friction_limit
+    error = np.hypot(limits.inverse_dynamics_rtol * terms.rss_torque, late * terms.torque_rate)
+    return error, terms.static_friction_limit
 
 
 def _read_forces(
@@ -272,10 +247,8 @@ def _read_forces(
 ) -> Iterator[ForceEstimate]:
     """Histories of prescribed joints whose efforts are compared: needed less measured torque."""
     episode, result, _ = run
-    tree = problem.system.mechanism
-    for samples, predicted in zip(
-        subtract_estimated_biases(episode.measurements, result.predicted_outputs), result.predicted_outputs, strict=True
-    ):
+    unbiased = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
+    for samples, predicted in zip(unbiased, result.predicted_outputs, strict=True):
         if not samples.sensor.effort_joints or samples.node.ndim > 1 or len(samples.node) < 10:
             continue
         error, held = _allowed(torques, run, samples.node, limits)
@@ -289,21 +262,11 @@ def _read_forces(
         together[bins, np.arange(len(times))] = 1.0
         mean = together / together.sum(axis=1, keepdims=True)
         for column, joint in enumerate(samples.sensor.effort_joints):
-            at, square = tree.joint_index(joint), weight[:, column] ** 2
-            unit = "N" if tree.joints[at].kind == "prismatic" else "N m"
-            whole = ForceEstimate(
-                episode.name,
-                joint,
-                joint,
-                unit,
-                mean @ times,
-                together @ (square * value[:, column]),
-                np.diag(together @ square),
-                mean @ error[:, at],
-                mean @ held[:, at],
-                problem.options.path_cutoff,
-            )
-            yield from _spans(whole, limits)
+            at, square = problem.system.mechanism.joint_index(joint), weight[:, column] ** 2
+            score, information = together @ (square * value[:, column]), np.diag(together @ square)
+            what = (episode.name, joint, joint, force_unit(problem.system, joint))
+            allowed = (mean @ error[:, at], mean @ held[:, at], problem.options.path_cutoff)
+            yield from _spans(ForceEstimate(*what, mean @ times, score, information, *allowed), limits)
 
 
 def _spans(whole: ForceEstimate, limits: Thresholds) -> Iterator[ForceEstimate]:
@@ -311,8 +274,7 @@ def _spans(whole: ForceEstimate, limits: Thresholds) -> Iterator[ForceEstimate]:
     overlap = math.ceil(2 * limits.max_event_duration / whole.sample_spacing)
     length = max(_MAX_SPAN_POINTS, 3 * overlap)
     for begin in range(0, max(len(whole.t) - overlap, 1), length - overlap):
-        keep = np.arange(begin, min(begin + length, len(whole.t)))
-        yield whole.subset_at(keep)
+        yield whole.subset_at(np.arange(begin, min(begin + length, len(whole.t))))
 
 
 def _driving_forces(
@@ -326,20 +288,25 @@ def _driving_forces(
 ) -> list[ForceEstimate]:
     """Histories of coordinates that move under unknown forces, where the smoother found some for part of the time."""
     sought = {trace.recording: _short(smoothed, i, limits) for i, trace in enumerate(smoothed.smoothed_unknowns)}
+    found: list[ForceEstimate] = []
     if not any(sought.values()):
-        return []
-    found = []
+        return found
     with threadpoolctl.threadpool_limits(1):
-        for model, run in zip(
-            linear_residual_models(problem, x, evaluation, limits, _FORCE_INTERVAL), runs, strict=False
-        ):
+        models = linear_residual_models(problem, x, evaluation, limits, _FORCE_INTERVAL)
+        for model, run in zip(models, runs, strict=False):
             if not sought[model.recording]:
                 continue
             middle = (model.interval_edges[:-1] + model.interval_edges[1:]) / 2
-            allowed = _allowed(torques, run, np.rint(middle / run[0].grid.time_step).astype(np.int64), limits)
-            for unknown in sought[model.recording]:
-                index = model.unknown_names.index(unknown)
-                found.append(_driving_force(problem, model, index, smoothed, middle, allowed))
+            error, held = _allowed(torques, run, np.rint(middle / run[0].grid.time_step).astype(np.int64), limits)
+            # the last interval is shorter than the others
+            full = slice(0, max(len(middle) - 1, 1))
+            for name in sought[model.recording]:
+                index, at = model.unknown_names.index(name), problem.system.mechanism.joint_index(name)
+                source, size = model.unknown_groups[index], model.reference_std[index]
+                score, information = force_likelihood_terms(model, smoothed.group_variance | {source: 0.0}, index)
+                what = (model.recording, source.location, name, force_unit(problem.system, name), middle[full])
+                known = (score[full] / size, information[full, full] / size**2)
+                found.append(ForceEstimate(*what, *known, error[full, at], held[full, at]))
     return found
 
 
@@ -349,39 +316,10 @@ def _short(smoothed: SmootherResult, recording: int, limits: Thresholds) -> list
     for i, source in enumerate(trace.unknown_groups):
         if source.kind != "force" or source.is_confounded_with_bias or not smoothed.group_variance[source]:
             continue
-        sure = np.abs(trace.posterior_mean[:, i]) > limits.location_z * np.maximum(trace.posterior_std[:, i], 1e-12)
+        sure = surely_not_zero(trace, [i], limits.location_z)
         if np.any(sure) and np.mean(sure) <= MAX_EVENT_TIME_FRACTION:
             names.append(trace.unknown_names[i])
     return names
-
-
-def _driving_force(
-    problem: EstimationProblem,
-    model: LinearResidualModel,
-    unknown: int,
-    smoothed: SmootherResult,
-    middle: Array,
-    allowed: tuple[Array, Array],
-) -> ForceEstimate:
-    source, tree = model.unknown_groups[unknown], problem.system.mechanism
-    at = tree.joint_index(model.unknown_names[unknown])
-    score, information = force_likelihood_terms(model, smoothed.group_variance | {source: 0.0}, unknown)
-    error, held = allowed
-    unit = "N" if tree.joints[at].kind == "prismatic" else "N m"
-    size = model.reference_std[unknown]
-    # the last interval is shorter than the others
-    full = slice(0, len(middle) - 1) if len(middle) > 1 else slice(None)
-    return ForceEstimate(
-        model.recording,
-        source.location,
-        model.unknown_names[unknown],
-        unit,
-        middle[full],
-        score[full] / size,
-        information[full, full] / size**2,
-        error[full, at],
-        held[full, at],
-    )
 
 
 def _one_each(
@@ -389,39 +327,23 @@ def _one_each(
 ) -> list[DisturbanceEvent]:
     """Events of forces; where one push moves the model, it is named at the coordinate that explains most of it."""
     prescribed = set(problem.system.prescribed)
-    kept: list[tuple[ForceEstimate, DetectedPulse]] = []
+    kept: list[DisturbanceEvent] = []
     for history, pulse in sorted(found, key=lambda entry: entry[1].p_value):
-        same = [
-            p
-            for h, p in kept
-            if h.recording == history.recording and not {h.coordinate, history.coordinate} <= prescribed
-        ]
-        if all(pulse.end_time <= other.start_time or pulse.start_time >= other.end_time for other in same):
-            kept.append((history, pulse))
-    return [
-        DisturbanceEvent(
-            history.recording,
-            history.location,
-            history.coordinate,
-            "force",
-            pulse.start_time,
-            pulse.end_time,
-            pulse.peak_value,
-            pulse.impulse,
-            pulse.peak_std * pulse.unit_impulse,
-            history.unit,
-            pulse,
-        )
-        for history, pulse in kept
-    ]
+        what = (history.recording, history.location, history.coordinate, "force", pulse.start_time, pulse.end_time)
+        size = (pulse.peak_value, pulse.impulse, pulse.peak_std * pulse.unit_impulse, history.unit)
+        event = DisturbanceEvent(*what, *size, pulse)
+        same = [e for e in kept if e.recording == event.recording and not {e.channel, event.channel} <= prescribed]
+        if all(event.overlap(other) <= 0 for other in same):
+            kept.append(event)
+    return kept
 
 
 def _recurs(one: DisturbanceEvent, other: DisturbanceEvent) -> bool:
     """Whether the same force is there at the same time of another recording."""
     if one.recording == other.recording or one.channel != other.channel or one.peak_value * other.peak_value < 0:
         return False
-    both = min(one.end_time, other.end_time) - max(one.start_time, other.start_time)
-    return both > _MIN_RECURRENCE_OVERLAP * max(one.end_time - one.start_time, other.end_time - other.start_time)
+    longer = max(one.end_time - one.start_time, other.end_time - other.start_time)
+    return one.overlap(other) > _MIN_RECURRENCE_OVERLAP * longer
 
 
 # -- wrong samples ----------------------------------------------------------------------------------------------------
@@ -431,35 +353,33 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
     """Samples that their neighbours contradict: of sensors beside their prediction, of joints as they were recorded."""
     episode, result, _ = run
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
-        if samples.sensor.effort_joints or samples.node.ndim > 1:
+        sensor = samples.sensor
+        if sensor.effort_joints or samples.node.ndim > 1:
             continue
         t = sample_times(episode, samples)
         for column, channel in enumerate(samples.channel_of_column):
-            seen = samples.is_used[:, column]
-            location = sensor_bias_location(problem.system, samples.sensor, samples.sensor.output_frames[column])
-            if samples.sensor.outputs_per_channel == 1:
-                location = channel.rpartition(".")[2]
+            location = channel.rpartition(".")[2]
+            if sensor.outputs_per_channel > 1:
+                location = sensor_bias_location(problem.system, sensor, sensor.output_frames[column])
+            seen, about = samples.is_used[:, column], (location, sensor.output_names[column], sensor.unit)
             values = (samples.value - predicted)[seen, column]
-            about = (episode.name, location, samples.sensor.output_names[column], samples.sensor.unit)
-            yield from _alone(t[seen], values, samples.std[seen, column], about)
+            yield from _alone(t[seen], values, samples.std[seen, column], episode.name, about)
     joints = episode.recording.joints
     if joints is None:
         return
     for quantity in ("position", "effort"):
         values, unit = joints.channels.get(quantity), CHANNELS[f"joints.{quantity}"].unit
-        channels = [f"joints.{quantity}.{joint}" for joint in joints.names]
-        for column, (joint, channel) in enumerate(zip(joints.names, channels, strict=True)):
+        for column, joint in enumerate(joints.names):
             floor = _floor(problem, episode, joint, quantity)
             if values is not None and floor is not None:
                 noise = np.full(len(joints.t), max(floor, quantization_step(values[:, column])))
-                about = (episode.name, joint, channel, unit)
-                yield from _alone(joints.t - episode.grid.start_time, values[:, column], noise, about)
+                about = (joint, f"joints.{quantity}.{joint}", unit)
+                yield from _alone(joints.t - episode.grid.start_time, values[:, column], noise, episode.name, about)
 
 
 def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: str) -> float | None:
     """Noise of what one joint's raw channel says, where the model is moved by it or, smoothed, compared with it."""
-    joints, options = episode.recording.joints, problem.options
-    system = problem.system
+    joints, options, system = episode.recording.joints, problem.options, problem.system
     assert joints is not None
     by_torque = joint in system.driven and joint not in system.servos
     if joint not in system.prescribed and (not by_torque or quantity == "position"):
@@ -475,47 +395,35 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
     return std
 
 
-def _alone(t: Array, values: Array, noise: Array, about: tuple[str, str, str, str]) -> Iterator[DisturbanceEvent]:
+def _alone(
+    t: Array, values: Array, noise: Array, recording: str, about: tuple[str, str, str]
+) -> Iterator[DisturbanceEvent]:
     """Runs of at most `_MAX_WRONG_SAMPLES` samples far from where what is around them leads, as none of these is."""
-    count = len(values)
-    if count < 2 * _NEIGHBOUR_COUNT:
+    count, many = len(values), _NEIGHBOUR_COUNT
+    if count < 2 * many:
         return
     off = _beside_neighbours(t, values)
     size = np.abs(off)
-    wide = np.lib.stride_tricks.sliding_window_view(
-        np.pad(size, _NEIGHBOUR_COUNT, mode="reflect"), 2 * _NEIGHBOUR_COUNT + 1
-    )
-    spread = 1.4826 * np.median(wide, axis=1)
-    odd = size > _WRONG_SAMPLE_Z * np.maximum(np.maximum(noise, spread), 1e-12)
+    wide = np.lib.stride_tricks.sliding_window_view(np.pad(size, many, mode="reflect"), 2 * many + 1)
+    spread = np.maximum(noise, 1.4826 * np.median(wide, axis=1))
+    odd = size > _WRONG_SAMPLE_Z * np.maximum(spread, 1e-12)
+    location, channel, unit = about
     for begin in np.flatnonzero(odd & ~np.roll(odd, 1)):
-        end = begin
-        while end + 1 < count and odd[end + 1]:
-            end += 1
+        end = begin + int(np.argmin([*odd[begin:], False])) - 1
         if end - begin >= _MAX_WRONG_SAMPLES:
             continue
-        near = np.r_[max(begin - _NEIGHBOUR_COUNT, 0) : begin, end + 1 : min(end + 1 + _NEIGHBOUR_COUNT, count)]
+        near = np.r_[max(begin - many, 0) : begin, end + 1 : min(end + 1 + many, count)]
         # a stamp that is late by an interval moves a value by what changes from sample to sample
         steps = np.abs(np.diff(values))[[k for k in near[:-1] if k + 1 != begin and k < count - 1]]
-        if size[begin : end + 1].min() < _MIN_NEIGHBOUR_RATIO * max(
-            size[near].max(initial=0.0), steps.max(initial=0.0)
-        ):
+        around = max(size[near].max(initial=0.0), steps.max(initial=0.0))
+        if size[begin : end + 1].min() < _MIN_NEIGHBOUR_RATIO * around:
             continue
-        period = float(np.median(np.diff(t[max(begin - _NEIGHBOUR_COUNT, 0) : end + _NEIGHBOUR_COUNT])))
+        period = float(np.median(np.diff(t[max(begin - many, 0) : end + many])))
+        window = (float(t[begin] - period / 2), float(t[end] + period / 2))
         peak = float(off[begin + int(size[begin : end + 1].argmax())])
-        spread_here = max(float(spread[begin]), float(noise[begin]))
-        recording, location, channel, unit = about
-        yield DisturbanceEvent(
-            recording,
-            location,
-            channel,
-            "sample",
-            float(t[begin] - period / 2),
-            float(t[end] + period / 2),
-            peak,
-            float(off[begin : end + 1].sum() * period),
-            spread_here * period * math.sqrt(end - begin + 1),
-            unit,
-        )
+        impulse = float(off[begin : end + 1].sum() * period)
+        std = float(spread[begin]) * period * math.sqrt(end - begin + 1)
+        yield DisturbanceEvent(recording, location, channel, "sample", *window, peak, impulse, std, unit)
 
 
 def _beside_neighbours(t: Array, values: Array) -> Array:
@@ -541,23 +449,21 @@ def problem_without_events(problem: EstimationProblem, events: EventSet) -> Esti
     """Return the problem with force events compensated and affected samples excluded.
 
     Forces at joints that recorded torques drive act beside these. Samples of prescribed joints' efforts in the window
-    of an event of that joint, samples that are wrong themselves, and all that follows a fall do not count. Forces on an
-    object and at servos stay in.
+    of an event of that joint, samples that are wrong themselves, and all that follows an overspeed do not count. Forces
+    on an object and at servos stay in.
     """
+    system, cutoff = problem.system, problem.options.path_cutoff
 
     def cleaned(episode: Episode) -> Episode:
-        own = events.for_recording(episode.name)
-        fall = min((f.start_time for f in events.overspeeds if f.recording == episode.name), default=math.inf)
-        if not own and not math.isfinite(fall):
+        own, end = events.for_recording(episode.name), events._end_of(episode.name)
+        if not own and not math.isfinite(end):
             return episode
         torque = episode.torque.copy()
         times = episode.grid.node_times[:-1] - episode.grid.start_time + episode.grid.time_step / 2
         for event in own:
-            if event.detected_pulse is not None and event.channel in set(problem.system.driven) - set(
-                problem.system.servos
-            ):
-                torque[:, problem.system.driven.index(event.channel)] += event.detected_pulse.evaluate_at(times)
-        parts = [_counting(episode, s, own, fall, problem.options.path_cutoff) for s in episode.measurements]
+            if event.detected_pulse is not None and event.channel in set(system.driven) - set(system.servos):
+                torque[:, system.driven.index(event.channel)] += event.detected_pulse.evaluate_at(times)
+        parts = [_counting(episode, samples, own, end, cutoff) for samples in episode.measurements]
         return replace(episode, torque=torque, measurements=tuple(parts))
 
     return problem.with_episodes([cleaned(e) for e in problem.episodes], [cleaned(e) for e in problem.held_out])
@@ -567,23 +473,17 @@ def _counting(
     episode: Episode, samples: Measurements, own: Sequence[DisturbanceEvent], end: float, cutoff: float
 ) -> Measurements:
     """Samples without those that an event spoils."""
-    smear = 1 / cutoff
-    hidden = np.zeros(samples.value.shape, bool)
+    hidden, is_effort = np.zeros(samples.value.shape, bool), bool(samples.sensor.effort_joints)
     t = sample_times(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
-    if math.isfinite(end) and samples.sensor.effort_joints:
+    if math.isfinite(end) and is_effort:
         hidden |= t > end - effort_filter(cutoff).settling_time
+    smear = 1 / cutoff if is_effort else 0.0
     for event in own:
+        inside = (t > event.start_time - smear) & (t < event.end_time + smear)
         for column, channel in enumerate(samples.channel_of_column):
-            if samples.sensor.effort_joints:
-                # a wrong angle is smeared over what all joints need
-                spoilt = event.channel == channel.rpartition(".")[2] or event.kind == "sample"
-                inside = (t[:, column] > event.start_time - smear) & (t[:, column] < event.end_time + smear)
-            else:
-                spoilt = event.channel == samples.sensor.output_names[column]
-                inside = (t[:, column] > event.start_time) & (t[:, column] < event.end_time)
-            if spoilt:
-                hidden[:, column] |= inside
-    if not np.any(hidden & samples.is_used):
-        return samples
-    return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))
+            name = channel.rpartition(".")[2] if is_effort else samples.sensor.output_names[column]
+            # a wrong angle is smeared over what all joints need
+            if event.channel == name or (is_effort and event.kind == "sample"):
+                hidden[:, column] |= inside[:, column]
+    return hide_samples(samples, hidden) if np.any(hidden & samples.is_used) else samples

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,6 +23,7 @@ from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, truncate_episode
+from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.recorded_inputs import recorded_sensors
 
 Array = NDArray[np.float64]
@@ -38,12 +39,10 @@ model is lost already, and a fit on less of the recording may fail earlier."""
 def make_candidate_effects(
     system: System, recordings: Sequence[Recording], choice: CandidateChoice
 ) -> list[EffectBase]:
-    """Return the candidate effects, excluding those of the nominal model.
+    """Return the candidate effects, excluding those of the nominal model `system`.
 
     Parameters
     ----------
-    system : System
-        The nominal one.
     choice : "all" or sequence of str
         `kind` (wherever a diagnosis tries it) or `kind@location`.
 
@@ -54,50 +53,37 @@ def make_candidate_effects(
     ModelError
         A location that does not exist.
     """
+    where, sensors = "diagnosis.candidates", recorded_sensors(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
-    possible = [
-        (kind, place)
-        for kind, place in candidate_effects(system, recorded_sensors(recordings))
-        if f"{kind}@{place}" not in present
-    ]
-    if isinstance(choice, str):
-        if choice != "all":
-            raise ConfigError(
-                f"candidates = '{choice}'", where="diagnosis.candidates", allowed="all, or a list of kinds"
-            )
+    possible = [pair for pair in candidate_effects(system, sensors) if "@".join(pair) not in present]
+    if isinstance(choice, str) and choice == "all":
         return [make_effect(kind, place, system) for kind, place in possible]
+    if isinstance(choice, str) or not choice:
+        what = f"candidates = '{choice}'" if choice else "there is no candidate to try"
+        raise ConfigError(what, where=where, allowed="all, or a list of kinds")
     pairs: list[tuple[str, str]] = []
     for text in choice:
         kind, _, place = text.partition("@")
         cls = EFFECTS[kind]
         if text in present:
-            raise ConfigError(f"{text} is part of the model", where="diagnosis.candidates", hint="leave it out")
+            raise ConfigError(f"{text} is part of the model", where=where, hint="leave it out")
         found = [(kind, place)] if place else [pair for pair in possible if pair[0] == kind]
         if not found:
-            missing = ", ".join(sorted(cls.required_sensors - recorded_sensors(recordings)))
+            missing = ", ".join(sorted(cls.required_sensors - sensors))
             raise ConfigError(
                 f"{kind} does not fit this system or these recordings",
-                where="diagnosis.candidates",
+                where=where,
                 allowed=", ".join(dict.fromkeys(k for k, _ in possible)),
                 hint=f"it needs {missing}" if missing else "leave it out",
             )
         pairs += [pair for pair in found if pair not in pairs]
-    if not pairs:
-        raise ConfigError(
-            "there is no candidate to try", where="diagnosis.candidates", allowed="all, or a list of kinds"
-        )
     return [make_effect(kind, place, system) for kind, place in pairs]
 
 
 def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
-    """Return the candidates without those named.
+    """Return the candidates without those named, as `kind` or `kind@location`.
 
     Excluded candidates stay in the compiled step at their neutral values, so that no recompilation is needed.
-
-    Parameters
-    ----------
-    names : sequence of str
-        `kind` or `kind@location`.
 
     Raises
     ------
@@ -116,13 +102,23 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
     return kept
 
 
+def neutral_values(effects: Sequence[EffectBase]) -> dict[str, float]:
+    """Return the parameter values at which some effects are absent, by parameter name."""
+    return {name: value for effect in effects for name, value in effect.neutral_values.items()}
+
+
+def join_effect_labels(effects: Sequence[EffectBase]) -> str:
+    """Join the labels `kind@location` of several effects by "and"; "the nominal model" for none."""
+    return " and ".join(effect.label for effect in effects) or "the nominal model"
+
+
 @dataclass(frozen=True)
 class TruncatedRecording:
     """A held-out recording truncated where the nominal model stops following it."""
 
     recording: str
     kept_duration: float  # how much of it is compared [s]; 0 where nothing is
-    full_duration: float  # its length [s]
+    full_duration: float  # [s]
 
 
 @dataclass(frozen=True)
@@ -134,8 +130,7 @@ class AllCandidatesProblem:
 
     # of the system with all candidates at their neutral values; frees the nominal parameters
     problem: EstimationProblem
-    # the candidates that are tried: all of the system's that are neutral, but for those left out
-    candidate_effects: tuple[EffectBase, ...]
+    candidate_effects: tuple[EffectBase, ...]  # those that are tried: neutral in the nominal model and not left out
     is_split_in_blocks: bool  # whether a single recording is both estimated on and held out, in alternate blocks
 
     @staticmethod
@@ -151,14 +146,19 @@ class AllCandidatesProblem:
         """
         joint, effects = _joint(problem.step, tuple(effects))
         estimate = [episode.recording for episode in problem.episodes]
-        held = [*held_out] if held_out else [episode.recording for episode in problem.held_out]
-        _check_apart(estimate, held)
+        held = [*held_out] or [episode.recording for episode in problem.held_out]
+        for recording in held:
+            if any(recording is other or _same(recording, other) for other in estimate):
+                raise DataError(
+                    "a recording is both estimated on and held out",
+                    where=recording.name,
+                    allowed="held-out recordings of other motions",
+                    hint="leave held_out empty to split one recording in blocks",
+                )
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
-        if not held:
-            made = _in_blocks(made)
-        return AllCandidatesProblem(made, effects, not held)
+        return AllCandidatesProblem(made if held else _in_blocks(made), effects, not held)
 
     @property
     def nominal_parameters(self) -> tuple[str, ...]:
@@ -185,27 +185,24 @@ class AllCandidatesProblem:
         problem, x = self.problem, self.problem.vector(values)
         kept, cuts = [], []
         for episode in problem.held_out:
-            whole = episode.grid.steps
+            whole, h = episode.grid.steps, episode.grid.time_step
             steps = _steps_followed(problem, episode, x)
-            if steps < whole:
-                steps = round(margin * steps)
-            h = episode.grid.time_step
+            if steps == whole:
+                kept.append(episode)
+                continue
+            steps = round(margin * steps)
             usable = steps * h >= _MIN_PREDICTED_DURATION
-            if steps < whole:
-                cuts.append(TruncatedRecording(episode.name, steps * h if usable else 0.0, whole * h))
-            if usable or steps == whole:
-                kept.append(episode if steps == whole else truncate_episode(episode, steps))
+            cuts.append(TruncatedRecording(episode.name, steps * h if usable else 0.0, whole * h))
+            kept += [truncate_episode(episode, steps)] if usable else []
         if not cuts:
             return self, ()
-        if kept:
-            return replace(self, problem=problem.with_episodes(problem.episodes, kept)), tuple(cuts)
-        return replace(self, problem=_in_blocks(problem), is_split_in_blocks=True), tuple(cuts)
+        cut = problem.with_episodes(problem.episodes, kept) if kept else _in_blocks(problem)
+        return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
     def with_free_effects(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Return the problem with the nominal parameters and those of some effects free."""
-        return self.problem.with_free_subset(
-            (*self.nominal_parameters, *(name for effect in effects for name in effect.parameters.names))
-        )
+        own = (name for effect in effects for name in effect.parameters.names)
+        return self.problem.with_free_subset((*self.nominal_parameters, *own))
 
     def relinearized_with_effects(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
         """Return the problem with some effects free, relinearised about the torque errors that remain with them.
@@ -225,8 +222,7 @@ class AllCandidatesProblem:
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
     """Unknowns at some values, and with neutral effects, where filters are about the right torques."""
-    neutral = {name: value for effect in effects for name, value in effect.neutral_values.items()}
-    return own.vector(at), own.vector({**at, **neutral})
+    return own.vector(at), own.vector({**at, **neutral_values(effects)})
 
 
 _JOINT: WeakKeyDictionary[Step, tuple[Step, tuple[EffectBase, ...]]] = WeakKeyDictionary()
@@ -236,35 +232,22 @@ _JOINT: WeakKeyDictionary[Step, tuple[Step, tuple[EffectBase, ...]]] = WeakKeyDi
 def _joint(step: Step, effects: tuple[EffectBase, ...]) -> tuple[Step, tuple[EffectBase, ...]]:
     """A step with candidates composed, and the candidates whose symbols it has."""
     known = _JOINT.get(step)
-    if known is None or list(map(_told, known[1])) != list(map(_told, effects)):
+    if known is None or list(map(_identity, known[1])) != list(map(_identity, effects)):
         known = _JOINT[step] = compile_step_like(step, step.system.with_effects(effects)), effects
     return known
 
 
-def _told(effect: EffectBase) -> tuple[object, ...]:
+def _identity(effect: EffectBase) -> tuple[object, ...]:
     return effect.label, effect.definitions, tuple(effect.parameters.vector())
 
 
-def _check_apart(estimate: Sequence[Recording], held: Sequence[Recording]) -> None:
-    for recording in held:
-        for other in estimate:
-            if recording is other or _same(recording, other):
-                raise DataError(
-                    "a recording is both estimated on and held out",
-                    where=recording.name,
-                    allowed="held-out recordings of other motions",
-                    hint="leave held_out empty to split one recording in blocks",
-                )
-
-
 def _same(a: Recording, b: Recording) -> bool:
-    def arrays(recording: Recording) -> list[Array]:
-        joints = [] if recording.joints is None else [recording.joints.position]
-        return [*joints, *(group.position for group in recording.points)]
-
-    first, second = arrays(a), arrays(b)
+    """Whether two recordings hold the same positions."""
+    first, second = (
+        [*([] if r.joints is None else [r.joints.position]), *(group.position for group in r.points)] for r in (a, b)
+    )
     return len(first) == len(second) and all(
-        x.shape == y.shape and np.array_equal(x, y, equal_nan=True) for x, y in zip(first, second, strict=True)
+        np.array_equal(x, y, equal_nan=True) for x, y in zip(first, second, strict=True)
     )
 
 
@@ -296,11 +279,10 @@ def _masked(episode: Episode, parity: int) -> Episode:
     for entry in episode.measurements:
         t = (entry.node + entry.fraction) * episode.grid.time_step
         hidden = (np.floor(t / _BLOCK_DURATION).astype(int) % 2 != parity)[:, None] & np.ones(entry.value.shape, bool)
-        value, weight = np.where(hidden, np.nan, entry.value), np.where(hidden, 0.0, entry.weight)
-        samples.append(replace(entry, value=value, weight=weight))
+        samples.append(hide_samples(entry, hidden))
     return replace(episode, measurements=tuple(samples))
 
 
-def join_effect_labels(effects: Sequence[Any]) -> str:
-    """Join the labels `kind@location` of several effects by "and"; "the nominal model" for none."""
-    return " and ".join(effect.label for effect in effects) if effects else "the nominal model"
+def hide_samples(samples: Measurements, hidden: NDArray[np.bool_]) -> Measurements:
+    """Return measurements of which some samples, shape (M, k), do not count."""
+    return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

@@ -1,17 +1,13 @@
 """Pulses in the history of an unknown force: short, of one sign, beside a rest that varies slowly or follows the load.
 
-At one place the data say of the values f of an unknown force at points of time, up to a constant,
-
-    log p(data | f) = g'f - f'L f / 2.
-
-f is a sum of pulses and a rest, which is Gaussian with a standard deviation that grows with the torques at work:
+The data say log p(data | f) = g'f - f'L f / 2 of the force's values f. It is a sum of pulses and a Gaussian rest:
 
     cov f(s), f(t) = e(s) e(t) (delta(s, t) + exp(-|s - t|/a))/2 + s^2 exp(-|s - t|/b),   e^2 = (c m)^2 + w^2 + h^2/3,
 
 m the error that a model of these torques is allowed anyway, h what friction may hold. c >= 1, w and s are those of the
 largest evidence, with a pulse as without it, so that a model that errs everywhere makes no events. Pulses are taken in
-one after the other, that which raises the evidence most first; this is the search for shocks by auxiliary residuals
-(de Jong and Penzer 1998, doi:10.1080/01621459.1998.10473717) with pulses in place of impulses.
+one after the other, that which raises the evidence most first: the search for shocks by auxiliary residuals (de Jong
+and Penzer 1998, doi:10.1080/01621459.1998.10473717) with pulses in place of impulses.
 """
 
 from __future__ import annotations
@@ -43,16 +39,14 @@ _STANDSTILL_SPEED = 0.1  # speed below which static friction may act [rad/s or m
 
 
 @dataclass(frozen=True)
-class TorqueTermSizes:
-    """Magnitude of the inverse dynamics terms of every coordinate at some nodes of a rollout."""
+class _TorqueTermSizes:
+    """Magnitude of the inverse dynamics terms of every coordinate at some nodes of a rollout, shape (M, n) each."""
 
-    # shape (M, n): root of the sum of squares of inertia (of every joint's acceleration by itself), Coriolis
-    # and centrifugal forces, gravity, springs, friction, effects' forces and the torque that was applied or
-    # needed [N m or N]
+    # root of the sum of squares of inertia (of every joint's acceleration by itself), Coriolis and centrifugal forces,
+    # gravity, springs, friction, effects' forces and the torque that was applied or needed [N m or N]
     rss_torque: Array
-    torque_rate: Array  # shape (M, n): of the torque needed [N m/s or N/s]
-    # shape (M, n): what friction may hold at rest, gone above `_STANDSTILL_SPEED` [N m or N]
-    static_friction_limit: Array
+    torque_rate: Array  # of the torque needed [N m/s or N/s]
+    static_friction_limit: Array  # what friction may hold at rest, gone above `_STANDSTILL_SPEED` [N m or N]
 
 
 class InverseDynamicsModel:
@@ -65,14 +59,14 @@ class InverseDynamicsModel:
     def _function(self) -> ca.Function:
         return _function(self._step.system, self._step.time_step)
 
-    def evaluate_term_sizes(self, theta: Array, rollout: Rollout, nodes: NDArray[np.int64]) -> TorqueTermSizes:
+    def evaluate_term_sizes(self, theta: Array, rollout: Rollout, nodes: NDArray[np.int64]) -> _TorqueTermSizes:
         """Return the term magnitudes along a rollout, accelerations from finite differences.
 
         Parameters
         ----------
         theta : ndarray, shape (ntheta,)
         nodes : ndarray of int, shape (M,)
-            At which the terms are wanted, in order.
+            Increasing.
         """
         system, time_step = self._step.system, self._step.time_step
         n = system.n_coordinates
@@ -87,7 +81,7 @@ class InverseDynamicsModel:
             if indices:
                 applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]
         rate = np.gradient(needed, time_step * nodes, axis=0) if len(nodes) > 1 else np.zeros_like(needed)
-        return TorqueTermSizes(np.sqrt(squares + applied**2), np.asarray(rate), np.abs(held))
+        return _TorqueTermSizes(np.sqrt(squares + applied**2), np.asarray(rate), np.abs(held))
 
 
 def _function(system: System, time_step: float) -> ca.Function:
@@ -198,10 +192,8 @@ class DetectedPulse:
 
     def evaluate_at(self, t: Array, cutoff: float = math.inf) -> Array:
         """Return the low-pass filtered pulse at times `t`."""
-        return (
-            self.peak_value
-            * _Filter.of(cutoff)(_Windows.one(self.start_time, self.end_time, self.is_flat_topped), t)[:, 0]
-        )
+        window = _Windows(*map(np.atleast_1d, (self.start_time, self.end_time, self.is_flat_topped)))
+        return self.peak_value * _Filter.of(cutoff)(window, t)[:, 0]
 
 
 @dataclass(frozen=True)
@@ -212,18 +204,13 @@ class _Windows:
     end: Array
     flat: NDArray[np.bool_]
 
-    @staticmethod
-    def one(begin: float, end: float, flat: bool) -> _Windows:
-        return _Windows(np.array([begin]), np.array([end]), np.array([flat]))
-
     def at(self, t: Array) -> Array:
         """At times (M, 1) shape (M, k); at one time for each, (k,), shape (k,)."""
         part = np.clip((t - self.begin) / (self.end - self.begin), 0.0, 1.0)
         ramp = np.where(self.flat, _FLAT_RAMP_FRACTION / 2, 0.5)
         return np.asarray(np.sin(np.pi / 2 * np.minimum(np.minimum(part, 1 - part) / ramp, 1.0)) ** 2)
 
-    def of(self, chosen: NDArray[np.int64]) -> _Windows:
-        """Some of them."""
+    def __getitem__(self, chosen: Any) -> _Windows:
         return _Windows(self.begin[chosen], self.end[chosen], self.flat[chosen])
 
 
@@ -238,9 +225,8 @@ class _Filter:
     def of(cutoff: float) -> _Filter:
         if not math.isfinite(cutoff):
             return _Filter(np.zeros(1), np.ones(1))
-        step = 0.1 / cutoff
         length = 30
-        delay = np.asarray(step * np.arange(-length, length + 1), float)
+        delay = np.asarray(0.1 / cutoff * np.arange(-length, length + 1), float)
         impulse = np.zeros((len(delay), 1))
         impulse[length] = 1.0
         weight = effort_filter(cutoff)(delay, impulse)[:, 0]
@@ -257,7 +243,7 @@ class _Filter:
         count = last - first
         column = np.repeat(np.arange(len(count)), count)
         row = np.arange(len(column)) - np.repeat(np.cumsum(count) - count - first, count)
-        values = self._seen(windows.of(column), t[row])
+        values = self._seen(windows[column], t[row])
         return scipy.sparse.csc_array((values, (row, column)), shape=(len(t), len(count)))
 
     def _seen(self, windows: _Windows, t: Array) -> Array:
@@ -300,6 +286,13 @@ class _Rest:
         evidence = self.evidence + 0.5 * float(told @ told)
         return _Rest(self.precision - lost @ lost.T, self.scored - lost @ told, evidence, lost)
 
+    def information(self, profiles: _SparseMatrix) -> Array:
+        """u' Sigma^-1 u of profiles u (M, k), shape (k,)."""
+        product = self.precision @ profiles
+        if scipy.sparse.issparse(profiles):
+            return np.asarray(profiles.multiply(product).sum(axis=0)).ravel()
+        return np.asarray(np.sum(profiles * product, axis=0))
+
     def gains(self, profiles: _SparseMatrix, bare: Array | None = None) -> Array:
         """By how much the evidence rises with each of some profiles (M, k) of its best size, shape (k,).
 
@@ -307,13 +300,6 @@ class _Rest:
         """
         told, sure = self._sizes(profiles, bare)
         return np.where(sure > 0, 0.5 * told**2 / np.where(sure > 0, sure, 1.0), 0.0)
-
-    def information(self, profiles: _SparseMatrix) -> Array:
-        """u' Sigma^-1 u of profiles u (M, k), shape (k,)."""
-        product = self.precision @ profiles
-        if scipy.sparse.issparse(profiles):
-            return np.asarray(profiles.multiply(product).sum(axis=0)).ravel()
-        return np.asarray(np.sum(profiles * product, axis=0))
 
     def sizes(self, profiles: Array) -> Array:
         """Best size of each profile, shape (k,), zero where the data say nothing."""
@@ -330,17 +316,8 @@ class _Rest:
 def detect_pulses(history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS) -> tuple[list[DetectedPulse], float]:
     """Return the pulses of one force history, largest evidence first, and the number of windows searched.
 
-    Parameters
-    ----------
-    limits : Thresholds
-        `min_log_bayes_factor` is the rise of the log evidence from which a pulse is looked at.
-
-    Returns
-    -------
-    list of DetectedPulse
-        With p-values of single windows; see `run_null_test.benjamini_hochberg_mask`.
-    float
-        Windows that do not overlap, of lengths a factor of two apart.
+    p-values are those of single windows; windows count that do not overlap, of lengths a factor of two apart.
+    `limits.min_log_bayes_factor` is the rise of the log evidence from which a pulse is looked at.
     """
     windows, tries, profiles = _looked_at(history.t.tobytes(), history.filter_cutoff, limits.max_event_duration)
     if not len(windows.begin):
@@ -360,7 +337,7 @@ def detect_pulses(history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLD
         rise = max(totals) - max(rest.evidence for rest in beside)
         if rise < limits.min_log_bayes_factor:
             break
-        window = _refined(history, rest, windows, int(gain.argmax()), seen, limits)
+        window = _refined(history, rest, windows[[int(gain.argmax())]], seen, limits)
         own = seen(window, history.t)
         rise += float(rest.gains(own)[0] - gain.max())
         other = _other(history, rest, window, seen)
@@ -369,7 +346,7 @@ def detect_pulses(history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLD
         taken = np.column_stack([taken, own if other is None else other])
         if other is None:
             found.append((window, rise))
-        free &= (windows.end <= window.begin[0]) | (windows.begin >= window.end[0])
+        free &= (windows.end <= window.begin) | (windows.begin >= window.end)
     covered = sum(float(window.end[0] - window.begin[0]) for window, _ in found)
     if covered > MAX_EVENT_TIME_FRACTION * float(history.t[-1] - history.t[0]):
         return [], tries
@@ -386,51 +363,43 @@ def _looked_at(times: bytes, cutoff: float, longest: float) -> tuple[_Windows, f
         lengths.append(lengths[-1] * _WINDOW_GROWTH)
     begins = [np.arange(first + spacing, last - spacing - length + 1e-9, spacing) for length in lengths]
     begin = np.concatenate(begins)
-    end = begin + np.repeat(lengths, [len(b) for b in begins])
-    windows = _Windows(np.tile(begin, 2), np.tile(end, 2), np.repeat([False, True], len(begin)))
+    windows = _both_shapes(begin, begin + np.repeat(lengths, [len(b) for b in begins]))
     # windows of nearly the same length tell the same: those within a factor of two count as one
     tries = math.log2(_WINDOW_GROWTH) * sum((last - first) / length for length in lengths if length <= last - first)
     return windows, tries, _Filter.of(cutoff).of_many(windows, t)
 
 
+def _both_shapes(begin: Array, end: Array) -> _Windows:
+    """Windows with rounded profiles, and the same with flat ones."""
+    return _Windows(np.tile(begin, 2), np.tile(end, 2), np.repeat([False, True], len(begin)))
+
+
 def _rests(history: ForceEstimate) -> list[_Rest]:
     values = history.force_values
-    spread = max(
-        1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-9 + float(np.median(history.model_error_std))
-    )
+    least = 1e-9 + float(np.median(history.model_error_std))
+    spread = max(1.4826 * float(np.median(np.abs(values - np.median(values)))), least)
     slowest = max(float(np.sqrt(np.mean(values**2))), spread)
     grid = product(_MODEL_ERROR_FACTORS, _NOISE_FLOOR_FACTORS, _SLOW_FORCE_FACTORS)
     return [_Rest.of(history, error, floor * spread, slow * slowest) for error, floor, slow in grid]
 
 
-def _refined(
-    history: ForceEstimate, rest: _Rest, windows: _Windows, best: int, seen: _Filter, limits: Thresholds
-) -> _Windows:
-    """The best window among many, its ends moved to where the evidence is largest."""
-    first, last = float(history.t[0]), float(history.t[-1])
-    shortest = _MIN_PULSE_POINTS * history.sample_spacing
-    begin, end, flat = float(windows.begin[best]), float(windows.end[best]), bool(windows.flat[best])
-    gain = float(rest.gains(seen(_Windows.one(begin, end, flat), history.t))[0])
-    for step in history.sample_spacing / np.array([2.0, 4.0, 8.0]):
-        moves = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]) * step
+def _refined(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds) -> _Windows:
+    """A window, its ends and its shape moved to where the evidence is largest."""
+    spacing = history.sample_spacing
+    first, last, shortest = history.t[0] + spacing, history.t[-1] - spacing, _MIN_PULSE_POINTS * spacing
+    gain = float(rest.gains(seen(window, history.t))[0])
+    moves = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
+    for step in spacing / np.array([2.0, 4.0, 8.0]):
         while True:
-            ends = np.array([begin, end]) + moves
-            length = ends[:, 1] - ends[:, 0]
-            inside = (ends[:, 0] >= first + history.sample_spacing) & (ends[:, 1] <= last - history.sample_spacing)
-            ends = ends[inside & (length >= shortest) & (length <= limits.max_event_duration)]
-            both = np.tile(ends, (2, 1))
-            tried = _Windows(both[:, 0], both[:, 1], np.repeat([False, True], len(ends)))
-            gains = rest.gains(seen(tried, history.t)) if len(ends) else np.zeros(1)
+            begin, end = window.begin + moves[:, 0] * step, window.end + moves[:, 1] * step
+            inside = (begin >= first) & (end <= last) & (end - begin >= shortest)
+            inside &= end - begin <= limits.max_event_duration
+            tried = _both_shapes(begin[inside], end[inside])
+            gains = rest.gains(seen(tried, history.t)) if np.any(inside) else np.zeros(1)
             if not float(gains.max()) > gain + 1e-3:
                 break
-            at = int(gains.argmax())
-            gain, begin, end, flat = (
-                float(gains[at]),
-                float(tried.begin[at]),
-                float(tried.end[at]),
-                bool(tried.flat[at]),
-            )
-    return _Windows.one(begin, end, flat)
+            gain, window = float(gains.max()), tried[[int(gains.argmax())]]
+    return window
 
 
 def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter) -> Array | None:
@@ -438,13 +407,10 @@ def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter)
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, gain = end - begin, float(rest.gains(seen(window, t))[0])
     steps = np.arange(begin - length / 2, end + length / 2, history.sample_spacing)
-    rising = [np.asarray(t > at, float) for at in steps]
-    rising = [step for step in rising if 1 < step.sum() < len(t) - 1]
-    swings = []
-    for wide in length * np.array([0.75, 1.0]):
-        for middle in (begin, begin + length / 4, (begin + end) / 2, end - length / 4, end):
-            part = np.clip((t - middle) / wide, -0.5, 0.5)
-            swings.append(np.sin(2 * np.pi * part))
+    rising = [step for step in (np.asarray(t > at, float) for at in steps) if 1 < step.sum() < len(t) - 1]
+    middles = (begin, begin + length / 4, (begin + end) / 2, end - length / 4, end)
+    places = product(length * np.array([0.75, 1.0]), middles)
+    swings = [np.sin(2 * np.pi * np.clip((t - middle) / wide, -0.5, 0.5)) for wide, middle in places]
     profiles = np.stack([*rising, *swings], axis=1)
     gains = rest.gains(profiles)
     best = int(gains.argmax())
@@ -455,18 +421,18 @@ def _stands_out(
     history: ForceEstimate, bare: _Rest, rest: _Rest, window: _Windows, seen: _Filter, longest: float
 ) -> bool:
     """Whether a pulse is shorter than the longest, larger than what is everywhere in the history, and seen."""
-    begin, end = float(window.begin[0]), float(window.end[0])
-    length, own = end - begin, seen(window, history.t)
+    t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
+    length, own = end - begin, seen(window, t)
     # at either bound its length is not found but cut off: jumps of friction are shorter, errors of the model longer
     if not 1.02 * _MIN_PULSE_POINTS * history.sample_spacing < length < 0.98 * longest:
         return False
     size = abs(float(rest.sizes(own)[0]))
-    near = history.force_values[(history.t > begin - length) & (history.t < end + length)]
+    near = history.force_values[(t > begin - length) & (t < end + length)]
     if size * float(np.abs(own).max()) > _MAX_PULSE_RANGE_RATIO * float(np.ptp(near)):
         return False
-    begins = np.arange(float(history.t[0]), float(history.t[-1]) - length, history.sample_spacing)
+    begins = np.arange(float(t[0]), float(t[-1]) - length, history.sample_spacing)
     everywhere = _Windows(begins, begins + length, np.repeat(window.flat, len(begins)))
-    return size > _MIN_PROMINENCE_RATIO * float(np.median(np.abs(bare.sizes(seen(everywhere, history.t)))))
+    return size > _MIN_PROMINENCE_RATIO * float(np.median(np.abs(bare.sizes(seen(everywhere, t)))))
 
 
 def _sized(
@@ -480,18 +446,11 @@ def _sized(
     size = spread @ (taken.T @ rest.scored)
     result = []
     for window, rise in found:
-        own = seen(window, history.t)[:, 0]
-        at = int(np.argmin(np.sum((taken - own[:, None]) ** 2, axis=0)))
-        p_value = math.erfc(math.sqrt(max(rise, 0.0)))
-        std = math.sqrt(max(float(spread[at, at]), 0.0))
-        result.append(
-            DetectedPulse(
-                float(window.begin[0]), float(window.end[0]), float(size[at]), bool(window.flat[0]), std, p_value
-            )
-        )
-    # friction can change by twice what it slides with wherever the joint stands still, whatever moves it
-    stuck = [
-        float(np.max(history.friction_limit[(history.t >= p.start_time) & (history.t <= p.end_time)], initial=0.0))
-        for p in result
-    ]
-    return [pulse for pulse, friction in zip(result, stuck, strict=True) if abs(pulse.peak_value) > 2 * friction]
+        at = int(np.argmin(np.sum((taken - seen(window, history.t)) ** 2, axis=0)))
+        std, p_value = math.sqrt(max(float(spread[at, at]), 0.0)), math.erfc(math.sqrt(max(rise, 0.0)))
+        begin, end, flat = float(window.begin[0]), float(window.end[0]), bool(window.flat[0])
+        # friction can change by twice what it slides with wherever the joint stands still, whatever moves it
+        stuck = np.max(history.friction_limit[(history.t >= begin) & (history.t <= end)], initial=0.0)
+        if abs(float(size[at])) > 2 * float(stuck):
+            result.append(DetectedPulse(begin, end, float(size[at]), flat, std, p_value))
+    return result

@@ -7,7 +7,7 @@ differences between models are paired. G = max(0, chi2/n - 1) is the gap.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_values
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase, ReportedParameter
 from yid_ocp.inference.null_test import sample_times
@@ -42,20 +42,23 @@ _RELINEARIZE_Z = 1.0
 
 @dataclass(frozen=True)
 class HeldOutLoss:
-    """Whitened squared prediction error of a model on the held-out recordings, by block of time."""
+    """Whitened squared prediction error of a model on the held-out recordings, by block of time, shape (nb,) each."""
 
-    # shape (nb,): sum of whitened squares and number of samples of every block; infinite where a rollout failed
-    block_chi2: Array
+    block_chi2: Array  # sums of whitened squares; infinite where a rollout failed
     block_sample_counts: Array
     channel_rmse: dict[str, tuple[float, str]]  # root mean square error and its unit
-    # squares by which the parameters contradict a baseline; other recordings say that, whatever blocks are
-    # drawn
+    # squares by which the parameters contradict a baseline; other recordings say that, whatever blocks are drawn
     baseline_chi2: float = 0.0
 
     @property
+    def total_chi2(self) -> float:
+        """Sum of squares, the contradiction to a baseline counted in."""
+        return float(self.block_chi2.sum()) + self.baseline_chi2
+
+    @property
     def chi2_per_sample(self) -> float:
-        """chi2/n, the contradiction to a baseline counted in."""
-        return float((self.block_chi2.sum() + self.baseline_chi2) / max(self.block_sample_counts.sum(), 1.0))
+        """chi2/n."""
+        return self.total_chi2 / max(float(self.block_sample_counts.sum()), 1.0)
 
     @property
     def excess_chi2(self) -> float:
@@ -64,19 +67,25 @@ class HeldOutLoss:
 
 
 @dataclass(frozen=True)
-class RefitModel:
+class StoredFit:
+    """The result of a refit as stored: one evaluation restores its `RefitModel`."""
+
+    values: dict[str, float]  # of every unknown
+    std: dict[str, float]  # inflated by the misfit as in `solve`; infinite where the data say nothing
+    amplitude_std: dict[str, float]  # of the effects' amplitudes, with their shapes held
+    solver_message: str  # why the solver ended
+
+
+@dataclass(frozen=True)
+class RefitModel(StoredFit):
     """The nominal model with some effects, fitted again, with its standard deviations and held-out loss."""
 
     effects: tuple[EffectBase, ...]
     problem: EstimationProblem  # of the composed system, with the nominal parameters and those of the effects free
-    values: dict[str, float]  # unknowns
-    std: dict[str, float]  # their standard deviations; see `_refit_covariance`
-    amplitude_std: dict[str, float]  # of the effects' amplitudes, with their shapes held; see `amplitude_std`
     cost: float
     evaluation: Evaluation
-    held_out_loss: HeldOutLoss  # held-out
-    solver_message: str  # why the solver ended
-    is_from_store: bool = False  # whether it comes from a store instead of the solver
+    held_out_loss: HeldOutLoss
+    is_from_store: bool = False
 
     @property
     def effect_parameter_count(self) -> int:
@@ -88,35 +97,22 @@ class RefitModel:
         return effect.reported_parameters(self.values, self.std)
 
 
-@dataclass(frozen=True)
-class StoredFit:
-    """The result of a refit as stored: one evaluation restores its `RefitModel`."""
-
-    values: dict[str, float]  # of every unknown
-    std: dict[str, float]
-    amplitude_std: dict[str, float]  # of amplitudes; see `RefitModel`
-    solver_message: str
-
-
 class RefitStore(Protocol):
     """Store of finished refits of one diagnosis, which an interrupted diagnosis reads; called by two threads."""
 
     def get(self, name: str) -> StoredFit | None:
         """The refit of this name, None where it is not known."""
-        ...
 
     def put(self, name: str, refitted: StoredFit) -> None:
         """Keep a refit."""
-        ...
 
 
 @dataclass(frozen=True)
 class KnownFits:
-    """What is known before a diagnosis begins."""
+    """What is known before a diagnosis begins: the nominal problem's solution, and refits of an interrupted run."""
 
-    solution: Solution | None = None  # of the nominal problem
-    # of refits that an earlier run of the same diagnosis finished; told of every further one
-    store: RefitStore | None = None
+    solution: Solution | None = None
+    store: RefitStore | None = None  # told of every further refit
 
 
 @dataclass(frozen=True)
@@ -125,70 +121,8 @@ class RefitContext:
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
-    progress: Progress  # told what is going on
+    progress: Progress
     store: RefitStore | None = None
-
-
-def refit_with_effects(
-    problem: AllCandidatesProblem,
-    effects: Sequence[EffectBase],
-    start: Mapping[str, float],
-    store: RefitStore | None = None,
-    name: str = "",
-    limits: Thresholds = DEFAULT_THRESHOLDS,
-) -> RefitModel | None:
-    """Fit the nominal parameters and those of some effects, and predict the held-out recordings.
-
-    Parameters
-    ----------
-    start : mapping of str to float
-        Where unknowns begin; a start that cannot be rolled out is drawn back towards neutral effects.
-    store : RefitStore, optional
-        Asked before the solver is, and told what it finds.
-    name : str
-        In the store; the effects' labels where empty, which do for refits that differ by their effects alone.
-    limits : Thresholds
-        For when a refit is tried again.
-
-    Returns
-    -------
-    RefitModel or None
-        None where the model cannot be rolled out at all.
-    """
-    known = load_stored_refit(problem, effects, store, name)
-    if known is not None:
-        return known
-    best = _attempt(problem, effects, start)
-    if best is not None and _half_done(problem, effects, start, best.finish, limits):
-        # the nominal fit may have driven its parameters to where this model cannot come back from
-        nominal = {*problem.nominal_parameters}
-        fresh = {
-            key: value
-            for key, value in start.items()
-            if key.split("[")[0] not in nominal and not key.startswith("start.")
-        }
-        again = _attempt(problem, effects, fresh) if len(fresh) < len(start) else None
-        best = again if again is not None and again.finish.cost < best.finish.cost else best
-    # those before it were found from both already
-    for effect in effects[-1:]:
-        moved = effect.alternative_start(start)
-        if moved is None or (best is not None and _leaves_noise(best.finish, limits)):
-            continue
-        again = _attempt(problem, effects, {**start, **moved})
-        if again is not None and (best is None or again.finish.cost < best.finish.cost):
-            best = again
-    if best is None:
-        return None
-    outcome, finish = best.outcome, best.finish
-    values = best.problem.named_values(outcome.x)
-    own = problem.held_out_relinearized(best.problem, effects, values)
-    covariance = _refit_covariance(own, finish, limits)
-    std = _mark_uninformative_std(effects, own.named_values(std_from_covariance(covariance, outcome.x)))
-    held = _mark_uninformative_std(effects, _conditional_amplitude_std(own.unknown_names, effects, covariance))
-    loss = _held_out_loss(own, outcome.x)
-    if store is not None:
-        store.put(name or join_effect_labels(effects), StoredFit(values, std, held, outcome.message))
-    return RefitModel(tuple(effects), own, values, std, held, finish.cost, finish, loss, outcome.message)
 
 
 @dataclass(frozen=True)
@@ -200,17 +134,97 @@ class _Attempt:
     finish: Evaluation
 
 
-@dataclass
-class _RelinearizedEvaluation:
-    """Evaluates a problem with filters about the torques that are seen at each point, from those of the last one on."""
+def refit_with_effects(
+    problem: AllCandidatesProblem,
+    effects: Sequence[EffectBase],
+    start: Mapping[str, float],
+    store: RefitStore | None = None,
+    name: str = "",
+    limits: Thresholds = DEFAULT_THRESHOLDS,
+) -> RefitModel | None:
+    """Fit the nominal parameters and those of some effects, and predict held-out recordings; None if it never runs.
 
-    problem: EstimationProblem
+    Parameters
+    ----------
+    start : mapping of str to float
+        Where unknowns begin; a start that cannot be rolled out is drawn back towards neutral effects.
+    store : RefitStore, optional
+        Asked before the solver is, and told what it finds.
+    name : str
+        In the store; the effects' labels where empty, which do for refits that differ by their effects alone.
+    limits : Thresholds
+        For when a refit is tried again.
+    """
+    known = load_stored_refit(problem, effects, store, name)
+    if known is not None:
+        return known
+    best = _attempt(problem, effects, start)
+    if best is not None and _half_done(problem, effects, start, best.finish, limits):
+        # the nominal fit may have driven its parameters to where this model cannot come back from
+        fresh = {
+            key: value
+            for key, value in start.items()
+            if key.split("[")[0] not in problem.nominal_parameters and not key.startswith("start.")
+        }
+        best = _cheaper(best, _attempt(problem, effects, fresh) if len(fresh) < len(start) else None)
+    # those before it were found from both already
+    for effect in effects[-1:]:
+        moved = effect.alternative_start(start)
+        if moved is None or (best is not None and _leaves_noise(best.finish, limits)):
+            continue
+        best = _cheaper(best, _attempt(problem, effects, {**start, **moved}))
+    if best is None:
+        return None
+    x, finish = best.outcome.x, best.finish
+    values = best.problem.named_values(x)
+    own = problem.held_out_relinearized(best.problem, effects, values)
+    covariance = _refit_covariance(own, finish, limits)
+    std = _mark_uninformative_std(effects, own.named_values(std_from_covariance(covariance, x)))
+    held = _mark_uninformative_std(effects, _conditional_amplitude_std(own.unknown_names, effects, covariance))
+    found = StoredFit(values, std, held, best.outcome.message)
+    if store is not None:
+        store.put(name or join_effect_labels(effects), found)
+    return _model(found, effects, own, finish, x)
 
-    def __call__(
-        self, x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
-    ) -> Evaluation:
-        self.problem = relinearized_at_torque_bias(self.problem, x, x)
-        return self.problem.evaluate(x, derivatives, equilibrium_guesses)
+
+def load_stored_refit(
+    problem: AllCandidatesProblem, effects: Sequence[EffectBase], store: RefitStore | None, name: str = ""
+) -> RefitModel | None:
+    """Return a refit from the store, evaluated once; None if the store does not have it."""
+    known = None if store is None else store.get(name or join_effect_labels(effects))
+    unknowns = {*problem.with_free_effects(effects).unknown_names}
+    amplitudes = {amplitude for effect in effects for amplitude in effect.amplitude_names}
+    if known is None or not (
+        set(known.values) == set(known.std) == unknowns and set(known.amplitude_std) == amplitudes
+    ):
+        return None
+    own = problem.relinearized_with_effects(effects, known.values)
+    x = own.vector(known.values)
+    finish = own.evaluate(x)
+    if not finish.ok:
+        return None
+    own = problem.held_out_relinearized(own, effects, known.values)
+    return _model(known, effects, own, finish, x, True)
+
+
+def _model(
+    known: StoredFit,
+    effects: Sequence[EffectBase],
+    own: EstimationProblem,
+    finish: Evaluation,
+    x: Array,
+    is_from_store: bool = False,
+) -> RefitModel:
+    loss, same = _held_out_loss(own, x), vars(known)
+    return RefitModel(
+        **same,
+        effects=tuple(effects),
+        problem=own,
+        cost=finish.cost,
+        evaluation=finish,
+        held_out_loss=loss,
+        is_from_store=is_from_store,
+    )
 
 
 def _half_done(
@@ -222,8 +236,7 @@ def _half_done(
 ) -> bool:
     """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
     own, count = problem.with_free_effects(effects), len(finish.residual)
-    neutral = {name: value for effect in effects for name, value in effect.neutral_values.items()}
-    before = own.evaluate(own.vector({**start, **neutral}), False, finish.equilibrium_guesses)
+    before = own.evaluate(own.vector({**start, **neutral_values(effects)}), False, finish.equilibrium_guesses)
     if 2 * finish.cost < limits.restart_chi2 * count or not before.ok:
         return False
     return before.cost - finish.cost > limits.restart_gain * (before.cost - count / 2)
@@ -234,11 +247,18 @@ def _leaves_noise(finish: Evaluation, limits: Thresholds) -> bool:
     return float(chi2.sf(2 * finish.cost, len(finish.residual))) >= limits.significance_level
 
 
+def _cheaper(first: _Attempt | None, second: _Attempt | None) -> _Attempt | None:
+    """The attempt of less cost, the first of equals."""
+    if first is None or second is None:
+        return first or second
+    return second if second.finish.cost < first.finish.cost else first
+
+
 def _attempt(
     problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
 ) -> _Attempt | None:
     """One run from one start; None where the model cannot be rolled out."""
-    neutral = {name: value for effect in effects for name, value in effect.neutral_values.items()}
+    neutral = neutral_values(effects)
     own = problem.relinearized_with_effects(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
@@ -254,9 +274,21 @@ def _attempt(
     ):
         return found
     # about fixed torques a run stops where the effect and an offset that it makes superfluous hold each other
-    outcome = REFIT_SOLVER.minimize_cost(found.problem, outcome.x, None, _RelinearizedEvaluation(found.problem))
-    again = None if outcome.status == Status.FAILED else _seen(problem, effects, outcome)
-    return again if again is not None and again.finish.cost < found.finish.cost else found
+    outcome = REFIT_SOLVER.minimize_cost(found.problem, outcome.x, None, _relinearizing(found.problem))
+    return found if outcome.status == Status.FAILED else _cheaper(found, _seen(problem, effects, outcome))
+
+
+def _relinearizing(problem: EstimationProblem) -> Callable[..., Evaluation]:
+    """Evaluate with filters about the torques that are seen at each point, from those of the last one on."""
+
+    def evaluate(
+        x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
+    ) -> Evaluation:
+        nonlocal problem
+        problem = relinearized_at_torque_bias(problem, x, x)
+        return problem.evaluate(x, derivatives, equilibrium_guesses)
+
+    return evaluate
 
 
 def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome: SolverResult) -> _Attempt | None:
@@ -266,29 +298,7 @@ def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome:
     return _Attempt(placed, outcome, finish) if finish.ok else None
 
 
-def load_stored_refit(
-    problem: AllCandidatesProblem, effects: Sequence[EffectBase], store: RefitStore | None, name: str = ""
-) -> RefitModel | None:
-    """Return a refit from the store, evaluated once; None if the store does not have it."""
-    known = None if store is None else store.get(name or join_effect_labels(effects))
-    own = problem.with_free_effects(effects)
-    amplitudes = {name for effect in effects for name in effect.amplitude_names}
-    if known is None or not set(known.values) == set(known.std) == set(own.unknown_names):
-        return None
-    if set(known.amplitude_std) != amplitudes:
-        return None
-    own = problem.relinearized_with_effects(effects, known.values)
-    x = own.vector(known.values)
-    finish = own.evaluate(x)
-    if not finish.ok:
-        return None
-    own = problem.held_out_relinearized(own, effects, known.values)
-    loss = _held_out_loss(own, x)
-    spread = known.std, known.amplitude_std
-    return RefitModel(tuple(effects), own, known.values, *spread, finish.cost, finish, loss, known.solver_message, True)
-
-
-def _refit_covariance(problem: EstimationProblem, finish: Evaluation, limits: Thresholds = DEFAULT_THRESHOLDS) -> Array:
+def _refit_covariance(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:
     """Covariance of the unknowns, shape (nx, nx), inflated by the misfit as in `solve`."""
     return covariance_of_fit(problem, finish, assess_goodness_of_fit(problem, finish, limits.gap_limits))
 
@@ -315,69 +325,44 @@ def _conditional_amplitude_std(
 
 def _mark_uninformative_std(effects: Sequence[EffectBase], std: Mapping[str, float]) -> dict[str, float]:
     """Standard deviations, infinite where larger than `_UNINFORMATIVE_STD_RATIO` times the width of the prior range."""
-    width = {name: high - low for effect in effects for name, (low, high) in effect.prior_ranges.items()}
-    return {
-        name: math.inf if size > _UNINFORMATIVE_STD_RATIO * width.get(name, math.inf) else size
-        for name, size in std.items()
-    }
+    most = {n: _UNINFORMATIVE_STD_RATIO * (b - a) for effect in effects for n, (a, b) in effect.prior_ranges.items()}
+    return {name: math.inf if size > most.get(name, math.inf) else size for name, size in std.items()}
 
 
-def refit_each_candidate(
+def refit_each(
     search: RefitContext,
     base: Sequence[EffectBase],
-    tried: Sequence[tuple[EffectBase, Mapping[str, float]]],
+    tried: Sequence[tuple[Sequence[EffectBase], Mapping[str, float]]],
     values: Mapping[str, float],
     where: str = "",
 ) -> list[RefitModel]:
-    """Refit the model with each of several effects added to those of `base`; return the refits that succeed.
+    """Refit the model with each of several effects or pairs added to those of `base`; return the refits that succeed.
 
     Parameters
     ----------
-    tried : sequence of (EffectBase, mapping of parameter to float)
+    tried : sequence of (sequence of EffectBase, mapping of parameter to float)
         With the values at which each begins.
     values : mapping of str to float
         Where all other unknowns begin.
     where : str
         What is said of `values` in the store, if the same effects are refitted from elsewhere too.
     """
-    beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
-    entries = [_Tried((*base, effect), effect.label, step, where) for effect, step in tried]
-    return _each(search, entries, values, f"{len(tried)} effects{beside}")
-
-
-def refit_each_pair(
-    search: RefitContext,
-    tried: Sequence[tuple[tuple[EffectBase, EffectBase], Mapping[str, float]]],
-    values: Mapping[str, float],
-) -> list[RefitModel]:
-    """Refit the model with each of several pairs of effects; return the refits that succeed."""
-    entries = [_Tried(pair, join_effect_labels(pair), step, "together") for pair, step in tried]
-    return _each(search, entries, values, f"{len(tried)} pairs")
-
-
-@dataclass(frozen=True)
-class _Tried:
-    effects: tuple[EffectBase, ...]
-    label: str  # of those that are new
-    step: Mapping[str, float]
-    where: str
-
-
-def _each(search: RefitContext, tried: Sequence[_Tried], values: Mapping[str, float], words: str) -> list[RefitModel]:
     if not tried:
         return []
-    search.progress.begin_stage(f"refitting with each of {words}")
-    parts = ParallelProgress(search.progress, len(tried), tried[0].label)
+    beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
+    noun = "effects" if len(tried[0][0]) == 1 else "pairs"
+    search.progress.begin_stage(f"refitting with each of {len(tried)} {noun}{beside}")
+    parts = ParallelProgress(search.progress, len(tried), join_effect_labels(tried[0][0]))
 
-    def one(entry: _Tried) -> RefitModel | None:
-        name = f"{join_effect_labels(entry.effects)} {entry.where}" if entry.where else ""
-        fit = refit_with_effects(
-            search.problem, entry.effects, {**values, **entry.step}, search.store, name, search.thresholds
-        )
-        text = f"no fit with {entry.label}"
+    def one(entry: tuple[Sequence[EffectBase], Mapping[str, float]]) -> RefitModel | None:
+        effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
+        name = f"{join_effect_labels(effects)} {where}" if where else ""
+        start = {**values, **entry[1]}
+        fit = refit_with_effects(search.problem, effects, start, search.store, name, search.thresholds)
+        text = f"no fit with {label}"
         if fit is not None:
             how = "resumed the refit" if fit.is_from_store else "refitted"
-            text = f"{how} with {entry.label}: held-out chi2/n {fit.held_out_loss.chi2_per_sample:.4g}"
+            text = f"{how} with {label}: held-out chi2/n {fit.held_out_loss.chi2_per_sample:.4g}"
         parts.count_done(text)
         return fit
 
@@ -407,12 +392,10 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
         if isinstance(result, str):
             total = np.full(number, np.inf)
         else:
-            total = np.bincount(
-                of_row, weights=problem.held_out_residual(i, episode, result).residual ** 2, minlength=number
-            )
-        keep = count > 0
-        squares.append(total[keep])
-        counts.append(count[keep])
+            rows = problem.held_out_residual(i, episode, result).residual
+            total = np.bincount(of_row, weights=rows**2, minlength=number)
+        squares.append(total[count > 0])
+        counts.append(count[count > 0])
     if problem.has_process_noise:
         # in metres and radians a prediction has its torques as they were recorded, less their offsets
         found = whitened_by_sensor_noise(problem).predict_held_out(x)

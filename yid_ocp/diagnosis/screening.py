@@ -8,16 +8,15 @@ amplitudes of candidate j and P = I - J_theta J_theta^+:
 S_j = G_j for white noise of unit standard deviation, and the sum of the scores' autocovariances for a coloured one,
 taken as it would be with the candidate's step done (Bartlett's weights, Newey and West 1987, doi:10.2307/1913610). The
 decrease of r'r that the linear model promises is s_j' G_j^-1 s_j, less where the amplitude would leave its bounds.
-
-Parameters that say nothing while the amplitude is neutral (relaxation times and the like) are taken over a grid, the
-best one counting as the best of that many tries (Davies 1987, doi:10.1093/biomet/74.1.33, bounded by Bonferroni).
+Shape parameters are taken over a grid, the best value as the best of that many tries (Davies 1987,
+doi:10.1093/biomet/74.1.33, bounded by Bonferroni).
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.signal
@@ -41,18 +40,17 @@ class EffectSignature:
     """First-order change of the residual by the amplitudes of a candidate."""
 
     effect: EffectBase
-    shape_values: dict[str, float]  # values of its shape parameters
-    projected_sensitivity: Array  # shape (nr, p): P J_j, by its amplitudes
-    score_noise_covariance: Array  # shape (p, p): covariance of `columns'` r under the noise's own colour
+    shape_values: dict[str, float]
+    projected_sensitivity: Array  # X = P J_j, shape (nr, p), by its amplitudes
+    score_noise_covariance: Array  # shape (p, p): covariance of X'r under the noise's own colour
 
 
 @dataclass(frozen=True)
 class CandidateLinearization:
     """Residual and signatures of all candidates, linearised at one point."""
 
-    projected_residual: Array  # shape (nr,): P r
+    projected_residual: Array  # P r, shape (nr,)
     signatures: tuple[EffectSignature, ...]  # one for each candidate and grid value
-    parameter_values: dict[str, float]  # where it was taken
 
 
 @dataclass(frozen=True)
@@ -60,8 +58,8 @@ class CandidateDetectability:
     """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone."""
 
     effect: EffectBase
-    detectable_amplitudes: dict[str, float]  # smallest value that would be noticed, in the parameter's unit
-    is_detectable: bool  # whether one of them lies within the range that an engineer would expect
+    detectable_amplitudes: dict[str, float]  # in the parameter's unit
+    is_detectable: bool  # whether one of them lies within the prior range
 
 
 @dataclass(frozen=True)
@@ -69,21 +67,17 @@ class CandidateScore:
     """Score test (Lagrange multiplier) of a candidate on the residual."""
 
     effect: EffectBase
-    predicted_values: dict[str, float]  # amplitudes to which the linear model would go, and the shape values
-    predicted_chi2_decrease: float  # promised decrease of r'r
+    predicted_values: dict[str, float]  # amplitudes after the step of the linear model, and the shape values
+    predicted_chi2_decrease: float
     lm_statistic: float  # LM with robust covariance
     p_value: float
 
 
 def _shape_grid(effect: EffectBase, count: int = DEFAULT_THRESHOLDS.shape_grid_size) -> list[dict[str, float]]:
-    """Return grid values of a candidate's shape parameters, uniform or log-uniform over the prior range."""
-    if not effect.shape_names:
-        return [{}]
-    axes = []
-    for name in effect.shape_names:
-        low, high = effect.prior_ranges[name]
-        axes.append(np.geomspace(low, high, count) if low > 0 else np.linspace(low, high, count))
-    return [{name: float(axis[i]) for name, axis in zip(effect.shape_names, axes, strict=True)} for i in range(count)]
+    """Grid values of a candidate's shape parameters, uniform or log-uniform over the prior range."""
+    ranges = {name: effect.prior_ranges[name] for name in effect.shape_names}
+    axes = [(np.geomspace if low > 0 else np.linspace)(low, high, count) for low, high in ranges.values()]
+    return [dict(zip(ranges, map(float, point), strict=True)) for point in zip(*axes, strict=True)] or [{}]
 
 
 def linearize_candidates(
@@ -109,15 +103,13 @@ def linearize_candidates(
         The model cannot be rolled out there.
     """
     labels = {effect.label for effect in base}
-    others = [effect for effect in problem.candidate_effects if effect.label not in labels]
-    grids = {effect.label: _shape_grid(effect, grid) for effect in others}
+    grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
     own = [name for effect in base for name in effect.parameters.names]
-    residual, basis = np.zeros(0), np.zeros((0, 0))
+    residual, basis, warm = np.zeros(0), np.zeros((0, 0)), None
     placed, series = problem.relinearized_with_effects(base, values), residual_channels(problem.problem)
-    warm = None
     signatures: list[EffectSignature] = []
-    for k in range(max((len(g) for g in grids.values()), default=0)):
-        chosen = [effect for effect in others if k < len(grids[effect.label])]
+    for k in range(max(map(len, grids.values()), default=0)):
+        chosen = [effect for effect in problem.candidate_effects if k < len(grids.get(effect.label, ()))]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
         amplitudes = [name for effect in chosen for name in effect.amplitude_names]
         trial = placed.with_free_subset((*problem.nominal_parameters, *own, *amplitudes)).with_parameter_values(shape)
@@ -125,28 +117,24 @@ def linearize_candidates(
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")
         names, warm = list(trial.unknown_names), evaluation.equilibrium_guesses
-        places = [names.index(name) for name in amplitudes]
-        rest = np.setdiff1d(np.arange(len(names)), places)
         data, jacobian = residual_without_weak_priors(trial, evaluation)
+        places = [names.index(name) for name in amplitudes]
         if k == 0:
-            basis = _basis(jacobian[:, rest])
+            basis = _basis(jacobian[:, np.setdiff1d(np.arange(len(names)), places)])
             residual = data - basis @ (basis.T @ data)
         moved = jacobian[:, places]
         moved = moved - basis @ (basis.T @ moved)
-        at = 0
-        for effect in chosen:
-            width = len(effect.amplitude_names)
-            columns = np.ascontiguousarray(moved[:, at : at + width])
+        edges = np.cumsum([len(effect.amplitude_names) for effect in chosen])[:-1]
+        for effect, part in zip(chosen, np.split(moved, edges, axis=1), strict=True):
+            columns = np.ascontiguousarray(part)
             signatures.append(EffectSignature(effect, grids[effect.label][k], columns, _coloured(columns, series)))
-            at += width
-    return CandidateLinearization(residual, tuple(signatures), dict(values))
+    return CandidateLinearization(residual, tuple(signatures))
 
 
 def _basis(matrix: Array) -> Array:
     """Orthonormal basis of the columns, those that depend on others left out."""
     size = np.linalg.norm(matrix, axis=0)
-    scaled = matrix[:, size > 0] / size[size > 0]
-    u, singular, _ = np.linalg.svd(scaled, full_matrices=False)
+    u, singular, _ = np.linalg.svd(matrix[:, size > 0] / size[size > 0], full_matrices=False)
     return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
 
 
@@ -156,58 +144,55 @@ def candidate_detectability(
     """Return the detectability of every candidate: amplitudes of `detection_z` standard deviations."""
     found: dict[str, CandidateDetectability] = {}
     for signature in point.signatures:
-        effect = signature.effect
+        effect, neutral = signature.effect, signature.effect.neutral_values
         information = signature.projected_sensitivity.T @ signature.projected_sensitivity
-        noise = signature.score_noise_covariance
-        inverse = np.linalg.pinv(information, rcond=1e-10, hermitian=True)
-        covariance = inverse @ noise @ inverse
-        detectable = {}
-        visible = False
-        for i, name in enumerate(effect.amplitude_names):
-            informed = information[i, i] > 1e-16
-            size = detection_z * float(np.sqrt(max(covariance[i, i], 0.0))) if informed else float("inf")
-            detectable[name] = size
-            quantity = next(q for q in effect.definitions if name.endswith(f".{q.name}"))
-            visible |= size < max(abs(bound - quantity.neutral_value) for bound in effect.prior_ranges[name])
+        inverse = _pinv(information)
+        variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
+        sizes = np.where(np.diag(information) > 1e-16, detection_z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
+        detectable = dict(zip(effect.amplitude_names, map(float, sizes), strict=True))
+        visible = any(
+            size < max(abs(bound - neutral[name]) for bound in effect.prior_ranges[name])
+            for name, size in detectable.items()
+        )
         best = found.get(effect.label)
         if (
             best is None
             or (visible and not best.is_detectable)
             or min(detectable.values()) < min(best.detectable_amplitudes.values())
         ):
-            found[effect.label] = CandidateDetectability(
-                effect, detectable, visible or (best is not None and best.is_detectable)
-            )
+            visible |= best is not None and best.is_detectable
+            found[effect.label] = CandidateDetectability(effect, detectable, visible)
     return tuple(found.values())
+
+
+def _pinv(matrix: Array) -> Array:
+    return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
 
 
 def _coloured(columns: Array, series: Sequence[ResidualChannel]) -> Array:
     """X' Omega X under the noise's known colour."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
-    size = float(np.max(np.abs(columns), initial=0.0))
+    least = 1e-6 * float(np.max(np.abs(columns), initial=0.0))
     for s in series:
-        x = columns[s.residual_indices]
-        if not np.any(np.abs(x) > 1e-6 * size):
+        x, colour = columns[s.residual_indices], s.noise_autocorrelation
+        if not np.any(np.abs(x) > least):
             continue
-        if len(s.noise_autocorrelation) > 1:
-            both = np.concatenate([s.noise_autocorrelation[:0:-1], s.noise_autocorrelation])[:, None]
-            total += (
-                x.T
-                @ scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(s.noise_autocorrelation) - 1 :][: len(x)]
-            )
-        else:
-            total += x.T @ x
+        seen = x
+        if len(colour) > 1:
+            both = np.concatenate([colour[:0:-1], colour])[:, None]
+            seen = scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(colour) - 1 :][: len(x)]
+        total += x.T @ seen
     return (total + total.T) / 2
 
 
 def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannel]) -> Array:
-    """Return the Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p)."""
+    """Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p)."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
         u = columns[s.residual_indices] * residual[s.residual_indices, None]
         length = int(np.sqrt(len(u))) + 1
-        cumulative = np.vstack([np.zeros((length, u.shape[1])), np.cumsum(u, axis=0)])
-        cumulative = np.vstack([cumulative, np.tile(cumulative[-1], (length - 1, 1))])
+        cumulative = np.pad(np.cumsum(u, axis=0), ((length, 0), (0, 0)))
+        cumulative = np.pad(cumulative, ((0, length - 1), (0, 0)), mode="edge")
         sums = cumulative[length:] - cumulative[:-length]
         total += sums.T @ sums / length
     return total
@@ -218,26 +203,19 @@ def score_candidates(
 ) -> tuple[CandidateScore, ...]:
     """Return the score of every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
-    best: dict[str, CandidateScore] = {}
-    tries: dict[str, int] = {}
+    scores: dict[str, list[CandidateScore]] = {}
     for signature in point.signatures:
-        label = signature.effect.label
-        if label not in seen:
-            continue
-        tries[label] = tries.get(label, 0) + 1
-        score = _score(signature, point.projected_residual, series)
+        if signature.effect.label in seen:
+            scores.setdefault(signature.effect.label, []).append(_score(signature, point.projected_residual, series))
+    found = []
+    for tries in scores.values():
+        best = tries[0]
         # shape values that make no difference are told apart by nothing but rounding: the first one stays
-        if label not in best or score.predicted_chi2_decrease > best[label].predicted_chi2_decrease * (
-            1 + _DECREASE_RTOL
-        ):
-            best[label] = score
-    final = [
-        CandidateScore(
-            s.effect, s.predicted_values, s.predicted_chi2_decrease, s.lm_statistic, min(1.0, s.p_value * tries[label])
-        )
-        for label, s in best.items()
-    ]
-    return tuple(sorted(final, key=lambda s: -s.predicted_chi2_decrease))
+        for score in tries[1:]:
+            if score.predicted_chi2_decrease > best.predicted_chi2_decrease * (1 + _DECREASE_RTOL):
+                best = score
+        found.append(replace(best, p_value=min(1.0, best.p_value * len(tries))))
+    return tuple(sorted(found, key=lambda s: -s.predicted_chi2_decrease))
 
 
 def bonferroni_min_p_value(ranked: Sequence[CandidateScore]) -> float:
@@ -247,37 +225,33 @@ def bonferroni_min_p_value(ranked: Sequence[CandidateScore]) -> float:
 
 def _room(effect: EffectBase) -> tuple[Array, Array]:
     """How far amplitudes may go from neutral, to either side."""
-    quantities = {f"{effect.label}.{q.name}": q for q in effect.definitions}
-    own = [quantities[name] for name in effect.amplitude_names]
+    own = [q for q in effect.definitions if not q.is_shape_parameter]
     return np.array([q.lower - q.neutral_value for q in own]), np.array([q.upper - q.neutral_value for q in own])
 
 
 def _promised(information: Array, slope: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
     """The linear model's step within bounds and the decrease of r'r by it; of one, or of a stack of them."""
-    plain = (np.linalg.pinv(information, rcond=1e-10, hermitian=True) @ slope[..., None])[..., 0]
+    plain = (_pinv(information) @ slope[..., None])[..., 0]
     step = np.clip(plain, lower, upper)
     return step, np.sum((2 * slope - (information @ step[..., None])[..., 0]) * step, axis=-1)
 
 
 def _score(signature: EffectSignature, residual: Array, series: Sequence[ResidualChannel]) -> CandidateScore:
-    effect, x = signature.effect, signature.projected_sensitivity
+    effect, x, floor = signature.effect, signature.projected_sensitivity, signature.score_noise_covariance
     slope = -(x.T @ residual)
     lower, upper = _room(effect)
     step, decrease = _promised(x.T @ x, slope, lower, upper)
     # the candidate's own share of the residual would hide it: what would be left is what its score scatters with
     covariance = _newey_west_covariance(x, residual + x @ step, series)
-    floor = signature.score_noise_covariance
     # a residual below the noise must not make a score look sure
     covariance = covariance if np.trace(covariance) > np.trace(floor) else floor
-    statistic = float(slope @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ slope)
+    statistic = float(slope @ _pinv(covariance) @ slope)
     p_value = float(scipy.stats.chi2.sf(statistic, len(step)))
     if len(step) == 1 and lower[0] == 0:
-        if step[0] <= 0:
-            statistic, p_value = 0.0, 1.0
+        statistic = statistic if step[0] > 0 else 0.0
         p_value = p_value / 2 if statistic > 0 else 1.0
-    return CandidateScore(
-        effect, _values(effect, step) | signature.shape_values, max(float(decrease), 0.0), statistic, p_value
-    )
+    values = _values(effect, step) | signature.shape_values
+    return CandidateScore(effect, values, max(float(decrease), 0.0), statistic, p_value)
 
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
@@ -288,12 +262,10 @@ def _values(effect: EffectBase, step: Array) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class ConfusabilityMatrix:
-    """Fractions of each candidate's signature that the others explain."""
+    """Fractions of each candidate's signature that the others explain, beyond what the nominal parameters can."""
 
     labels: tuple[str, ...]
-    # shape (nj, nj): fraction of row j's signature that column i's can explain, beyond what the nominal
-    # parameters can
-    overlap_fractions: Array
+    overlap_fractions: Array  # shape (nj, nj): of row j's signature by column i's
 
     def confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
         """Return the candidates that explain at least the fraction `limit` of one candidate's signature."""
@@ -306,9 +278,8 @@ class CandidatePair:
     """First-order decrease of the residual by two candidates together."""
 
     effects: tuple[EffectBase, EffectBase]
-    predicted_values: dict[str, float]  # amplitudes to which the linear model would go, and the shape values
-    predicted_chi2_decrease: float  # promised decrease of r'r
-    penalized_chi2_decrease: float  # the decrease beyond what chance alone brings by so many amplitudes
+    predicted_values: dict[str, float]  # amplitudes after the step of the linear model, and the shape values
+    penalized_chi2_decrease: float  # decrease of r'r beyond what chance alone brings by so many amplitudes
 
 
 @dataclass(frozen=True)
@@ -317,45 +288,36 @@ class JointScores:
 
     effects: tuple[EffectBase, ...]
     shape_values: tuple[dict[str, float], ...]
-    information: Array  # shape (n, n): X'X of all signatures side by side
-    score_vector: Array  # shape (n,): -X'r
+    information: Array  # X'X of all signatures side by side, shape (n, n)
+    score_vector: Array  # -X'r, shape (n,)
 
     @property
-    def effect_columns(self) -> list[slice]:
+    def _columns(self) -> list[NDArray[np.int64]]:
         """Columns of every candidate."""
-        edges = np.cumsum([0, *(len(effect.amplitude_names) for effect in self.effects)])
-        return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+        return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
 
     def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePair]:
-        """Yield all pairs of some candidates, largest penalised decrease first.
+        """Yield all pairs of the candidates with these labels, largest penalised decrease first.
 
         What two effects do together neither need do alone: one of them may hide in what the other leaves.
-
-        Parameters
-        ----------
-        among : sequence of str
-            Labels.
         """
         bounds = [_room(effect) for effect in self.effects]
         lower, upper = (np.concatenate([np.zeros(0), *(entry[k] for entry in bounds)]) for k in (0, 1))
-        columns = [np.arange(block.start, block.stop) for block in self.effect_columns]
-        wanted = set(among)
+        columns, wanted = self._columns, [i for i, effect in enumerate(self.effects) if effect.label in set(among)]
         by_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
-        for i, j in itertools.combinations([i for i, e in enumerate(self.effects) if e.label in wanted], 2):
+        for i, j in itertools.combinations(wanted, 2):
             by_size.setdefault((len(columns[i]), len(columns[j])), []).append((i, j))
-        found: list[tuple[float, float, int, int, Array]] = []
+        found: list[tuple[float, int, int, Array]] = []
         for members in by_size.values():
             at = np.array([[*columns[i], *columns[j]] for i, j in members])
             information, slope = self.information[at[:, :, None], at[:, None, :]], self.score_vector[at]
             steps, decrease = _promised(information, slope, lower[at], upper[at])
-            penalized = decrease - at.shape[1]
-            found += [(w, d, *both, s) for w, d, both, s in zip(penalized, decrease, members, steps, strict=True)]
-        for penalized, promised, i, j, step in sorted(found, key=lambda entry: -entry[0]):
+            found += [(w, *both, s) for w, both, s in zip(decrease - at.shape[1], members, steps, strict=True)]
+        for penalized, i, j, step in sorted(found, key=lambda entry: -entry[0]):
             (one, other), width = (self.effects[i], self.effects[j]), len(columns[i])
             values = _values(one, step[:width]) | _values(other, step[width:])
-            yield CandidatePair(
-                (one, other), values | self.shape_values[i] | self.shape_values[j], float(promised), float(penalized)
-            )
+            values |= self.shape_values[i] | self.shape_values[j]
+            yield CandidatePair((one, other), values, float(penalized))
 
 
 def score_jointly(point: CandidateLinearization, chosen: Sequence[CandidateScore] = ()) -> JointScores:
@@ -364,11 +326,11 @@ def score_jointly(point: CandidateLinearization, chosen: Sequence[CandidateScore
     groups: dict[str, list[EffectSignature]] = {}
     for signature in point.signatures:
         groups.setdefault(signature.effect.label, []).append(signature)
-    kept = []
-    for label, group in groups.items():
-        wanted = shape.get(label)
-        kept.append(next((s for s in group if s.shape_values == wanted), group[len(group) // 2]))
-    every = np.hstack([s.projected_sensitivity for s in kept]) if kept else np.zeros((len(point.projected_residual), 0))
+    kept = [
+        next((s for s in group if s.shape_values == shape.get(label)), group[len(group) // 2])
+        for label, group in groups.items()
+    ]
+    every = np.hstack([np.zeros((len(point.projected_residual), 0)), *(s.projected_sensitivity for s in kept)])
     effects, shapes = tuple(s.effect for s in kept), tuple(s.shape_values for s in kept)
     return JointScores(effects, shapes, every.T @ every, -(every.T @ point.projected_residual))
 
@@ -378,14 +340,14 @@ def confusability_matrix(everything: JointScores) -> ConfusabilityMatrix:
     ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
     gram = everything.information * scale[:, None] * scale
-    blocks = everything.effect_columns
+    blocks = everything._columns[:-1]
+    inverses = [np.linalg.pinv(gram[np.ix_(b, b)], rcond=1e-8, hermitian=True) for b in blocks]
     matrix = np.zeros((len(blocks), len(blocks)))
-    inverses = [np.linalg.pinv(gram[b, b], rcond=1e-8, hermitian=True) for b in blocks]
     for j, row in enumerate(blocks):
-        size = float(np.trace(gram[row, row]))
-        for i, column in enumerate(blocks):
-            cross = gram[row, column]
-            matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size if size > 0 else 0.0
+        size = float(np.trace(gram[np.ix_(row, row)]))
+        for i, column in enumerate(blocks if size > 0 else ()):
+            cross = gram[np.ix_(row, column)]
+            matrix[j, i] = float(np.trace(cross @ inverses[i] @ cross.T)) / size
     return ConfusabilityMatrix(tuple(effect.label for effect in everything.effects), np.clip(matrix, 0.0, 1.0))
 
 
@@ -397,11 +359,6 @@ class ScreeningResult:
     candidate_scores: tuple[CandidateScore, ...]  # best first
     confusability: ConfusabilityMatrix
     joint_scores: JointScores
-
-    @property
-    def undetectable_labels(self) -> list[str]:
-        """Labels of candidates that these data cannot detect."""
-        return [entry.effect.label for entry in self.detectability if not entry.is_detectable]
 
 
 def screen_candidates(

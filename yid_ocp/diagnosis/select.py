@@ -17,14 +17,12 @@ from yid_ocp.diagnosis.refit import (
     HeldOutLoss,
     RefitContext,
     RefitModel,
-    refit_each_candidate,
-    refit_each_pair,
+    refit_each,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import (
     CandidatePair,
     CandidateScore,
-    ConfusabilityMatrix,
     ScreeningResult,
     bonferroni_min_p_value,
     screen_candidates,
@@ -39,15 +37,15 @@ _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 @dataclass(frozen=True)
 class GapClosure:
-    """Fraction of the held-out gap that a model closes, with its 95 % interval; NaN if there was no gap.
-
-    `is_decisive`: whether the likelihood ratio favours the model decisively, however small the gap; see `_lr_decisive`.
-    """
+    """Fraction of the held-out gap that a model closes, with its 95 % interval; NaN if there was no gap."""
 
     fraction: float
     ci_low: float
     ci_high: float
-    is_decisive: bool = False
+    is_decisive: bool = False  # whether the likelihood ratio favours the model decisively, however small the gap
+
+
+NO_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -60,37 +58,31 @@ class SelectedEffect:
     equivalent_effects: tuple[EffectBase, ...]  # effects that the data cannot tell from this one, the chosen one first
 
 
-def gap_closure(
-    before: HeldOutLoss, after: HeldOutLoss, seed: int = 0, limits: Thresholds = DEFAULT_THRESHOLDS
-) -> GapClosure:
+def gap_closure(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> GapClosure:
     """Return the fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
     sure = _lr_decisive(before, after, limits)
     if before.excess_chi2 <= 0 or not np.isfinite(after.chi2_per_sample):
-        return GapClosure(float("nan"), float("nan"), float("nan"), sure)
-    rng = np.random.default_rng(seed)
-    draws = rng.integers(0, len(before.block_sample_counts), (_N_BOOTSTRAP, len(before.block_sample_counts)))
+        return replace(NO_CLOSURE, is_decisive=sure)
+    draws = np.random.default_rng(0).integers(
+        0, len(before.block_sample_counts), (_N_BOOTSTRAP, len(before.block_sample_counts))
+    )
     n = before.block_sample_counts[draws].sum(axis=1)
     g0 = np.maximum((before.block_chi2[draws].sum(axis=1) + before.baseline_chi2) / n - 1.0, 0.0)
     g1 = np.maximum((after.block_chi2[draws].sum(axis=1) + after.baseline_chi2) / n - 1.0, 0.0)
     ratio = 1 - g1[g0 > 0] / g0[g0 > 0]
-    low, high = np.quantile(ratio, [0.025, 0.975]) if len(ratio) else (float("nan"), float("nan"))
+    low, high = np.quantile(ratio, [0.025, 0.975]) if len(ratio) else (math.nan, math.nan)
     return GapClosure(1 - after.excess_chi2 / before.excess_chi2, float(low), float(high), sure)
 
 
 def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
     """Whether the held-out log likelihood ratio favours `after` decisively, if both models leave only noise."""
-    return (
-        _noise_is_left(limits, before, after) and _squares(before) - _squares(after) > 2 * limits.min_log_bayes_factor
-    )
+    fall = before.total_chi2 - after.total_chi2 if _noise_is_left(limits, before, after) else 0.0
+    return fall > 2 * limits.min_log_bayes_factor
 
 
 def _noise_is_left(limits: Thresholds, *losses: HeldOutLoss) -> bool:
     """Whether all of some models leave little but noise."""
     return max(loss.chi2_per_sample for loss in losses) < 1 + limits.min_excess_chi2
-
-
-def _squares(loss: HeldOutLoss) -> float:
-    return float(np.sum(loss.block_chi2)) + loss.baseline_chi2
 
 
 def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float, float]:
@@ -104,50 +96,36 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
     return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
+def _chi2(fit: RefitModel) -> float:
+    return fit.held_out_loss.chi2_per_sample
+
+
 def _near_best_models(fits: Sequence[RefitModel], limits: Thresholds = DEFAULT_THRESHOLDS) -> list[RefitModel]:
     """Models that predict the held-out recordings as well as the best one, the simplest first."""
-    best = min(fits, key=lambda fit: fit.held_out_loss.chi2_per_sample)
+    best = min(fits, key=_chi2)
     likely = [fit for fit in fits if not fit.effects or _likely(fit.effects[-1], fit, limits)]
-    if (
-        likely
-        and min(fit.held_out_loss.chi2_per_sample for fit in likely)
-        <= (1 + limits.implausible_shape_margin) * best.held_out_loss.chi2_per_sample
-    ):
-        fits = likely
-        best = min(fits, key=lambda fit: fit.held_out_loss.chi2_per_sample)
+    if likely and min(map(_chi2, likely)) <= (1 + limits.implausible_shape_margin) * _chi2(best):
+        fits, best = likely, min(likely, key=_chi2)
     near = []
     for fit in fits:
         lost, error = held_out_improvement(fit.held_out_loss, best.held_out_loss)
-        close = fit is best or lost <= max(error, limits.chi2_equivalence * best.held_out_loss.chi2_per_sample)
-        if close or _lr_equivalent(fit, best, limits) or _bic_prefers(fit, best, limits):
+        close = fit is best or lost <= max(error, limits.chi2_equivalence * _chi2(best))
+        if close or _noise_difference(fit, best, limits) <= CHI2_95_TWO_SIDED or _bic_prefers(fit, best, limits):
             near.append(fit)
     likeliest = min(near, key=lambda fit: penalized_chi2_difference(fit, best))
-    near = [fit for fit in near if not _lr_rejects(fit, likeliest, limits)]
+    near = [fit for fit in near if not _noise_difference(fit, likeliest, limits) > 2 * limits.min_log_bayes_factor]
 
     def order(fit: RefitModel) -> tuple[bool, int, float]:
-        return (
-            bool(fit.effects) and _is_amplitude_outside_prior(fit.effects[-1], fit.values, limits),
-            fit.effect_parameter_count,
-            penalized_chi2_difference(fit, likeliest),
-        )
+        odd = any(_is_amplitude_outside_prior(effect, fit, limits) for effect in fit.effects[-1:])
+        return odd, fit.effect_parameter_count, penalized_chi2_difference(fit, likeliest)
 
     return sorted(near, key=order)
 
 
-def _lr_equivalent(fit: RefitModel, other: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether the likelihood ratio of two models over all recordings is within its 95 % bound."""
-    return (
-        _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
-        and penalized_chi2_difference(fit, other) <= CHI2_95_TWO_SIDED
-    )
-
-
-def _lr_rejects(fit: RefitModel, other: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
-    """Whether the log likelihood ratio over all recordings rejects `fit` against `other` decisively."""
-    return (
-        _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
-        and penalized_chi2_difference(fit, other) > 2 * limits.min_log_bayes_factor
-    )
+def _noise_difference(fit: RefitModel, other: RefitModel, limits: Thresholds) -> float:
+    """`penalized_chi2_difference`; NaN where either leaves more than noise, so that squares are errors of a model."""
+    left = _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
+    return penalized_chi2_difference(fit, other) if left else math.nan
 
 
 def penalized_chi2_difference(fit: RefitModel, other: RefitModel) -> float:
@@ -155,71 +133,56 @@ def penalized_chi2_difference(fit: RefitModel, other: RefitModel) -> float:
 
     Every parameter counts as the one by which chance alone lowers r'r.
     """
-    held = _squares(fit.held_out_loss) - _squares(other.held_out_loss)
+    held = fit.held_out_loss.total_chi2 - other.held_out_loss.total_chi2
     return held + 2 * (fit.cost - other.cost) + fit.effect_parameter_count - other.effect_parameter_count
 
 
-def _likely(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
-    return _is_significant(effect, fit, limits) and not _is_shape_outside_prior(effect, fit.values, limits, fit.std)
-
-
-def _bic_prefers(fit: RefitModel, best: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
+def _bic_prefers(fit: RefitModel, best: RefitModel, limits: Thresholds) -> bool:
     """Whether BIC prefers `fit` with fewer parameters over `best` when model error dominates.
 
     Residuals are then errors of the model, of unknown size and alike for the length of a block: blocks times the
-    logarithm of the losses' ratio against parameters times that of the blocks (BIC, Schwarz 1978,
+    logarithm of the losses' ratio against parameters times that of the blocks (Schwarz 1978,
     doi:10.1214/aos/1176344136).
     """
-    if best.held_out_loss.chi2_per_sample < limits.model_error_chi2 or not np.isfinite(
-        fit.held_out_loss.chi2_per_sample
-    ):
+    blocks, fewer = len(best.held_out_loss.block_chi2), best.effect_parameter_count - fit.effect_parameter_count
+    if _chi2(best) < limits.model_error_chi2 or not np.isfinite(_chi2(fit)) or fewer <= 0:
         return False
-    blocks, fewer = (
-        len(best.held_out_loss.block_sample_counts),
-        best.effect_parameter_count - fit.effect_parameter_count,
-    )
-    return fewer > 0 and blocks * math.log(
-        fit.held_out_loss.chi2_per_sample / best.held_out_loss.chi2_per_sample
-    ) <= fewer * math.log(blocks)
+    return blocks * math.log(_chi2(fit) / _chi2(best)) <= fewer * math.log(blocks)
 
 
-def _is_shape_outside_prior(
-    effect: EffectBase,
-    values: Mapping[str, float],
-    limits: Thresholds = DEFAULT_THRESHOLDS,
-    std: Mapping[str, float] | None = None,
-) -> bool:
+def _likely(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
+    return _is_significant(effect, fit, limits) and not _is_shape_outside_prior(effect, fit, limits)
+
+
+def _is_shape_outside_prior(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
     """Whether a shape parameter lies outside its prior range by `shape_range_factor` or `prior_range_margin` widths."""
     for name in effect.shape_names:
         low, high = effect.prior_ranges[name]
-        room = limits.prior_range_margin * (high - low)
-        factor = limits.shape_range_factor
+        room, factor = limits.prior_range_margin * (high - low), limits.shape_range_factor
         near, far = (low / factor, high * factor) if low > 0 else (low - room, high + room)
-        unsure = limits.min_z * (std or {}).get(name, 0.0)
-        if not near - unsure <= values[name] <= far + unsure:
+        unsure = limits.min_z * fit.std.get(name, 0.0)
+        if not near - unsure <= fit.values[name] <= far + unsure:
             return True
     return False
 
 
-def _is_amplitude_outside_prior(
-    effect: EffectBase, values: Mapping[str, float], limits: Thresholds = DEFAULT_THRESHOLDS
-) -> bool:
+def _is_amplitude_outside_prior(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
     """Whether an amplitude lies outside its prior range by more than `prior_range_margin` widths of that range."""
-    for name in effect.amplitude_names:
-        low, high = effect.prior_ranges[name]
-        room = limits.prior_range_margin * (high - low)
-        if not low - room <= values[name] <= high + room:
-            return True
-    return False
+    ranges = {name: effect.prior_ranges[name] for name in effect.amplitude_names}
+    margin = limits.prior_range_margin
+    return not all(
+        low - margin * (high - low) <= fit.values[name] <= high + margin * (high - low)
+        for name, (low, high) in ranges.items()
+    )
 
 
-def _is_significant(effect: EffectBase, fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
+def _is_significant(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
     """Whether any amplitude is at least `min_z` standard deviations from neutral."""
     neutral, std = effect.neutral_values, fit.amplitude_std
     return any(abs(fit.values[n] - neutral[n]) >= limits.min_z * std.get(n, 0.0) for n in effect.amplitude_names)
 
 
-def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
+def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds) -> bool:
     """Whether the held-out error, of all channels or of any one, is reduced by the fraction `min_rmse_reduction`."""
     if _lr_decisive(before, after, limits) or not np.isfinite(before.chi2_per_sample):
         return True
@@ -228,12 +191,9 @@ def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds
 
 def rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
     """Return the relative reduction of the held-out RMSE: the larger of all channels together and the best channel."""
+    channels = [name for name in before.channel_rmse if name in after.channel_rmse]
     pairs = [(np.sqrt(before.chi2_per_sample), np.sqrt(after.chi2_per_sample))]
-    pairs += [
-        (rmse, after.channel_rmse[name][0])
-        for name, (rmse, _) in before.channel_rmse.items()
-        if name in after.channel_rmse
-    ]
+    pairs += [(before.channel_rmse[name][0], after.channel_rmse[name][0]) for name in channels]
     return float(max(1.0 - later / earlier if earlier > 0 else 0.0 for earlier, later in pairs))
 
 
@@ -241,25 +201,26 @@ def rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
 
 
 def _refit_shortlist(
-    scores: Sequence[CandidateScore], alike: ConfusabilityMatrix, limits: Thresholds, places: Sequence[str] = ()
-) -> list[tuple[EffectBase, Mapping[str, float]]]:
-    """Choose the candidates to refit, with their start values."""
+    screened: ScreeningResult, limits: Thresholds, base: Sequence[EffectBase] = (), places: Sequence[str] = ()
+) -> list[tuple[tuple[EffectBase, ...], Mapping[str, float]]]:
+    """The candidates to refit, with their start values; the best of every place of the gap is among them."""
+    scores, alike = screened.candidate_scores, screened.confusability
     ranked = [score for score in scores if score.p_value < limits.significance_level]
     if not ranked:
         return []
-    best = list(ranked[: limits.n_refit_per_round])
-    extra: list[CandidateScore] = []
-    for score in best:
-        names = alike.confusable_with(score.effect.label, limits.signature_overlap)
-        extra += [s for s in ranked if s.effect.label in names and s not in best and s not in extra]
-    extra.sort(key=lambda s: -s.predicted_chi2_decrease)
-    chosen = [*best, *extra[: limits.n_refit_per_round]]
+    best = ranked[: limits.n_refit_per_round]
+    names = {n for s in best for n in alike.confusable_with(s.effect.label, limits.signature_overlap)}
+    extra = sorted(
+        (s for s in ranked if s.effect.label in names and s not in best), key=lambda s: -s.predicted_chi2_decrease
+    )
     surest = sorted(ranked, key=lambda s: (s.p_value, -s.lm_statistic))[: limits.n_refit_lowest_p]
-    there = [next((s for s in scores if s.effect.location == place), None) for place in places]
-    for other in (*surest, *there):
-        if other is not None and other not in chosen:
-            chosen.append(other)
-    return [(s.effect, s.predicted_values) for s in chosen]
+    # where the gap lay before anything was added asks for no more than the significant afterwards
+    there = [[s for s in (ranked if base else scores) if s.effect.location == place][:1] for place in places]
+    chosen: list[CandidateScore] = []
+    for score in (*best, *extra[: limits.n_refit_per_round], *surest, *(s for own in there for s in own)):
+        if score not in chosen:
+            chosen.append(score)
+    return [((s.effect,), s.predicted_values) for s in chosen]
 
 
 def _from_before(search: RefitContext) -> list[RefitModel]:
@@ -269,17 +230,16 @@ def _from_before(search: RefitContext) -> list[RefitModel]:
     except SolverError:
         return []
     search.progress.begin_stage("trying candidates from the earlier run's parameters")
-    chosen = _refit_shortlist(screened.candidate_scores, screened.confusability, search.thresholds)
-    return refit_each_candidate(search, (), chosen, {}, "from the earlier run's parameters")
+    chosen = _refit_shortlist(screened, search.thresholds)
+    return refit_each(search, (), chosen, {}, "from the earlier run's parameters")
 
 
-def _likelier(fits: Sequence[RefitModel], others: Sequence[RefitModel]) -> list[RefitModel]:
-    """Of every effect the fit of least cost."""
+def _likelier(fits: Sequence[RefitModel]) -> list[RefitModel]:
+    """Of every effect the fit of least cost, in the order of their first ones."""
     best: dict[str, RefitModel] = {}
-    for fit in (*fits, *others):
+    for fit in fits:
         label = fit.effects[-1].label
-        if label not in best or fit.cost < best[label].cost:
-            best[label] = fit
+        best[label] = min(best.get(label, fit), fit, key=lambda entry: entry.cost)
     return list(best.values())
 
 
@@ -294,10 +254,8 @@ def select_effects(
 
     Parameters
     ----------
-    nominal : RefitModel
-        Without any effect.
     screened : ScreeningResult
-        All candidates at that fit.
+        All candidates at the nominal fit.
     places : sequence of str
         Where the smoother says that the gap lies.
     moved : bool
@@ -308,9 +266,9 @@ def select_effects(
     fits : tuple of RefitModel
         Of single effects in the first round, the chosen one first, then by held-out loss; where one effect alone stays,
         its last fit first.
+    selected : tuple of SelectedEffect
     """
-    limits, alone = search.thresholds, screened
-    current = nominal
+    limits, alone, current = search.thresholds, screened, nominal
     first: tuple[RefitModel, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
     paired = False
@@ -323,29 +281,33 @@ def select_effects(
             p_value = bonferroni_min_p_value(screened.candidate_scores)
             if _little_is_left(current, limits) and p_value >= limits.candidate_significance_level:
                 break
-        fits = _fits_of_round(search, nominal, (alone, screened), current, places, moved)
+        fits = refit_each(search, base, _refit_shortlist(screened, limits, base, places), current.values)
+        if moved and not base:
+            fits = _likelier([*fits, *_from_before(search)])
+        if len(base) == 1:
+            pairs = refit_each(search, (), _pairs_to_refit(alone, limits, base[0]), nominal.values, "together")
+            fits += [
+                fit
+                for fit in pairs
+                if _likely(fit.effects[0], fit, limits) and not _is_amplitude_outside_prior(fit.effects[0], fit, limits)
+            ]
+        fits = _of_a_size(fits, limits) if base else fits
         if not fits:
             break
         near = _near_best_models(fits, limits)
-        if not added:
-            first = (
-                near[0],
-                *sorted((fit for fit in fits if fit is not near[0]), key=lambda fit: fit.held_out_loss.chi2_per_sample),
-            )
+        first = first or (near[0], *sorted((fit for fit in fits if fit is not near[0]), key=_chi2))
         chosen = next((fit for fit in near if _worth_adding(current, fit, limits)), None)
         if chosen is None:
             break
         paired = chosen.effects[:-1] != base
-        total = gap_closure(nominal.held_out_loss, chosen.held_out_loss, limits=limits)
+        total = gap_closure(nominal.held_out_loss, chosen.held_out_loss, limits)
+        both = f"put {join_effect_labels(chosen.effects)} in the place of {join_effect_labels(base)}"
         said = "" if np.isnan(total.fraction) else f": {100 * total.fraction:.3g} % of the held-out gap closed"
+        search.progress.begin_stage((both if paired else f"added {chosen.effects[-1].label}") + said)
         if paired:
-            search.progress.begin_stage(
-                f"put {join_effect_labels(chosen.effects)} in the place of {join_effect_labels(base)}{said}"
-            )
-            both = [SelectedEffect(effect, chosen, total, (effect,)) for effect in chosen.effects]
-            added = _rebuilt(search, nominal, both, chosen)
+            pair = [SelectedEffect(effect, chosen, total, (effect,)) for effect in chosen.effects]
+            added = _rebuilt(search, nominal, pair, chosen)
         else:
-            search.progress.begin_stage(f"added {chosen.effects[-1].label}{said}")
             beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == base]
             added = (*added, SelectedEffect(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
         current = chosen
@@ -357,39 +319,14 @@ def select_effects(
     return first, kept
 
 
-def _fits_of_round(
-    search: RefitContext,
-    nominal: RefitModel,
-    screened: tuple[ScreeningResult, ScreeningResult],
-    current: RefitModel,
-    places: Sequence[str],
-    moved: bool,
-) -> list[RefitModel]:
-    """Refits of a round: candidates beside the effects so far, and likely pairs instead of a single one.
-
-    `screened` holds all candidates at the nominal fit and beside the effects so far.
-    """
-    limits, base, (alone, beside) = search.thresholds, current.effects, screened
-    # where the gap lay before anything was added asks for no more than the significant afterwards
-    scores = [score for score in beside.candidate_scores if not base or score.p_value < limits.significance_level]
-    chosen = _refit_shortlist(scores, beside.confusability, limits, places)
-    fits = refit_each_candidate(search, base, chosen, current.values)
-    if moved and not base:
-        fits = _likelier(fits, _from_before(search))
-    if len(base) == 1:
-        pairs = refit_each_pair(search, _pairs_to_refit(alone, limits, base[0]), nominal.values)
-        fits += [fit for fit in pairs if _firmly(fit.effects[0], fit, limits)]
-    return _of_a_size(fits, limits) if base else fits
-
-
 def _pairs_to_refit(
     screened: ScreeningResult, limits: Thresholds, without: EffectBase
-) -> list[tuple[tuple[EffectBase, EffectBase], Mapping[str, float]]]:
-    """Choose the pairs of candidates to refit: best penalized decrease first, without confusable duplicates."""
-    alike = screened.confusability
+) -> list[tuple[tuple[EffectBase, ...], Mapping[str, float]]]:
+    """The pairs of candidates to refit: best penalized decrease first, without confusable duplicates."""
 
     def same(one: EffectBase, other: EffectBase) -> bool:
-        return one.label == other.label or other.label in alike.confusable_with(one.label, limits.signature_overlap)
+        alike = screened.confusability.confusable_with(one.label, limits.signature_overlap)
+        return one.label == other.label or other.label in alike
 
     def covered(pair: CandidatePair, by: CandidatePair) -> bool:
         (a, b), (c, d) = pair.effects, by.effects
@@ -405,14 +342,9 @@ def _pairs_to_refit(
     return [(pair.effects, pair.predicted_values) for pair in chosen]
 
 
-def _firmly(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
-    """Whether an effect of a fit is there, with a shape and an amplitude to be expected."""
-    return _likely(effect, fit, limits) and not _is_amplitude_outside_prior(effect, fit.values, limits)
-
-
 def _of_a_size(fits: Sequence[RefitModel], limits: Thresholds) -> list[RefitModel]:
     """Fits whose last effect is of a size to be expected: beyond it, it mends what those before it do wrong."""
-    return [fit for fit in fits if not _is_amplitude_outside_prior(fit.effects[-1], fit.values, limits)]
+    return [fit for fit in fits if not _is_amplitude_outside_prior(fit.effects[-1], fit, limits)]
 
 
 def _little_is_left(fit: RefitModel, limits: Thresholds) -> bool:
@@ -422,14 +354,17 @@ def _little_is_left(fit: RefitModel, limits: Thresholds) -> bool:
 
 def _worth_adding(current: RefitModel, chosen: RefitModel, limits: Thresholds) -> bool:
     """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all."""
-    gained, error = held_out_improvement(current.held_out_loss, chosen.held_out_loss)
-    part = gained >= limits.min_gap_closed * current.held_out_loss.excess_chi2 and current.held_out_loss.excess_chi2 > 0
+    before, after = current.held_out_loss, chosen.held_out_loss
+    gained, error = held_out_improvement(before, after)
+    part = gained >= limits.min_gap_closed * before.excess_chi2 and before.excess_chi2 > 0
     closes = not _little_is_left(current, limits) and gained > error and part
-    if not closes and not _lr_decisive(current.held_out_loss, chosen.held_out_loss, limits):
-        return False
-    return _is_significant(chosen.effects[-1], chosen, limits) and _is_rmse_reduced(
-        current.held_out_loss, chosen.held_out_loss, limits
-    )
+    return (closes or _lr_decisive(before, after, limits)) and _is_there(current, chosen, chosen.effects[-1], limits)
+
+
+def _is_there(without: RefitModel, full: RefitModel, effect: EffectBase, limits: Thresholds) -> bool:
+    """Whether an effect is surely not zero and takes away a relevant part of the held-out error."""
+    reduced = _is_rmse_reduced(without.held_out_loss, full.held_out_loss, limits)
+    return reduced and _is_significant(effect, full, limits)
 
 
 def _reconsidered(
@@ -445,7 +380,7 @@ def _reconsidered(
         if position is None:
             break
         tried.add(others[position])
-        revised = _revised(search, nominal, kept, position)
+        revised = _revised(search, nominal, kept, kept[position])
         if _labels(revised) == _labels(kept) or _labels(revised) not in seen:
             kept = revised
             seen.add(_labels(kept))
@@ -457,25 +392,24 @@ def _labels(added: Sequence[SelectedEffect]) -> frozenset[str]:
 
 
 def _revised(
-    search: RefitContext, nominal: RefitModel, kept: tuple[SelectedEffect, ...], position: int
+    search: RefitContext, nominal: RefitModel, kept: tuple[SelectedEffect, ...], entry: SelectedEffect
 ) -> tuple[SelectedEffect, ...]:
     """The effects without one of them, with another in its place, or as they are with what would do as well."""
-    limits, full, entry = search.thresholds, kept[-1].refitted_model, kept[position]
+    limits, full, label = search.thresholds, kept[-1].refitted_model, entry.effect.label
     rest = [other.effect for other in kept if other is not entry]
     # it begins elsewhere than a refit of the same effects in an earlier round
-    without = _again(search, rest, full, f"{join_effect_labels(full.effects)} without {entry.effect.label}")
+    without = _again(search, rest, full, f"{join_effect_labels(full.effects)} without {label}")
     if without is None:
         return kept
     if not _needed(without, full, entry.effect, limits):
-        search.progress.begin_stage(f"left {entry.effect.label} out again: the others do as well")
+        search.progress.begin_stage(f"left {label} out again: the others do as well")
         return _rebuilt(search, nominal, [other for other in kept if other is not entry], without)
-    search.progress.begin_stage(f"looking for others in the place of {entry.effect.label}")
+    search.progress.begin_stage(f"looking for others in the place of {label}")
     screened = screen_candidates(search.problem, rest, without.values, limits)
-    tried = _refit_shortlist(screened.candidate_scores, screened.confusability, limits)[: limits.n_refit_per_round]
-    tried = [pair for pair in tried if pair[0].label != entry.effect.label]
+    tried = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]
     own = replace(full, effects=(*rest, entry.effect))
-    others = refit_each_candidate(search, rest, tried, without.values)
-    if not _is_amplitude_outside_prior(entry.effect, own.values, limits):
+    others = refit_each(search, rest, [pair for pair in tried if pair[0][0].label != label], without.values)
+    if not _is_amplitude_outside_prior(entry.effect, own, limits):
         others = _of_a_size(others, limits)
     near = _near_best_models([own, *others], limits)
     chosen = next((fit for fit in near if _needed(without, fit, fit.effects[-1], limits)), own)
@@ -483,7 +417,7 @@ def _revised(
     placed = [replace(e, effect=chosen.effects[-1], equivalent_effects=rivals) if e is entry else e for e in kept]
     if chosen is own:
         return tuple(placed)
-    search.progress.begin_stage(f"put {chosen.effects[-1].label} in the place of {entry.effect.label}")
+    search.progress.begin_stage(f"put {chosen.effects[-1].label} in the place of {label}")
     return _rebuilt(search, nominal, placed, replace(chosen, effects=tuple(e.effect for e in placed)))
 
 
@@ -491,30 +425,24 @@ def _needed(without: RefitModel, full: RefitModel, effect: EffectBase, limits: T
     """Whether held-out recordings are surely predicted worse without an effect, and it is there at all."""
     gained, error = held_out_improvement(without.held_out_loss, full.held_out_loss)
     sure = gained > error or _lr_decisive(without.held_out_loss, full.held_out_loss, limits)
-    return (
-        sure
-        and _is_significant(effect, full, limits)
-        and _is_rmse_reduced(without.held_out_loss, full.held_out_loss, limits)
-    )
+    return sure and _is_there(without, full, effect, limits)
 
 
 def _rebuilt(
     search: RefitContext, nominal: RefitModel, entries: Sequence[SelectedEffect], last: RefitModel
 ) -> tuple[SelectedEffect, ...]:
     """Effects in their order, each with the fit of all up to it, or of all where that cannot be made."""
-    found = []
-    for i, entry in enumerate(entries):
-        effects = [other.effect for other in entries[: i + 1]]
-        part = None if i == len(entries) - 1 else _again(search, effects, last, f"{join_effect_labels(effects)} again")
-        fit = last if part is None else part
-        found.append(
-            replace(
-                entry,
-                refitted_model=fit,
-                cumulative_closure=gap_closure(nominal.held_out_loss, fit.held_out_loss, limits=search.thresholds),
-            )
+    effects = [entry.effect for entry in entries]
+    parts = [effects[:i] for i in range(1, len(effects))]
+    fits = [_again(search, part, last, f"{join_effect_labels(part)} again") or last for part in parts]
+    return tuple(
+        replace(
+            entry,
+            refitted_model=fit,
+            cumulative_closure=gap_closure(nominal.held_out_loss, fit.held_out_loss, search.thresholds),
         )
-    return tuple(found)
+        for entry, fit in zip(entries, [*fits, last], strict=True)
+    )
 
 
 def _again(search: RefitContext, effects: Sequence[EffectBase], near: RefitModel, name: str) -> RefitModel | None:

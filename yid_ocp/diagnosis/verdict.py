@@ -1,19 +1,115 @@
-"""Step eight: whether there is a gap, and the verdict."""
+"""Step eight: whether there is a gap, whether the effects carry over to the held-out recordings, and the verdict.
+
+Two or three effects together imitate almost anything on the recordings on which they were fitted. What is true of the
+robot comes out the same wherever it is fitted; so the held-out recordings are fitted in turn, and values are compared.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
-from yid_ocp.diagnosis.refit import RefitModel
+from yid_ocp.diagnosis.hypotheses import join_effect_labels
+from yid_ocp.diagnosis.refit import RefitContext, RefitModel, refit_with_effects
 from yid_ocp.diagnosis.screening import CandidateDetectability, CandidateScore, bonferroni_min_p_value
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.effects import EffectBase
 from yid_ocp.inference.null_test import NullTestResult, exceeds_noise
 from yid_ocp.inference.smoother import SmootherResult
 
 UnknownReason = Literal["", "none", "unsure", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, closure not significant, too little explained, no transfer."""
+
+_DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
+
+
+@dataclass(frozen=True)
+class TransferCheck:
+    """One parameter of an effect, estimated on the estimation recordings and again on the held-out ones."""
+
+    effect_label: str
+    parameter: str
+    unit: str
+    estimation_value: float
+    estimation_std: float
+    held_out_value: float
+    held_out_std: float
+    is_consistent: bool
+
+    @property
+    def disagreement(self) -> str:
+        """Both estimates, in words."""
+        here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
+        there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
+        return f"{self.effect_label}.{self.parameter} is {here} and {there}"
+
+    @property
+    def difference(self) -> tuple[float, float]:
+        """Absolute difference of the two estimates, and its standard deviation."""
+        spread = math.hypot(self.estimation_std, self.held_out_std)
+        return abs(self.estimation_value - self.held_out_value), spread
+
+
+def check_transfer(search: RefitContext, fit: RefitModel) -> tuple[TransferCheck, ...]:
+    """Refit the effects on the held-out recordings and compare every amplitude.
+
+    Empty if one recording is split, or if the model cannot be fitted there, which is no evidence against it.
+    """
+    if search.problem.is_split_in_blocks or not fit.effects:
+        return ()
+    search.progress.begin_stage("fitting the held-out recordings with the same effects")
+    problem = search.problem.problem
+    turned = replace(search.problem, problem=problem.with_episodes(problem.held_out, problem.episodes))
+    if problem.has_process_noise:
+        turned = turned.whitened_at(fit.values)
+    # what both sets of recordings have in common, nothing of single recordings' starts
+    names = {*turned.nominal_parameters, *(name for effect in fit.effects for name in effect.parameters.names)}
+    start = {name: value for name, value in fit.values.items() if name in names}
+    name = f"{join_effect_labels(fit.effects)} on the held-out recordings"
+    again = refit_with_effects(turned, fit.effects, start, search.store, name, search.thresholds)
+    if again is None:
+        return ()
+    return tuple(entry for effect in fit.effects for entry in _compare(effect, fit, again, search.thresholds))
+
+
+def _compare(effect: EffectBase, first: RefitModel, second: RefitModel, limits: Thresholds) -> list[TransferCheck]:
+    """The amplitudes of one effect in two fits."""
+    neutral, found = effect.neutral_values, []
+    width = {name: high - low for name, (low, high) in effect.prior_ranges.items()}
+    size = max(abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitude_names)
+    for name in effect.amplitude_names:
+        own = (first.values[name], first.std[name], second.values[name], second.std[name])
+        entry = TransferCheck(
+            effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit, *own, True
+        )
+        apart, spread = entry.difference
+        # what has no standard deviation says nothing against it
+        sure = math.isfinite(spread) and apart > limits.transfer_z_max * spread
+        found.append(replace(entry, is_consistent=not sure or apart <= limits.transfer_rtol * size * width[name]))
+    return found
+
+
+def inflate_std_by_disagreement(fit: RefitModel, entries: Sequence[TransferCheck]) -> RefitModel:
+    """Return the fit with amplitude standard deviations inflated by the disagreement between the recordings.
+
+    What a model misses of all of a recording its residual does not show: where two fits differ by more than
+    `_DISAGREEMENT_Z` standard deviations of both together, each is known to the spread of the two, the difference over
+    the square root of two.
+    """
+    std = dict(fit.std)
+    for entry in entries:
+        (apart, spread), name = entry.difference, f"{entry.effect_label}.{entry.parameter}"
+        if apart > _DISAGREEMENT_Z * spread:
+            std[name] = max(std[name], apart / math.sqrt(2.0))
+    return replace(fit, std=std)
+
+
+def failed_transfer_checks(entries: Sequence[TransferCheck]) -> tuple[TransferCheck, ...]:
+    """Return the checks whose two estimates disagree."""
+    return tuple(entry for entry in entries if not entry.is_consistent)
 
 
 def has_gap(
@@ -28,14 +124,7 @@ def has_gap(
     Either as a whole, or along what a candidate would do to it with some channel above noise: the sum over all channels
     does not notice what only a few samples show. A candidate alone has to be surer than that sum: it is the best of
     many, at the end of a tail that is known by asymptotics only. An offset of a torque beyond what was stated needs no
-    such channel: it is one number among thousands, and all others follow it.
-
-    Parameters
-    ----------
-    ranked : sequence of CandidateScore
-        Of all visible candidates; their smallest p-value counts as the best of that many tries.
-    offsets : bool
-        Whether the size of torque offsets is stated.
+    such channel where `offsets` are stated: it is one number among thousands, and all others follow it.
     """
     if exceeds_noise((before, held_out), limits.gap_limits):
         return True
@@ -65,34 +154,20 @@ def is_chance_excess(
 
 def decide_verdict(
     gap: bool,
-    visible: Sequence[CandidateDetectability],
-    added: Sequence[SelectedEffect],
-    total: GapClosure,
-    limits: Thresholds,
     enough: bool,
-    explained: float = 1.0,
-    carried: bool = True,
+    visible: Sequence[CandidateDetectability],
+    reason: UnknownReason,
+    added: Sequence[SelectedEffect],
 ) -> str:
     """Return the verdict: insufficient_data, no_gap, unknown, confusable or effect.
 
-    Parameters
-    ----------
-    added : sequence of SelectedEffect
-        After composition.
-    total : GapClosure
-        Of all effects added.
-    enough : bool
-        Whether there are samples enough for the unknowns.
-    explained : float
-        What the effects explain over what unknown forces, offsets and biases explain.
-    carried : bool
-        Whether the effects come out alike on the held-out recordings.
+    `enough`: whether there are samples enough for the unknowns; `reason`: why effects do not explain a gap.
     """
     if not enough or not any(entry.is_detectable for entry in visible):
         return "insufficient_data"
     if not gap:
         return "no_gap"
-    if find_unknown_reason(added, total, limits, explained, carried):
+    if reason:
         return "unknown"
     return "confusable" if len(added[0].equivalent_effects) > 1 else "effect"
 
@@ -108,7 +183,7 @@ def required_explained_fraction(added: Sequence[SelectedEffect], limits: Thresho
 
 
 def find_unknown_reason(
-    added: Sequence[SelectedEffect], total: GapClosure, limits: Thresholds, explained: float = 1.0, carried: bool = True
+    added: Sequence[SelectedEffect], total: GapClosure, limits: Thresholds, explained: float, carried: bool
 ) -> UnknownReason:
     """Return why a gap has no accepted effect; empty if it has one.
 

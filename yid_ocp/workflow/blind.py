@@ -265,7 +265,7 @@ def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -
     first = Path(folder) / f"{name}.h5"
     BlindExperiment(**experiment)._write_first_recording(first)
     _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
-    detectable = [entry.to_dict() for entry in ensemble.detectable_effects]
+    detectable = ensemble.detectable_effects_to_json()
     write_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 

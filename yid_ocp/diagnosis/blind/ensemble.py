@@ -1,8 +1,4 @@
-"""Random blind cases of one experiment, and their labels.
-
-What sort a case is of stands in the plan. Labels are written apart from the recordings and their hash is published
-before any recording is looked at.
-"""
+"""Random blind cases of one experiment; their labels are sealed before any recording is looked at."""
 
 from __future__ import annotations
 
@@ -21,10 +17,10 @@ from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateChoice, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.screening import CandidateLinearization, EffectSignature, linearize_candidates
+from yid_ocp.diagnosis.screening import CandidateLinearization, linearize_candidates
 from yid_ocp.diagnosis.select import gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.effects.base import EffectBase, ParameterDefinition, segment_springs
+from yid_ocp.effects.base import EffectBase, segment_springs
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -35,7 +31,7 @@ from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 _Key = TypeVar("_Key", str, float)
-DETECTABLE_MULTIPLES = (1.0, 3.0, 10.0)
+_DETECTABLE_MULTIPLES = (1.0, 3.0, 10.0)
 """Multiples of the detectable size."""
 CATEGORY_SHARES: Mapping[str, float] = {
     "null": 0.2,
@@ -76,8 +72,6 @@ def plan_cases(
         How large a part of the cases each gets; fewer than `_MIN_CASES_PER_EXPERIMENT` are none, but for the largest.
     chains : frozenset of str
         Experiments whose object can be made of finer links.
-    purpose : str
-        Of `ENSEMBLE_PURPOSES`.
 
     Raises
     ------
@@ -93,21 +87,19 @@ def plan_cases(
     slots: list[tuple[str, float | None]] = []
     for category, number in _dealt(count, CATEGORY_SHARES).items():
         if category == "single":
-            for size, times in _dealt(number, dict.fromkeys(DETECTABLE_MULTIPLES, 1.0)).items():
+            for size, times in _dealt(number, dict.fromkeys(_DETECTABLE_MULTIPLES, 1.0)).items():
                 slots += [(category, size)] * times
         else:
-            slots += [(category, DETECTABLE_MULTIPLES[-1] if category in ("pair", "left_out") else None)] * number
+            slots += [(category, _DETECTABLE_MULTIPLES[-1] if category in ("pair", "left_out") else None)] * number
     # the experiment that is furthest behind its part gets the next case, so that every sort is spread over all
     given = dict.fromkeys(kept, 0)
     cases = []
-    slots.sort(
-        key=lambda slot: slot[0] != "finer_chain"
-    )  # what few can do comes first, so that the rest makes up for it
+    slots.sort(key=lambda slot: slot[0] != "finer_chain")  # what few can do comes first; the rest makes up for it
     for i, slot in enumerate(slots):
         able = [name for name in kept if slot[0] != "finer_chain" or name in chains]
         name = max(able or kept, key=lambda entry: kept[entry] * (i + 1) - given[entry])
         given[name] += 1
-        cases.append((name, *(slot if able else ("single", DETECTABLE_MULTIPLES[1]))))
+        cases.append((name, *(slot if able else ("single", _DETECTABLE_MULTIPLES[1]))))
     order = np.random.default_rng([seed, ENSEMBLE_PURPOSES.index(purpose), 2]).permutation(count)
     return [PlannedCase(number, *cases[int(place)]) for number, place in enumerate(order)]
 
@@ -177,8 +169,7 @@ class BlindCase:
     name: str
     estimation_recordings: tuple[Recording, ...]
     held_out_recording: Recording
-    # kinds that are left out of the library; mostly one that has nothing to do with the case
-    excluded_kinds: tuple[str, ...]
+    excluded_kinds: tuple[str, ...]  # left out of the library; mostly one that has nothing to do with the case
 
 
 def seal_labels(labels: Sequence[CaseLabel]) -> tuple[str, str]:
@@ -211,26 +202,9 @@ class RecordingConditions:
     purpose: str = ENSEMBLE_PURPOSES[0]  # of `ENSEMBLE_PURPOSES`
 
 
-@dataclass(frozen=True)
-class DetectableEffect:
-    """Sensitivity of an experiment to an effect, which gives its detectable size."""
-
-    effect: EffectBase
-    shape_values: Mapping[str, float]  # values of its shape parameters
-    # shape (p, p): |columns a| is by how many standard deviations of the data the amplitudes a move the
-    # residual
-    sensitivity_factor: Array
-
-    @staticmethod
-    def from_signature(signature: EffectSignature) -> DetectableEffect:
-        """Build from a candidate's signature on a clean recording."""
-        factor = np.asarray(np.linalg.qr(signature.projected_sensitivity, mode="r"))
-        return DetectableEffect(signature.effect, signature.shape_values, factor)
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
-        columns = self.sensitivity_factor.tolist()
-        return {"effect": self.effect.label, "shape": dict(self.shape_values), "columns": columns}
+_Detectable = tuple[EffectBase, Mapping[str, float], Array]
+"""A candidate, values of its shape parameters, and F (p, p): |F a| is by how many standard deviations of the data the
+amplitudes a move the residual."""
 
 
 class CaseGenerator:
@@ -266,11 +240,8 @@ class CaseGenerator:
     ) -> None:
         self.simulated_system = problem.system if simulated_system is None else simulated_system
         if not self.simulated_system.driven or self.simulated_system.prescribed:
-            raise ConfigError(
-                "a blind proof moves driven arms",
-                where="model",
-                allowed="a robot whose arms are driven, nothing prescribed",
-            )
+            arms = "a robot whose arms are driven, nothing prescribed"
+            raise ConfigError("a blind proof moves driven arms", where="model", allowed=arms)
         if seed < 0:
             raise ConfigError(f"seed = {seed}", where="--seed", allowed="a whole number from 0")
         self.problem, self.seed, self._finer = problem, seed, finer
@@ -281,18 +252,15 @@ class CaseGenerator:
         self.conditions = replace(conditions or RecordingConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_KINDS):
-            raise ConfigError(
-                "none of the candidates can be done in MuJoCo",
-                where="diagnosis.candidates",
-                allowed=", ".join(INJECTABLE_KINDS),
-            )
-        self._detectable: tuple[DetectableEffect, ...] | None = None
+            what, where = "none of the candidates can be done in MuJoCo", "diagnosis.candidates"
+            raise ConfigError(what, where=where, allowed=", ".join(INJECTABLE_KINDS))
+        self._detectable: tuple[_Detectable, ...] | None = None
 
     def _rng(self, *path: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
 
-    def draw_true_parameters(self, rng: np.random.Generator) -> dict[str, float]:
-        """Draw true values of the free parameters, log-uniform about their start."""
+    def _draw_true_parameters(self, rng: np.random.Generator) -> dict[str, float]:
+        """True values of the free parameters, log-uniform about their start."""
         start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
         return {name: float(start[name] * _STIFFNESS_SPREAD_FACTOR ** rng.uniform(-1, 1)) for name in self.problem.free}
 
@@ -305,24 +273,22 @@ class CaseGenerator:
         links: int = 1,
     ) -> Recording:
         """Simulate one recording with injected effects; it carries no description or truth."""
-        system = self.simulated_system
+        nominal, system, values = self.simulated_system, self.simulated_system, truth
         if links > 1:
             assert self._finer is not None
             system = self._finer(links)
-        values = truth if links == 1 else finer_chain_parameters(self.simulated_system, system, truth)
-        made = simulate_random_motion(
-            self.simulated_system, system, self.initial_configuration, truth, values, injected, rng, self.conditions
-        )
+            values = finer_chain_parameters(nominal, system, truth)
+        posture = self.initial_configuration
+        made = simulate_random_motion(nominal, system, posture, truth, values, injected, rng, self.conditions)
         return replace(made, name=name, description="", source="", true_parameters={})
 
-    def linearize_clean_recordings(self) -> CandidateLinearization:
-        """Return the candidates' signatures on clean recordings."""
+    def _linearize_clean_recordings(self) -> CandidateLinearization:
+        """The candidates' signatures on clean recordings."""
         rng = self._rng(0)
-        names = [f"clean_{i}" for i in range(self.conditions.estimation_count)]
-        clean = tuple(self.simulate_recording(self.draw_true_parameters(rng), (), rng, name) for name in names)
-        problem = self.nominal_problem(clean)
+        names = [*(f"clean_{i}" for i in range(self.conditions.estimation_count)), "other"]
+        *clean, other = [self.simulate_recording(self._draw_true_parameters(rng), (), rng, name) for name in names]
+        problem = self._nominal_problem(clean)
         effects = make_candidate_effects(problem.system, clean, self._candidates)
-        other = self.simulate_recording(self.draw_true_parameters(rng), (), rng, "other")
         composed = AllCandidatesProblem.from_problem(problem, effects, [other])
         nominal = fit_nominal_model(problem, composed, limits=self._limits)
         # weighted by all noise, that of torques too
@@ -330,26 +296,32 @@ class CaseGenerator:
         return linearize_candidates(composed, (), nominal.values, self._limits.shape_grid_size)
 
     @property
-    def detectable_effects(self) -> tuple[DetectableEffect, ...]:
-        """Detectable size of every candidate, computed once."""
+    def _detectable_effects(self) -> tuple[_Detectable, ...]:
+        """Sensitivity of every candidate, computed once."""
         if self._detectable is None:
             self._detectable = tuple(
-                DetectableEffect.from_signature(signature) for signature in self.linearize_clean_recordings().signatures
+                (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r")))
+                for s in self._linearize_clean_recordings().signatures
             )
         return self._detectable
 
+    def detectable_effects_to_json(self) -> list[dict[str, Any]]:
+        """Return the sensitivity of every candidate, which gives its detectable size, JSON-compatible."""
+        return [
+            {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
+            for effect, shape, factor in self._detectable_effects
+        ]
+
     def load_detectable_effects(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Load detectable sizes computed by another process, from `DetectableEffect.to_dict`."""
+        """Load detectable sizes computed by another process, from `detectable_effects_to_json`."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
-            DetectableEffect(
-                by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float))
-            )
+            (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
             for own in detectable
         )
 
-    def nominal_problem(self, recordings: Sequence[Recording]) -> EstimationProblem:
-        """Return the nominal estimation problem of some recordings."""
+    def _nominal_problem(self, recordings: Sequence[Recording]) -> EstimationProblem:
+        """The nominal estimation problem of some recordings."""
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
@@ -366,7 +338,7 @@ class CaseGenerator:
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
         for attempt in range(MAX_CASE_DRAWS):
             rng = self._rng(1, wanted.number, attempt)
-            truth = self.draw_true_parameters(rng)
+            truth = self._draw_true_parameters(rng)
             injected, multiple = self._injected(wanted, rng)
             links = 2 if wanted.category == "finer_chain" else 1
             try:
@@ -386,8 +358,7 @@ class CaseGenerator:
         )
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
-        at_work = {effect.kind for effect in injected}
-        kinds = sorted({entry.effect.kind for entry in self.detectable_effects} - at_work)
+        kinds = sorted({e.kind for e, *_ in self._detectable_effects} - {effect.kind for effect in injected})
         return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
     def _injected(
@@ -397,53 +368,43 @@ class CaseGenerator:
             return (), None
         if wanted.category == "outside":
             return (self._outside(rng),), None
-        size = DETECTABLE_MULTIPLES[-1] if wanted.multiple is None else wanted.multiple
-        if wanted.category == "pair":
-            (one, multiple), (two, _) = self._inside(rng, size), self._inside(rng, size)
-            return ((one, two) if one.label != two.label else (one,)), multiple
-        effect, multiple = self._inside(rng, size)
-        return (effect,), multiple
+        size = _DETECTABLE_MULTIPLES[-1] if wanted.multiple is None else wanted.multiple
+        drawn = [self._inside(rng, size) for _ in range(2 if wanted.category == "pair" else 1)]
+        labels = [effect.label for effect, _ in drawn]
+        return tuple(e for i, (e, _) in enumerate(drawn) if e.label not in labels[:i]), drawn[0][1]
 
     def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
         """An effect of the library at so many times its detectable size, or as near as its range lets it come."""
-        groups: dict[str, dict[str, list[int]]] = {}
-        for i, entry in enumerate(self.detectable_effects):
-            if entry.effect.kind in INJECTABLE_KINDS:
-                places = groups.setdefault(entry.effect.kind, {})
-                places.setdefault(entry.effect.location, []).append(i)
-        best: tuple[InjectedEffect, float] | None = None
+        groups: dict[str, dict[str, list[_Detectable]]] = {}
+        for entry in self._detectable_effects:
+            if entry[0].kind in INJECTABLE_KINDS:
+                groups.setdefault(entry[0].kind, {}).setdefault(entry[0].location, []).append(entry)
+        drawn = []
         for _ in range(40):
             kind = str(rng.choice(sorted(groups)))
-            place = str(rng.choice(sorted(groups[kind])))
-            drawn = self._sized(self.detectable_effects[int(rng.choice(groups[kind][place]))], rng, wanted)
-            if drawn is None:
-                continue
-            made, multiple = drawn
-            if multiple > 0.9 * wanted:
-                return made, wanted
-            if best is None or multiple > best[1]:
-                best = made, multiple
-        assert best is not None
-        return best
+            shapes = groups[kind][str(rng.choice(sorted(groups[kind])))]
+            found = self._sized(shapes[int(rng.choice(len(shapes)))], rng, wanted)
+            if found is not None and found[1] > 0.9 * wanted:
+                return found[0], wanted
+            drawn += [] if found is None else [found]
+        return max(drawn, key=lambda entry: entry[1])
 
     def _sized(
-        self, entry: DetectableEffect, rng: np.random.Generator, wanted: float
+        self, entry: _Detectable, rng: np.random.Generator, wanted: float
     ) -> tuple[InjectedEffect, float] | None:
         """Amplitudes in a random proportion at so many times the detectable size, as far as the range allows."""
-        effect = entry.effect
-        quantities: dict[str, ParameterDefinition] = {f"{effect.label}.{q.name}": q for q in effect.definitions}
-        room = {n: effect.prior_ranges[n] for n in effect.amplitude_names}
-        neutral = np.array([quantities[n].neutral_value for n in effect.amplitude_names])
-        low, high = (np.array([room[n][side] for n in effect.amplitude_names]) - neutral for side in (0, 1))
+        (effect, shape, factor), names = entry, entry[0].amplitude_names
+        neutral = np.array([effect.neutral_values[n] for n in names])
+        low, high = np.array([effect.prior_ranges[n] for n in names]).T - neutral
         way = rng.uniform(low, high)
-        seen = float(np.linalg.norm(entry.sensitivity_factor @ way))
+        seen = float(np.linalg.norm(factor @ way))
         if seen <= 0:
             return None
         reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
-        factor = min(wanted * self._limits.detection_z / seen, float(reach))
-        values = {**dict(zip(effect.amplitude_names, neutral + factor * way, strict=True)), **entry.shape_values}
+        times = min(wanted * self._limits.detection_z / seen, float(reach))
+        values = {**dict(zip(names, neutral + times * way, strict=True)), **shape}
         reported = {name: told.value for name, told in effect.reported_parameters(values).items()}
-        return InjectedEffect(effect.kind, effect.location, reported), factor * seen / self._limits.detection_z
+        return InjectedEffect(effect.kind, effect.location, reported), times * seen / self._limits.detection_z
 
     def _outside(self, rng: np.random.Generator) -> InjectedEffect:
         system = self.simulated_system
@@ -483,14 +444,9 @@ def simulate_random_motion(
     rng: np.random.Generator,
     conditions: RecordingConditions,
 ) -> Recording:
-    """Simulate a recording of a random motion planned for the nominal system.
+    """Simulate a random motion planned for the nominal system, from a configuration of the driven joints.
 
-    Parameters
-    ----------
-    posture : mapping of str to float
-        Of the driven joints at the start.
-    truth, values : mapping of str to float
-        Parameters of the nominal and of the simulated system.
+    `truth` and `values` are the parameters of the nominal and of the simulated system.
     """
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
@@ -558,42 +514,30 @@ def diagnose_case(
     progress: Progress | None = None,
 ) -> DiagnosisResult:
     """Diagnose a blind case from its recordings alone."""
-    problem = ensemble.nominal_problem(case.estimation_recordings)
-    return diagnose(
-        problem,
-        candidates,
-        [case.held_out_recording],
-        thresholds=thresholds,
-        progress=progress,
-        exclude=case.excluded_kinds,
-    )
+    problem, held_out = ensemble._nominal_problem(case.estimation_recordings), [case.held_out_recording]
+    how: dict[str, Any] = {"thresholds": thresholds, "progress": progress, "exclude": case.excluded_kinds}
+    return diagnose(problem, candidates, held_out, **how)
 
 
 def best_possible_closure(
     ensemble: CaseGenerator, case: BlindCase, label: CaseLabel, candidates: CandidateChoice = "all"
 ) -> float:
     """Return the held-out closure of the true effects after a refit, the best a diagnosis could reach."""
-    problem = ensemble.nominal_problem(case.estimation_recordings)
+    problem = ensemble._nominal_problem(case.estimation_recordings)
     effects = make_candidate_effects(problem.system, case.estimation_recordings, candidates)
     composed = AllCandidatesProblem.from_problem(problem, effects, [case.held_out_recording])
     nominal = fit_nominal_model(problem, composed)
-    true = {entry.label: entry for entry in label.injected}
+    true = {entry.label: entry.values for entry in label.injected}
     chosen = [effect for effect in composed.candidate_effects if effect.label in true]
-    start = {}
-    for effect in chosen:
-        start.update(_internal(effect.label, true[effect.label].values, effect.definitions))
+    # reported values in the parameters' own unit
+    start = {
+        f"{effect.label}.{quantity.name}": quantity.to_internal(true[effect.label][quantity.reported_name_and_unit[0]])
+        for effect in chosen
+        for quantity in effect.definitions
+        if quantity.reported_name_and_unit[0] in true[effect.label]
+    }
     # under the weights of the nominal fit, as all that it is compared with
     fit = refit_with_effects(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
     if fit is None or len(chosen) < len(true):
         return math.nan
     return gap_closure(nominal.held_out_loss, fit.held_out_loss).fraction
-
-
-def _internal(label: str, values: Mapping[str, float], quantities: Sequence[ParameterDefinition]) -> dict[str, float]:
-    """Reported values in the parameters' own unit."""
-    found = {}
-    for quantity in quantities:
-        name, _ = quantity.reported_name_and_unit
-        if name in values:
-            found[f"{label}.{quantity.name}"] = quantity.to_internal(values[name])
-    return found

@@ -17,10 +17,11 @@ import scipy.stats
 from yid_ocp.diagnosis.blind.ensemble import CATEGORY_SHARES, CaseLabel
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EFFECTS
+from yid_ocp.files import finite_json
 
 _FORMAT = "yid-blind/1"
 _CATEGORIES = tuple(CATEGORY_SHARES)
-OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")
+_OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")
 """Categories whose true effect is not among the candidates."""
 _MAX_CONFUSABLE_SET = 3  # largest confusable set that counts as correct
 _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
@@ -37,19 +38,16 @@ class CaseScore:
     answer: str
     multiple: float
     gap: bool  # whether a gap was reported
-    # the true kind at the true place is first, or among the first two, of the candidates; the true place comes
-    # first
-    kind_first: bool
-    kind_second: bool
+    kind_first: bool  # the true kind at the true place is the first candidate
+    kind_second: bool  # or among the first two
     location_first: bool
     confusable: tuple[str, ...]  # set that was named as not separable
     # as the verdict asks: no_gap of a clean one, the true effect alone or in a set of at most three, each of a
     # pair likewise, unknown at the right place outside the library
     right: bool
-    closure: float  # held out, of what was added and of the true effects refitted
-    best: float
-    # relative error of every parameter of the true effect where it was added, and whether its 95 % interval has
-    # it
+    closure: float  # held out, of what was added
+    best: float  # and of the true effects refitted
+    # relative error of every parameter of the true effect where it was added, and whether its 95 % interval has it
     errors: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
     seconds: float = math.nan
     experiment: str = ""
@@ -75,30 +73,21 @@ class CaseScore:
 def score_case(
     label: CaseLabel, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
 ) -> CaseScore:
-    """Score a `yid-diagnosis/2` result against its label.
+    """Score a `yid-diagnosis/2` result against its label; `best` is of `best_possible_closure`."""
 
-    Parameters
-    ----------
-    best : float
-        Of `best_possible_closure`.
-    """
-    verdict = str(result["verdict"])
-    named = [f"{e['kind']}@{e['location']}" for e in result["effects"]]
-    listed = [f"{e['kind']}@{e['location']}" for e in result["which"]]
-    groups = [tuple(f"{e['kind']}@{e['location']}" for e in group) for group in result["confusable"]]
-    alike = next((group for group in groups if named and named[0] in group), ())
-    true = [effect.label for effect in label.injected]
-    places = [p["location"] for p in result["where"]]
-    gap = verdict not in ("no_gap", "insufficient_data")
-    located = bool(true) and bool(places) and places[0] in {effect.location for effect in label.injected}
-    if label.category in ("null",):
+    def labels(entries: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+        return tuple(f"{e['kind']}@{e['location']}" for e in entries)
+
+    verdict, named, listed = str(result["verdict"]), labels(result["effects"]), labels(result["which"])
+    groups = [labels(group) for group in result["confusable"]]
+    true, places = [effect.label for effect in label.injected], [p["location"] for p in result["where"]]
+    located = bool(true) and places[:1] != [] and places[0] in {effect.location for effect in label.injected}
+    if label.category == "null":
         right = verdict == "no_gap"
-    elif label.category in ("outside", "left_out"):
+    elif label.category in _OUT_OF_LIBRARY_CATEGORIES:
         right = verdict == "unknown" and located
-    elif label.category == "pair":
-        right = _found(true, named, groups)
     else:
-        right = bool(true) and _found(true, named[:1], groups)
+        right = bool(true) and _found(true, named if label.category == "pair" else named[:1], groups)
     errors: dict[str, tuple[float, bool]] = {}
     z: dict[str, float] = {}
     for effect in label.injected:
@@ -113,29 +102,32 @@ def score_case(
             errors[f"{effect.label}.{name}"] = (abs(miss) / max(abs(value), 1e-9), abs(miss) <= 1.96 * found["std"])
             if found["std"] > 0:
                 z[f"{effect.label}.{name}"] = miss / found["std"]
-    closed, before = result["gap"]["closure"], result["gap"].get("before") or {}
-    p_value = before.get("p_value")
+    before = result["gap"].get("before") or {}
     return CaseScore(
-        label.case,
-        label.category,
-        " + ".join(true) or "-",
-        verdict,
-        " + ".join(named) or "-",
-        math.nan if label.multiple is None else label.multiple,
-        gap,
-        bool(true) and listed[:1] == true[:1],
-        bool(true) and true[0] in listed[:2],
-        located,
-        alike,
-        right,
-        math.nan if closed is None else float(closed),
-        best,
-        errors,
-        seconds,
-        label.experiment,
-        z,
-        math.nan if p_value is None else float(p_value),
+        case=label.case,
+        category=label.category,
+        truth=" + ".join(true) or "-",
+        verdict=verdict,
+        answer=" + ".join(named) or "-",
+        multiple=_or_nan(label.multiple),
+        gap=verdict not in ("no_gap", "insufficient_data"),
+        kind_first=bool(true) and listed[:1] == (true[0],),
+        kind_second=bool(true) and true[0] in listed[:2],
+        location_first=located,
+        confusable=next((group for group in groups if named and named[0] in group), ()),
+        right=right,
+        closure=_or_nan(result["gap"]["closure"]),
+        best=best,
+        errors=errors,
+        seconds=seconds,
+        experiment=label.experiment,
+        z=z,
+        p_value=_or_nan(before.get("p_value")),
     )
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else float(value)
 
 
 def _found(true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str, ...]]) -> bool:
@@ -149,8 +141,8 @@ def _found(true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str
     return any(true[0] in own and _found(true[1:], [*named[:i], *named[i + 1 :]], groups) for i, own in enumerate(sets))
 
 
-def binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
-    """Return count, total, rate and its 95 % interval (Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404)."""
+def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
+    """Count, total, rate and its 95 % interval (Clopper and Pearson 1934, doi:10.1093/biomet/26.4.404)."""
     count, total = sum(map(bool, hits)), len(hits)
     if not total:
         return {"count": 0, "of": 0, "rate": None, "low": None, "high": None}
@@ -165,37 +157,32 @@ def score_ensemble(marks: Sequence[CaseScore]) -> dict[str, Any]:
     def mean(values: Sequence[float]) -> float | None:
         return float(np.mean(values)) if len(values) else None
 
-    singles = [m for m in marks if m.category == "single"]
+    by = {sort: [m for m in marks if m.category == sort] for sort in _CATEGORIES}
+    singles, pairs = by["single"], by["pair"]
+    strange = [m for m in marks if m.category in _OUT_OF_LIBRARY_CATEGORIES]
     seen = [m for m in singles if m.gap]
     named = [m for m in seen if m.answer != "-"]
-    strange = [m for m in marks if m.category in OUT_OF_LIBRARY_CATEGORIES]
-    pairs = [m for m in marks if m.category == "pair"]
     errors = [entry for m in singles for entry in m.errors.values()]
-    relative = [m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]
-    sizes = sorted({m.multiple for m in singles if math.isfinite(m.multiple)})
     shares = {
-        "false_alarms": [m.gap for m in marks if m.category == "null"],
+        "false_alarms": [m.gap for m in by["null"]],
         "kind_first": [m.kind_first for m in seen],
         "kind_in_two": [m.kind_second for m in seen],
         "location_first": [m.location_first for m in seen],
         "sets_cover": [m.truth in m.named for m in named],
         "unknown_recall": [m.verdict == "unknown" for m in strange],
-        **{
-            f"unknown_{sort}": [m.verdict == "unknown" for m in strange if m.category == sort]
-            for sort in OUT_OF_LIBRARY_CATEGORIES
-        },
+        **{f"unknown_{sort}": [m.verdict == "unknown" for m in by[sort]] for sort in _OUT_OF_LIBRARY_CATEGORIES},
         "unknown_location": [m.location_first for m in strange if m.gap],
         "pairs_right": [m.right for m in pairs],
         "pairs_named": [set(m.truth.split(" + ")) <= set(m.answer.split(" + ")) for m in pairs],
         "interval_coverage": [inside for _, inside in errors],
     }
-    intervals = {name: binomial_proportion(hits) for name, hits in shares.items()}
+    intervals = {name: _binomial_proportion(hits) for name, hits in shares.items()}
     detected = {}
-    for size in sizes:
+    for size in sorted({m.multiple for m in singles if math.isfinite(m.multiple)}):
         own = [m for m in singles if m.multiple == size]
         hits = {"gap": [m.gap for m in own], "first": [m.gap and m.kind_first for m in own]}
         hits["right"] = [m.right for m in own]
-        detected[f"{size:.3g}"] = {name: binomial_proportion(said) for name, said in hits.items()}
+        detected[f"{size:.3g}"] = {name: _binomial_proportion(said) for name, said in hits.items()}
     return {
         "format": _FORMAT,
         "cases": len(marks),
@@ -207,31 +194,30 @@ def score_ensemble(marks: Sequence[CaseScore]) -> dict[str, Any]:
         },
         "detection_intervals": detected,
         "set_size": mean([len(m.named) for m in named]),
-        "closure_of_best": mean(relative),
+        "closure_of_best": mean([m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]),
         "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
         "seconds": mean([m.seconds for m in marks if math.isfinite(m.seconds)]),
-        "experiments": _by_experiment(marks),
+        "experiments": {
+            name: _experiment_rates([m for m in marks if m.experiment == name])
+            for name in dict.fromkeys(m.experiment for m in marks)
+        },
         "confusion": _confusion_matrix(marks),
         "calibration": _calibration_rates(marks),
         "marks": [asdict(m) for m in marks],
     }
 
 
-def _by_experiment(marks: Sequence[CaseScore]) -> dict[str, dict[str, Any]]:
-    """Cases, false alarms and right answers of every experiment."""
-    found = {}
-    for name in dict.fromkeys(m.experiment for m in marks):
-        own = [m for m in marks if m.experiment == name]
-        found[name] = {
-            "cases": len(own),
-            "false_alarms": binomial_proportion([m.gap for m in own if m.category == "null"]),
-            "right": binomial_proportion([m.right for m in own if m.category not in ("null", "finer_chain")]),
-        }
-    return found
+def _experiment_rates(own: Sequence[CaseScore]) -> dict[str, Any]:
+    """Cases, false alarms and right answers of one experiment."""
+    return {
+        "cases": len(own),
+        "false_alarms": _binomial_proportion([m.gap for m in own if m.category == "null"]),
+        "right": _binomial_proportion([m.right for m in own if m.category not in ("null", "finer_chain")]),
+    }
 
 
 def _confusion_matrix(marks: Sequence[CaseScore]) -> dict[str, Any]:
-    """Return the confusion matrix: true classes (rows), answers (columns) and counts."""
+    """The confusion matrix: true classes (rows), answers (columns) and counts."""
     rows = sorted({m.sort for m in marks}, key=lambda name: (name in _CATEGORIES, name))
     columns = sorted({m.said for m in marks}, key=lambda name: (name in _VERDICTS, name))
     counts = [[sum((m.sort, m.said) == (row, column) for m in marks) for column in columns] for row in rows]
@@ -239,14 +225,13 @@ def _confusion_matrix(marks: Sequence[CaseScore]) -> dict[str, Any]:
 
 
 def _calibration_rates(marks: Sequence[CaseScore]) -> dict[str, Any]:
-    """Return the empirical coverage of parameter intervals and of p-values of clean recordings."""
+    """The empirical coverage of parameter intervals and of p-values of clean recordings."""
     z = [abs(value) for m in marks if m.category == "single" for value in m.z.values()]
     p = [m.p_value for m in marks if m.category == "null" and math.isfinite(m.p_value)]
-    levels = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-    quantiles = {level: float(scipy.stats.norm.ppf(0.5 * (1 + level))) for level in levels}
+    quantiles = {a: float(scipy.stats.norm.ppf(0.5 * (1 + a))) for a in (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)}
     return {
-        "intervals": [{"level": a, **binomial_proportion([x <= quantiles[a] for x in z])} for a in levels],
-        "p_values": [{"level": a, **binomial_proportion([x < a for x in p])} for a in (0.01, 0.05, 0.1, 0.2, 0.5)],
+        "intervals": [{"level": a, **_binomial_proportion([x <= q for x in z])} for a, q in quantiles.items()],
+        "p_values": [{"level": a, **_binomial_proportion([x < a for x in p])} for a in (0.01, 0.05, 0.1, 0.2, 0.5)],
     }
 
 
@@ -254,6 +239,7 @@ _CALIBRATION_FORMAT = "yid-calibration/1"
 _TARGET_COVERAGE = 0.95  # fraction of the cases that a threshold is to leave on their side
 
 _Statistics = Mapping[str, Any]
+_Statistic = Callable[[_Statistics, Thresholds, str], float]
 
 
 def permissive_thresholds(limits: Thresholds) -> Thresholds:
@@ -262,34 +248,19 @@ def permissive_thresholds(limits: Thresholds) -> Thresholds:
     A diagnosis of clean recordings with these shows how far chance alone goes.
     """
     sure = 1.0 + 1e-9
-    limits = replace(
+    return replace(
         limits,
         significance_level=sure,
         candidate_significance_level=sure,
         unexplained_p_factor=1.0,
         min_excess_chi2=-1.0,
         min_channel_excess_chi2=-1.0,
-    )
-    return replace(
-        limits,
         min_log_bayes_factor=1e-9,
         max_unknown_groups=1,
         min_gap_closed=-math.inf,
         min_rmse_reduction=-math.inf,
         max_effects=1,
     )
-
-
-@dataclass(frozen=True)
-class _CalibrationRule:
-    """Rule that derives one threshold from a statistic of the cases."""
-
-    setting: str
-    statistic: Callable[[_Statistics, Thresholds, str], float]
-    words: str
-    of: Literal["clean", "named", "refitted"]
-    side: Literal["most", "least"]
-    limit: float
 
 
 def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
@@ -306,7 +277,7 @@ def _along(said: _Statistics, limits: Thresholds, _: str) -> float:
     )
 
 
-def _of(name: str) -> Callable[[_Statistics, Thresholds, str], float]:
+def _of(name: str) -> _Statistic:
     return lambda said, limits, truth: -math.inf if said.get(name) is None else float(said[name])
 
 
@@ -337,42 +308,42 @@ def _lost(said: _Statistics, limits: Thresholds, truth: str) -> float:
     return lost if lost > math.hypot(own["error"], best["error"]) else 0.0
 
 
+@dataclass(frozen=True)
+class _CalibrationRule:
+    """Rule that derives one threshold from a statistic of the cases."""
+
+    setting: str
+    statistic: _Statistic
+    of: Literal["clean", "named", "refitted"]
+    side: Literal["most", "least"]
+    limit: float
+
+
 _CALIBRATION_RULES: Mapping[str, _CalibrationRule] = {
-    "gap": _CalibrationRule("min_excess_chi2", _excess, "chi2/n - 1 of a significant residual", "clean", "most", 0.1),
-    "candidate": _CalibrationRule(
-        "candidate_significance_level", _of("candidate"), "p of the best candidate", "clean", "least", 1e-4
-    ),
-    "channel": _CalibrationRule(
-        "min_channel_excess_chi2", _along, "the same of the worst channel, along a candidate", "clean", "most", 0.02
-    ),
-    "evidence": _CalibrationRule(
-        "min_log_bayes_factor", _of("evidence"), "rise of the log evidence by the best place", "clean", "most", 5.0
-    ),
-    "rival": _CalibrationRule(
-        "min_log_bayes_factor", _odds, "log odds of the likeliest effect against the truth", "refitted", "most", 5.0
-    ),
-    "closure": _CalibrationRule(
-        "min_gap_closed", _of("closure_low"), "lower end of the closure by the best effect", "clean", "most", 0.05
-    ),
-    "relevance": _CalibrationRule(
-        "min_rmse_reduction", _of("fall"), "part of a held-out error taken away by it", "clean", "most", 0.01
-    ),
-    "explained": _CalibrationRule(
-        "min_explained_fraction", _of("explained"), "part of the smoother's explanation", "named", "least", 0.75
-    ),
-    "carried": _CalibrationRule(
-        "transfer_z_max", _of("carried"), "standard deviations between recordings", "named", "most", 3.0
-    ),
-    "tie": _CalibrationRule(
-        "chi2_equivalence",
-        _lost,
-        "held-out chi2/n by which the truth is behind the best effect, beyond a standard error",
-        "refitted",
-        "most",
-        0.001,
-    ),
+    "gap": _CalibrationRule("min_excess_chi2", _excess, "clean", "most", 0.1),
+    "candidate": _CalibrationRule("candidate_significance_level", _of("candidate"), "clean", "least", 1e-4),
+    "channel": _CalibrationRule("min_channel_excess_chi2", _along, "clean", "most", 0.02),
+    "evidence": _CalibrationRule("min_log_bayes_factor", _of("evidence"), "clean", "most", 5.0),
+    "rival": _CalibrationRule("min_log_bayes_factor", _odds, "refitted", "most", 5.0),
+    "closure": _CalibrationRule("min_gap_closed", _of("closure_low"), "clean", "most", 0.05),
+    "relevance": _CalibrationRule("min_rmse_reduction", _of("fall"), "clean", "most", 0.01),
+    "explained": _CalibrationRule("min_explained_fraction", _of("explained"), "named", "least", 0.75),
+    "carried": _CalibrationRule("transfer_z_max", _of("carried"), "named", "most", 3.0),
+    "tie": _CalibrationRule("chi2_equivalence", _lost, "refitted", "most", 0.001),
 }
 """All rules, by what they look at."""
+_STATISTIC_TEXTS = {
+    "gap": "chi2/n - 1 of a significant residual",
+    "candidate": "p of the best candidate",
+    "channel": "the same of the worst channel, along a candidate",
+    "evidence": "rise of the log evidence by the best place",
+    "rival": "log odds of the likeliest effect against the truth",
+    "closure": "lower end of the closure by the best effect",
+    "relevance": "part of a held-out error taken away by it",
+    "explained": "part of the smoother's explanation",
+    "carried": "standard deviations between recordings",
+    "tie": "held-out chi2/n by which the truth is behind the best effect, beyond a standard error",
+}
 
 
 def _conformal_quantile(
@@ -415,38 +386,36 @@ def calibrate_thresholds(
         for label, mark, entry in zip(labels, marks, answers, strict=True)
         if (said := entry["result"].get("statistics")) is not None
     ]
+    clean = [wide or said for label, _, said, wide in cases if label.category == "null"]
+    single = [(mark, said) for label, mark, said, _ in cases if label.category == "single"]
+    outside = [said for label, _, said, _ in cases if label.category in _OUT_OF_LIBRARY_CATEGORIES]
     found = {}
     for name, rule in _CALIBRATION_RULES.items():
-        clean = [rule.statistic(wide or said, limits, "") for label, _, said, wide in cases if label.category == "null"]
-        true = [
-            (mark.multiple, rule.statistic(said, limits, mark.truth))
-            for label, mark, said, _ in cases
-            if label.category == "single" and (mark.right or rule.of != "named")
-        ]
-        strange = [
-            rule.statistic(said, limits, "")
-            for label, _, said, _ in cases
-            if label.category in OUT_OF_LIBRARY_CATEGORIES
-        ]
-        sample = clean if rule.of == "clean" else [value for _, value in true if value > -math.inf]
+        known = [(m, rule.statistic(said, limits, m.truth)) for m, said in single if m.right or rule.of != "named"]
+        sample = [value for _, value in known if value > -math.inf]
+        if rule.of == "clean":
+            sample = [rule.statistic(said, limits, "") for said in clean]
         value, attained = _conformal_quantile(sample, rule.side, coverage)
-        sizes = sorted({size for size, _ in true})
         # what chance brings more of is what small values tell of
         sign = -1.0 if rule.of == "clean" and rule.side == "least" else 1.0
-        beyond = {size: [sign * x > sign * value for s, x in true if s == size] for size in sizes}
+        beyond = {
+            size: [sign * x > sign * value for m, x in known if m.multiple == size]
+            for size in sorted({m.multiple for m, _ in known})
+        }
+        strange = [sign * rule.statistic(said, limits, "") > sign * value for said in outside]
         found[name] = {
             "setting": rule.setting,
-            "statistic": rule.words,
+            "statistic": _STATISTIC_TEXTS[name],
             "of": rule.of,
             "side": rule.side,
             "cases": len(sample),
             "coverage": attained,
-            "quantile": _number(value),
+            "quantile": finite_json(value),
             "limit": rule.limit,
             "is": getattr(limits, rule.setting),
-            "sample": [_number(entry) for entry in sorted(sample)],
-            "effects_beyond": {f"{size:.3g}": binomial_proportion(hits) for size, hits in beyond.items()},
-            "strange_beyond": binomial_proportion([sign * entry > sign * value for entry in strange]),
+            "sample": finite_json(sorted(sample)),
+            "effects_beyond": {f"{size:.3g}": _binomial_proportion(hits) for size, hits in beyond.items()},
+            "strange_beyond": _binomial_proportion(strange),
         }
     return {"format": _CALIBRATION_FORMAT, "asked": coverage, "rules": found, "settings": _recommended_settings(found)}
 
@@ -477,7 +446,3 @@ def _opened(answer: Mapping[str, Any]) -> _Statistics | None:
     """Statistics with open thresholds, where there are any."""
     wide = answer.get("open")
     return wide if wide is not None and "p_value" in wide else None
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
