@@ -15,7 +15,7 @@ import pytest
 NAME = "yid_ocp"
 PACKAGE = Path(__file__).parents[1] / NAME
 LAYERS = (
-    ("errors", "version"),
+    ("errors", "version", "arrays"),
     ("registry",),  # it raises errors, so the two cannot share a layer
     ("options", "files", "least_squares", "interruption", "progress", "display"),
     ("parallel",),

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from yid_ocp.arrays import Array
+
 _ResidualFunction = Callable[[Array], tuple[Array, Array]]
 _Projection = Callable[[Array], Array]
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.optimize
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.joint_checks import effect_setting_line
+from yid_ocp.arrays import Array
 from yid_ocp.data.issues import MIN_NOISE_DIFFERENCES, QUALITY_LIMITS, Issue, Severity, median_sample_period
 from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.inference.null_test import residual_channels
@@ -26,8 +26,6 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
-
-Array = NDArray[np.float64]
 
 PositionFunction = Callable[[Array], Array]
 """From times on the joints' clock (N,) to places (N, np, 3) [m]."""

@@ -13,9 +13,9 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.profile import with_profile_intervals
+from yid_ocp.arrays import Array
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step
 from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
 from yid_ocp.inference.uncertainty import (
@@ -31,8 +31,6 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
 from yid_ocp.solvers.base import Solver, uses_process_noise_covariance
-
-Array = NDArray[np.float64]
 
 _MEMORY_SAMPLING_PERIOD = 0.02
 # Two estimates agree when they differ by less than this many of the larger standard deviation, or by this fraction of

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import casadi as ca
 import numpy as np
 import scipy.optimize
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step
 from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
 from yid_ocp.inference.whitening import whitened_at
@@ -24,8 +24,6 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.unknown_vector import INITIAL_STATE_PREFIX
-
-Array = NDArray[np.float64]
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96

@@ -16,11 +16,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.stats
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 
-Array = NDArray[np.float64]
 _MIN_CORRELATION_EIGENVALUE = 1e-12
 """Smallest eigenvalue of a correlation matrix; what is known better than that follows from rounding."""
 

@@ -10,10 +10,11 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 import scipy.linalg
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unknowns, with_nuisance_unknowns
 from yid_ocp.analysis.torque_error_propagation import episode_sensitivities
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError, YidError
 from yid_ocp.inference.whitening import whitened_at
@@ -29,8 +30,6 @@ from yid_ocp.sensors import recorded_camera_pose
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, PositionSensor, is_measured_by_arm
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-
-Array = NDArray[np.float64]
 
 CAMERA_GROUP, ARM_GROUP = "points_camera", "points_arm"
 _MARKER_AXIS_DISTANCE = 0.03  # of a marker from the axis [m]

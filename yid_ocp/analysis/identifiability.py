@@ -9,9 +9,10 @@ from typing import Literal
 
 import numpy as np
 import threadpoolctl
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.profile import ParameterProfile, check_small_estimate, map_at_optimum, profile_likelihood
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
@@ -42,7 +43,6 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers.base import Solution
 
-Array = NDArray[np.float64]
 InitialStateKnowledge = Literal["assumed", "unknown"]
 
 _GRASP_OFFSET_KIND = "grasp_offset"
@@ -328,7 +328,7 @@ class _Sensitivities:
     x: Array
     evaluation: Evaluation
     names: tuple[str, ...]
-    chosen: NDArray[np.int64]
+    chosen: IntArray
     scale: Array
     inflation: float
     by_alone: Array

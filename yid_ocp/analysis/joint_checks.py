@@ -10,8 +10,8 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 import scipy.interpolate
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import white_noise_std
 from yid_ocp.data.issues import DEGREES_PER_RADIAN, QUALITY_LIMITS, Issue, median_sample_period
 from yid_ocp.data.recording import JointGroup, Recording
@@ -24,8 +24,6 @@ from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import values_by_joint
 from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
-
-Array = NDArray[np.float64]
 
 _ANGLE_LIMIT_MARGIN = 0.1
 """How far angles may be beyond a joint's limits, where a robot's own model differs from its URDF [rad or m]."""
@@ -399,7 +397,7 @@ def _limits(arm: RecordedJointsModel, effort: Array, largest: Array) -> Iterator
         yield _issue("effort_limits", words, float(ratio[j]) / _MAX_EFFORT_RATIO, advice, arm.joint_names[j])
 
 
-def _zero(arm: RecordedJointsModel, dead: NDArray[np.bool_]) -> Issue:
+def _zero(arm: RecordedJointsModel, dead: BoolArray) -> Issue:
     names = [name for name, off in zip(arm.joint_names, dead, strict=True) if off]
     which = "all joints" if dead.all() else ", ".join(names)
     words = f"the effort of {which} is zero throughout, while gravity and motion need more"
@@ -444,9 +442,7 @@ def _by_joint(data: _Data) -> Iterator[Issue]:
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
 
 
-def _signs(
-    arm: RecordedJointsModel, fit: _Fit, turned: NDArray[np.bool_], upright: NDArray[np.bool_]
-) -> Iterator[Issue]:
+def _signs(arm: RecordedJointsModel, fit: _Fit, turned: BoolArray, upright: BoolArray) -> Iterator[Issue]:
     depth = -fit.inverse / fit.std / (_MIN_Z / 2)
     cases = [
         (f"the effort of {arm.joint_names[j]} has", float(depth[j]), arm.joint_names[j]) for j in np.flatnonzero(turned)
@@ -458,7 +454,7 @@ def _signs(
         yield _issue("effort_sign", words, by, "turn the sign; effort is what the motor does to the joint", joint)
 
 
-def _offsets(data: _Data, fit: _Fit, told: NDArray[np.bool_]) -> Iterator[Issue]:
+def _offsets(data: _Data, fit: _Fit, told: BoolArray) -> Iterator[Issue]:
     needed, size = data.needed, data.size
     low, high = 1 / _WRONG_GAIN_FACTOR, _WRONG_GAIN_FACTOR
     # a large zero error looks like a large gain; but then the variation follows as it should
@@ -542,7 +538,7 @@ def _by_itself(data: _Data) -> tuple[Array, Array]:
     return columns, np.concatenate([spread for _, spread in parts])
 
 
-def _loaded(data: _Data) -> NDArray[np.bool_]:
+def _loaded(data: _Data) -> BoolArray:
     """Joints on which what is held can act like a wrong zero."""
     if not data.holders:
         return np.zeros(len(data.size), bool)

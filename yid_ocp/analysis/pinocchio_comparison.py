@@ -15,9 +15,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.step_diagnostics import with_numeric_parameters
+from yid_ocp.arrays import Array
 from yid_ocp.model.kinematics import (
     forward_kinematics,
     lagrangian_second_derivatives,
@@ -26,8 +26,6 @@ from yid_ocp.model.kinematics import (
 )
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
-
-Array = NDArray[np.float64]
 
 _RELATIVE_TOLERANCE = 1e-8  # of the largest entry; placements are rounded to 1e-11 of an exact quarter turn
 _N_RANDOM_CONFIGURATIONS = 3  # at which both are compared, besides the one that is given

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 import scipy.interpolate
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.clock_checks import (
     PositionFunction,
@@ -19,6 +18,7 @@ from yid_ocp.analysis.clock_checks import (
     timestamp_correction,
 )
 from yid_ocp.analysis.joint_checks import RecordedJointsModel, effect_setting_line
+from yid_ocp.arrays import Array
 from yid_ocp.data.issues import Issue, median_sample_period
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model.objects.base import CableTopology
@@ -26,7 +26,6 @@ from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.sensors import SensorOptions
 
-Array = NDArray[np.float64]
 _SensorChoices = Callable[[str], SensorOptions]
 
 _HELD_POINT_TOLERANCE = 0.01

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step, residual_without_weak_priors
 from yid_ocp.inference.uncertainty import (
     ConfidenceInterval,
@@ -29,7 +29,6 @@ from yid_ocp.solvers import Solution
 from yid_ocp.solvers.gauss_newton import GaussNewton
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
 _Found = TypeVar("_Found")
 
 # quantiles 0.95 and 0.999 of chi2 with one degree of freedom

@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from yid_ocp.analysis.step_symbols import StepSymbols
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.sensors import Sensor, sensor_function
 
-_BoolMatrix = NDArray[np.bool_]
 _ZERO_RTOL = 1e-14  # of the largest entry: rounding
 
 
@@ -44,15 +43,15 @@ class SparsityPattern:
 
     name: str
     title: str
-    nonzero_mask: _BoolMatrix
+    nonzero_mask: BoolArray
     row_blocks: tuple[NamedRange, ...]
     column_blocks: tuple[NamedRange, ...]
     row_labels: tuple[str, ...]
     column_labels: tuple[str, ...]
-    marked_mask: _BoolMatrix | None = None
+    marked_mask: BoolArray | None = None
     mark_label: str = ""
 
-    def with_marked_nonzeros(self, values: NDArray[np.float64], where: str) -> SparsityPattern:
+    def with_marked_nonzeros(self, values: Array, where: str) -> SparsityPattern:
         """The pattern with the numerically nonzero entries of one matrix highlighted."""
         marked = np.abs(values) > _ZERO_RTOL * np.max(np.abs(values), initial=0.0)
         return replace(self, marked_mask=marked, mark_label=f"not zero at {where}")
@@ -68,7 +67,7 @@ _Block = tuple[str, tuple[str, ...]]
 
 
 def _pattern(
-    name: str, title: str, mask: _BoolMatrix, rows: Sequence[_Block], columns: Sequence[_Block]
+    name: str, title: str, mask: BoolArray, rows: Sequence[_Block], columns: Sequence[_Block]
 ) -> SparsityPattern:
     def named(blocks: Sequence[_Block]) -> tuple[tuple[NamedRange, ...], tuple[str, ...]]:
         ends = np.cumsum([0, *(len(own) for _, own in blocks)]).tolist()
@@ -102,10 +101,10 @@ def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
     free = list(system.free_indices)
     joints = system.mechanism.joint_names
 
-    def block(row: str, column: str) -> _BoolMatrix:
+    def block(row: str, column: str) -> BoolArray:
         return whole[symbols.block_slice(row), symbols.block_slice(column)]
 
-    def by(*columns: str) -> _BoolMatrix:
+    def by(*columns: str) -> BoolArray:
         """Residual's rows by columns."""
         parts = [np.hstack([block(row, column) for column in columns]) for row in ("del", "internal", "constraint")]
         return np.vstack([parts[0][free], *parts[1:]])
@@ -116,7 +115,7 @@ def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
     by_unknown = by_new[:, known]
     inverse = _inverse_sparsity(by_unknown)
 
-    def response(*columns: str) -> _BoolMatrix:
+    def response(*columns: str) -> BoolArray:
         """The state after the step by columns."""
         y = _times(inverse, by(*columns))
         full = np.zeros((by_new.shape[1], y.shape[1]), bool)
@@ -144,7 +143,7 @@ def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
     return {pattern.name: pattern for pattern in found}
 
 
-def _inverse_sparsity(mask: _BoolMatrix) -> _BoolMatrix:
+def _inverse_sparsity(mask: BoolArray) -> BoolArray:
     """Structural nonzeros of a matrix's inverse from those of the matrix.
 
     With rows put in the order of a perfect matching the diagonal is full, and entry (i, j) of the inverse can differ
@@ -162,12 +161,12 @@ def _inverse_sparsity(mask: _BoolMatrix) -> _BoolMatrix:
     return result
 
 
-def _times(a: _BoolMatrix, b: _BoolMatrix) -> _BoolMatrix:
-    product: _BoolMatrix = (a.astype(np.float32) @ b.astype(np.float32)) > 0
+def _times(a: BoolArray, b: BoolArray) -> BoolArray:
+    product: BoolArray = (a.astype(np.float32) @ b.astype(np.float32)) > 0
     return product
 
 
-def _mask(pattern: ca.Sparsity) -> _BoolMatrix:
+def _mask(pattern: ca.Sparsity) -> BoolArray:
     mask = np.zeros(pattern.shape, bool)
     row, column = pattern.get_triplet()
     mask[row, column] = True
@@ -181,9 +180,9 @@ def _mask(pattern: ca.Sparsity) -> _BoolMatrix:
 class _NlpStage:
     """Sparsity of one stage of the NLP, the same for all; the start depends on all free parameters."""
 
-    constraint_mask: _BoolMatrix  # one step's constraints by (theta_free, x_k, x_{k+1}, lam_k)
-    hessian_mask: _BoolMatrix  # of these constraints times their multipliers
-    gauss_newton_mask: _BoolMatrix  # of the priors and of one reading of every sensor, by (theta_free, x_k)
+    constraint_mask: BoolArray  # one step's constraints by (theta_free, x_k, x_{k+1}, lam_k)
+    hessian_mask: BoolArray  # of these constraints times their multipliers
+    gauss_newton_mask: BoolArray  # of the priors and of one reading of every sensor, by (theta_free, x_k)
     constraint_blocks: Sequence[_Block]
     state_blocks: Sequence[_Block]
     multiplier_labels: tuple[str, ...]
@@ -263,7 +262,7 @@ def kkt_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
     }
 
 
-def _nlp_sparsity_masks(stage: _NlpStage, steps: int) -> tuple[_BoolMatrix, _BoolMatrix, _BoolMatrix]:
+def _nlp_sparsity_masks(stage: _NlpStage, steps: int) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Sparsity masks of one recording's constraint Jacobian, constraint Hessian and measurement Hessian."""
     (f, nx, m, height), fixed = stage.sizes, stage.fixed_start_rows
     width = f + (steps + 1) * nx + steps * m

@@ -8,16 +8,14 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.step_symbols import StepSymbols
+from yid_ocp.arrays import Array
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepLinearization
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.sensors import sensor_function
-
-Array = NDArray[np.float64]
 
 # balances Newton's tolerance against the third derivative, for angles and stiffnesses of order one
 _DIFFERENCE_STEP = 1e-5

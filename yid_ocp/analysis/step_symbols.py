@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
-import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.integrator.discrete import DiscreteEquations
@@ -216,7 +215,7 @@ class EquationEntry:
         """Whether it is zero for every state."""
         return bool(self.expression.is_zero())
 
-    def numeric_value(self, variables: ca.SX, at: NDArray[np.float64]) -> float:
+    def numeric_value(self, variables: ca.SX, at: Array) -> float:
         """Numeric value of the entry at values (k,) of the variables."""
         return float(ca.Function("value", [variables], [ca.densify(self.expression)])(at))
 

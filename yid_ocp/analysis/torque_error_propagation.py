@@ -16,8 +16,8 @@ from collections.abc import Mapping
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory
 from yid_ocp.integrator.rollout import linearized_steps
@@ -27,8 +27,6 @@ from yid_ocp.problem.episodes import InputErrors
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.sensors import Sensor
 from yid_ocp.sensors.joints import PositionSensor
-
-Array = NDArray[np.float64]
 
 _NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a reading's noise
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
@@ -22,6 +22,7 @@ from yid_ocp.analysis.experiment_design import (
     uniform_sample_times,
 )
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, identifiability, unknowns_from_solution
+from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, parameter_verdict
@@ -30,8 +31,6 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers.base import Solution
-
-Array = NDArray[np.float64]
 
 _FASTER_CAMERA_RATES = (10.0, 30.0)  # rates of the camera to try [Hz]
 _MIN_INFORMATION_EIGENVALUE = 1e-16  # of information on relative changes: standard deviations up to 1e8

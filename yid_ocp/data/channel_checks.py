@@ -7,12 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import scipy.special
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.issues import (
     MIN_NOISE_DIFFERENCES,
     QUALITY_LIMITS,
-    Array,
     Issue,
     SensorChoiceLookup,
     median_sample_period,
@@ -84,7 +83,7 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
 
-def _longest_run(same: NDArray[np.bool_]) -> tuple[int, int]:
+def _longest_run(same: BoolArray) -> tuple[int, int]:
     """First and last index of the longest stretch of samples that are all the same."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     if not len(edges):

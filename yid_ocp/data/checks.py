@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 import scipy.signal
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import (
     excess_noise_issues,
     overstated_noise_issues,
@@ -26,7 +27,6 @@ from yid_ocp.data.issues import (
     MIN_EPOCH_SECONDS,
     QUALITY_LIMITS,
     SECONDS_PER_CLOCK_UNIT,
-    Array,
     Issue,
     SampleGroup,
     SensorChoiceLookup,

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.sensors import SensorOptions
 
-Array = NDArray[np.float64]
 SampleGroup = JointGroup | PointGroup
 Severity = Literal["warning", "not_trusted", "refused"]
 

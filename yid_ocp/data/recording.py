@@ -9,13 +9,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.sensors.base import EffortKind, declared_channels
 
-Array = NDArray[np.float64]
 ClockKind = Literal["recorded", "nominal"]
 
 JOINT_CHANNEL_UNITS: Mapping[str, str] = {
@@ -108,7 +108,7 @@ class JointGroup(ReprMixin):
             f"{count_with_noun(len(self.names), 'joint')}, {_sampled(self.t)}: {', '.join(self.channels)}", rows
         )
 
-    def _rows(self, rows: NDArray[np.bool_]) -> JointGroup:
+    def _rows(self, rows: BoolArray) -> JointGroup:
         changes: dict[str, Any] = {name: value[rows] for name, value in self.channels.items()}
         return replace(self, t=self.t[rows], **changes)
 
@@ -161,7 +161,7 @@ class PointGroup(ReprMixin):
             f"{self.name}, {count_with_noun(len(self.names), 'point')}, {_sampled(self.t)}, in {self.frame}", rows
         )
 
-    def _rows(self, rows: NDArray[np.bool_]) -> PointGroup:
+    def _rows(self, rows: BoolArray) -> PointGroup:
         std = None if self.std is None else self.std[rows]
         return replace(self, t=self.t[rows], position=self.position[rows], std=std)
 
@@ -205,7 +205,7 @@ class ChannelGroup(ReprMixin):
     def _summary(self) -> ReprSummary:
         return ReprSummary(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {', '.join(self.values)}")
 
-    def _rows(self, rows: NDArray[np.bool_]) -> ChannelGroup:
+    def _rows(self, rows: BoolArray) -> ChannelGroup:
         return replace(self, t=self.t[rows], values={key: value[rows] for key, value in self.values.items()})
 
 

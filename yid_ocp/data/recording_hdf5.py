@@ -11,12 +11,12 @@ from typing import Any
 import h5py
 import numpy as np
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.hdf5_io import create_hdf5_atomically, open_checked_hdf5
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
     JOINT_STD_FIELDS,
     POINT_GROUP_NAME_PATTERN,
-    Array,
     ChannelGroup,
     JointGroup,
     PointGroup,

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import threadpoolctl
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.estimate_history import RunEstimates
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_messages import (
@@ -78,7 +78,6 @@ from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.solvers.base import RESTART_FACTORS
 
 log = logging.getLogger(__name__)
-Array = NDArray[np.float64]
 
 _MAX_EVENT_ROUNDS = 3  # maximum number of refits of the nominal model, each without the events found before it
 

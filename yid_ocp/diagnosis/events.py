@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 import threadpoolctl
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import quantization_step
 from yid_ocp.diagnosis.hypotheses import hide_samples
 from yid_ocp.diagnosis.localise import force_unit, surely_not_zero
@@ -42,7 +42,6 @@ from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import effort_filter
 from yid_ocp.sensors.base import CHANNELS, values_by_joint
 
-Array = NDArray[np.float64]
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 """A recording, its prediction and the parameters theta of that."""
 
@@ -230,7 +229,7 @@ def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate |
 
 
 def _allowed(
-    torques: InverseDynamicsModel, run: _RecordingRollout, nodes: NDArray[np.int64], limits: Thresholds
+    torques: InverseDynamicsModel, run: _RecordingRollout, nodes: IntArray, limits: Thresholds
 ) -> tuple[Array, Array]:
     """What the model of every coordinate's torque may be wrong by, and what friction may hold, shape (M, n)."""
     episode, result, theta = run

@@ -8,8 +8,8 @@ from typing import Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import EFFECTS, EffectBase, candidate_effects, make_effect
 from yid_ocp.errors import ConfigError, DataError
@@ -26,7 +26,6 @@ from yid_ocp.problem.episodes import Episode, truncate_episode
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.recorded_inputs import recorded_sensors
 
-Array = NDArray[np.float64]
 CandidateChoice = Literal["all"] | Sequence[str]
 
 _BLOCK_DURATION = 1.0  # length of the blocks in which a single recording is split [s]
@@ -283,6 +282,6 @@ def _masked(episode: Episode, parity: int) -> Episode:
     return replace(episode, measurements=tuple(samples))
 
 
-def hide_samples(samples: Measurements, hidden: NDArray[np.bool_]) -> Measurements:
+def hide_samples(samples: Measurements, hidden: BoolArray) -> Measurements:
     """Return measurements of which some samples, shape (M, k), do not count."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

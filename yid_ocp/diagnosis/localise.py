@@ -6,14 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
 from yid_ocp.inference.smoother_model import UnknownGroup
 from yid_ocp.model.system import System
-
-Array = NDArray[np.float64]
 
 _MIN_NAMED_SHARE = 0.1  # share of the gap from which a place is named
 _MAX_NAMED_LOCATIONS = 3  # places that are named at most
@@ -63,7 +61,7 @@ def localise_gap(
     return _by_share(found)
 
 
-def surely_not_zero(trace: SmoothedUnknowns, columns: Sequence[int], limit: float) -> NDArray[np.bool_]:
+def surely_not_zero(trace: SmoothedUnknowns, columns: Sequence[int], limit: float) -> BoolArray:
     """Whether some unknowns are further from zero than `limit` standard deviations, shape (J, columns)."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > limit * std)

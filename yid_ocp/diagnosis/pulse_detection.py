@@ -23,8 +23,8 @@ import casadi as ca
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.integrator.rollout import applied_joint_torque
 from yid_ocp.integrator.step import Step
@@ -32,8 +32,6 @@ from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
 from yid_ocp.model.system import MidpointState, System
 from yid_ocp.problem.signal_filters import effort_filter
-
-Array = NDArray[np.float64]
 
 _STANDSTILL_SPEED = 0.1  # speed below which static friction may act [rad/s or m/s]
 
@@ -59,7 +57,7 @@ class InverseDynamicsModel:
     def _function(self) -> ca.Function:
         return _function(self._step.system, self._step.time_step)
 
-    def evaluate_term_sizes(self, theta: Array, rollout: Rollout, nodes: NDArray[np.int64]) -> _TorqueTermSizes:
+    def evaluate_term_sizes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
         """Return the term magnitudes along a rollout, accelerations from finite differences.
 
         Parameters
@@ -156,7 +154,7 @@ class ForceEstimate:
         """From point to point [s]."""
         return float(np.median(np.diff(self.t)))
 
-    def subset_at(self, keep: NDArray[np.int64]) -> ForceEstimate:
+    def subset_at(self, keep: IntArray) -> ForceEstimate:
         """Return the estimate restricted to some time points."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}
@@ -202,7 +200,7 @@ class _Windows:
 
     begin: Array
     end: Array
-    flat: NDArray[np.bool_]
+    flat: BoolArray
 
     def at(self, t: Array) -> Array:
         """At times (M, 1) shape (M, k); at one time for each, (k,), shape (k,)."""

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_values
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase, ReportedParameter
@@ -29,8 +29,6 @@ from yid_ocp.problem.prediction_errors import rmse_by_channel
 from yid_ocp.progress import ParallelProgress, Progress
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
-
-Array = NDArray[np.float64]
 
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
 """A refit starts near its end and must be good to a small part of its std and of `chi2_equivalence` only."""

@@ -21,16 +21,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.signal
 import scipy.stats
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.inference.null_test import ResidualChannel, residual_channels
-
-Array = NDArray[np.float64]
 
 _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
 
@@ -292,7 +290,7 @@ class JointScores:
     score_vector: Array  # -X'r, shape (n,)
 
     @property
-    def _columns(self) -> list[NDArray[np.int64]]:
+    def _columns(self) -> list[IntArray]:
         """Columns of every candidate."""
         return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
 

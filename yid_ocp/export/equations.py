@@ -9,7 +9,6 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.step_diagnostics import with_numeric_parameters
 from yid_ocp.analysis.step_symbols import (
@@ -20,13 +19,12 @@ from yid_ocp.analysis.step_symbols import (
     escape_latex,
     format_expressions,
 )
+from yid_ocp.arrays import Array
 from yid_ocp.files import atomic_write, make_folder, write_json, write_text
 from yid_ocp.integrator.codegen import casadi_c_source, parameter_jacobian_function
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
 from yid_ocp.model.mechanism import merge_bodies
 from yid_ocp.model.system import System
-
-Array = NDArray[np.float64]
 
 _MAX_JACOBIAN_OPERATIONS = 60_000  # operations; longer C keeps a compiler busy for minutes
 _ARGUMENT_NAMES = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")

@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.errors import OutputError
 from yid_ocp.files import atomic_write, make_folder, os_error_reason
 
-Array = NDArray[np.float64]
 _SignalKind = Literal["joints", "point", "vector", "wrench"]
 _MESSAGE_TYPES: Mapping[_SignalKind, str] = {
     "joints": "sensor_msgs/msg/JointState",

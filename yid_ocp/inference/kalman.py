@@ -17,9 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg.lapack
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from yid_ocp.arrays import Array
 
 
 @dataclass(frozen=True)

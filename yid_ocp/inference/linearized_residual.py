@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.problem.episode_prediction import EpisodePredictor
@@ -19,8 +19,6 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.model_functions import ModelFunctions, NodeValues
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class ResidualSlopes:
     included, and by the efforts of prescribed joints there (r, nc).
     """
 
-    node: NDArray[np.int64]
+    node: IntArray
     before: Array
     after: Array
     by_effort_before: Array
@@ -79,7 +77,7 @@ class ResidualSlopes:
         """From the sensors' own derivatives along the trajectory."""
         step, theta = course.model_functions.step, course.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_indices)
-        found: list[NDArray[np.int64]] = []
+        found: list[IntArray] = []
         parts: list[tuple[Array, ...]] = []
         for samples in course.measurements:
             used = samples.evaluation_nodes
@@ -107,15 +105,15 @@ class ResidualSlopes:
         return ResidualSlopes(np.concatenate(found), *arrays)
 
     @property
-    def visible_states(self) -> NDArray[np.bool_]:
+    def visible_states(self) -> BoolArray:
         """States that a residual depends on, shape (nx,)."""
         return np.any(self.before != 0, axis=0) | np.any(self.after != 0, axis=0)
 
-    def by_some_states(self, kept: NDArray[np.int64]) -> ResidualSlopes:
+    def by_some_states(self, kept: IntArray) -> ResidualSlopes:
         """The slopes by some of the states alone."""
         return replace(self, before=self.before[:, kept], after=self.after[:, kept])
 
-    def some_rows(self, rows: NDArray[np.int64]) -> ResidualSlopes:
+    def some_rows(self, rows: IntArray) -> ResidualSlopes:
         """Some of the rows alone."""
         slopes = (self.before, self.after, self.by_effort_before, self.by_effort_after)
         return ResidualSlopes(self.node[rows], *(array[rows] for array in slopes))
@@ -135,7 +133,7 @@ class ResidualSlopes:
                 found[used] += np.einsum("rx,rxd->rd", by_effort[used], effort[local])
         return found
 
-    def rows_by_node(self, last: int) -> list[NDArray[np.int64]]:
+    def rows_by_node(self, last: int) -> list[IntArray]:
         """Rows of each node from 0 to `last`."""
         order = np.argsort(self.node, kind="stable")
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))

@@ -13,14 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.stats
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
-
-Array = NDArray[np.float64]
 
 RESIDUAL_WINDOW_LENGTH = 0.5
 """Length of the time windows in which a residual is tested [s]."""
@@ -54,7 +52,7 @@ class ResidualChannel:
     group: str
     unit: str
     t: Array
-    residual_indices: NDArray[np.int64]
+    residual_indices: IntArray
     noise_autocorrelation: Array
 
 

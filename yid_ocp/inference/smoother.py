@@ -22,8 +22,8 @@ import numpy as np
 import scipy.linalg
 import scipy.optimize
 import threadpoolctl
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
 from yid_ocp.inference.smoother_model import (
     DEFAULT_SMOOTHER_THRESHOLDS,
@@ -35,8 +35,6 @@ from yid_ocp.inference.smoother_model import (
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-
-Array = NDArray[np.float64]
 
 _MAX_ITERATIONS = 12
 """Fixed-point iterations on the standard deviations."""
@@ -320,7 +318,7 @@ def _largest_evidences(
     return map_in_threads(lambda source: _largest_evidence(bases, source), sources)
 
 
-def _responses(base: _Filtered, chosen: NDArray[np.int64]) -> Array:
+def _responses(base: _Filtered, chosen: IntArray) -> Array:
     """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, u J).
 
     The filter follows a disturbance as far as its own unknowns let it; those without variance stay at zero.

@@ -23,8 +23,8 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse
 from annotated_types import Ge, Gt, Le
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects.base import robot_joints
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualSlopes, nominal_trajectory
 from yid_ocp.integrator.rollout import AdditionalLoads, active_state_mask, applied_joint_torque, linearized_steps
@@ -36,7 +36,6 @@ from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.sensors import Sensor
 
-Array = NDArray[np.float64]
 _UnknownKind = Literal["force", "push", "offset", "bias"]
 
 _CORRELATION_TIME = 0.5
@@ -103,8 +102,8 @@ class _SmootherUnknowns:
     names: tuple[str, ...]
     sources: tuple[UnknownGroup, ...]
     reference: Array
-    forced: NDArray[np.int64]
-    grasped: NDArray[np.int64]
+    forced: IntArray
+    grasped: IntArray
     pushed: tuple[str, ...]
     biased: tuple[tuple[int, int], ...]
 
@@ -153,7 +152,7 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
 
 def _unknown_forces(
     course: _LinearizedEpisode, part: float
-) -> tuple[list[str], list[UnknownGroup], list[float], NDArray[np.int64]]:
+) -> tuple[list[str], list[UnknownGroup], list[float], IntArray]:
     """Names, sources, reference sizes and coordinates of the unknown forces."""
     system, joint_names = course.system, course.system.mechanism.joint_names
     place = {joint: s.name for s in system.segment_layouts for link in s.link_joints for joint in link}
@@ -340,7 +339,7 @@ def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Additi
 
 
 def _steps(
-    course: _LinearizedEpisode, loads: AdditionalLoads, pushes: Array, moving: NDArray[np.int64], first: int, last: int
+    course: _LinearizedEpisode, loads: AdditionalLoads, pushes: Array, moving: IntArray, first: int, last: int
 ) -> tuple[Array, Array, Array]:
     """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps.
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.inference.linearized_residual import residual_without_weak_priors
 from yid_ocp.inference.null_test import (
     DEFAULT_GAP_CRITERIA,
@@ -21,7 +21,6 @@ from yid_ocp.inference.null_test import (
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 
-Array = NDArray[np.float64]
 ConfidenceInterval = tuple[float | None, float | None]
 
 MAX_IDENTIFIABLE_RELATIVE_STD = 0.1
@@ -173,20 +172,20 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
     return covariance * np.outer(factor, factor)
 
 
-def _clusters(problem: EstimationProblem) -> list[list[NDArray[np.int64]]]:
+def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     """Rows of the data cut into blocks of time, and where there are enough into recordings and channels of these."""
     total = sum(episode.grid.steps for episode in problem.episodes) * problem.step.time_step
     length = float(np.clip(total / _N_TIME_BLOCKS, _MIN_BLOCK_LENGTH, _MAX_BLOCK_LENGTH))
-    blocks: dict[tuple[str, int], list[NDArray[np.int64]]] = {}
-    recordings: dict[str, list[NDArray[np.int64]]] = {}
-    channels: list[list[NDArray[np.int64]]] = []
+    blocks: dict[tuple[str, int], list[IntArray]] = {}
+    recordings: dict[str, list[IntArray]] = {}
+    channels: list[list[IntArray]] = []
     for series in residual_channels(problem):
         channels.append([series.residual_indices])
         recordings.setdefault(series.recording, []).append(series.residual_indices)
         at = (series.t / length).astype(int)
         for block in np.unique(at):
             blocks.setdefault((series.recording, int(block)), []).append(series.residual_indices[at == block])
-    found: list[list[NDArray[np.int64]]] = []
+    found: list[list[IntArray]] = []
     if len(blocks) > 1:
         found.append([np.concatenate(parts) for parts in blocks.values()])
     if len(recordings) > 1 and len(channels) >= _MIN_CLUSTER_CHANNELS:

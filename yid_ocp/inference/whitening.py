@@ -35,8 +35,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualSlopes, nominal_trajectory
 from yid_ocp.integrator.rollout import LinearizedStep, active_state_mask, linearized_steps
@@ -48,9 +49,6 @@ from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrors
 from yid_ocp.problem.evaluation import ResidualWhitener
 from yid_ocp.problem.measurements import subtract_estimated_biases
-
-Array = NDArray[np.float64]
-_RowIndices = NDArray[np.int64]
 
 _MIN_TORQUE_GAIN = 0.1
 """Smallest ratio of acting to recorded torque at which errors of one are converted into errors of the other."""
@@ -64,7 +62,7 @@ _TORQUE_BIAS_TOLERANCE = 0.05
 class _FilterStep:
     """One step of a frozen filter of (d, w, b): rows of the residual, and their slopes by a known torque (r, nu)."""
 
-    rows: _RowIndices
+    rows: IntArray
     kalman: KalmanStep
     by_torque: Array
 
@@ -113,7 +111,7 @@ class WhiteningFilter:
     filter_steps: tuple[_FilterStep, ...]
     input_errors: InputErrors
     initial_covariance: Array
-    state_mask: NDArray[np.bool_]
+    state_mask: BoolArray
     torque_bias_std: Array
 
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
@@ -221,7 +219,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> W
 
 def _error_step(
     here: LinearizedStep,
-    kept: _RowIndices,
+    kept: IntArray,
     feedback: TrackingFeedback | None,
     momentum: Array,
     errors: InputErrors,

@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.arrays import BoolArray, IntArray
 from yid_ocp.integrator.discrete import DiscreteEquations
 
 _Indices = NDArray[np.int32]
@@ -190,7 +191,7 @@ def step_index_tables(functions: StepFunctions) -> StepIndexTables:
     n, nz, m = system.n_coordinates, e.z0.numel(), e.lam.numel()
     nt, nqz = n + nz + m, n + nz
 
-    def at(key: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def at(key: str) -> tuple[IntArray, IntArray]:
         return nonzero_indices(functions.sparsity_patterns[key])
 
     related = np.zeros((n, n), bool)
@@ -230,7 +231,7 @@ def step_index_tables(functions: StepFunctions) -> StepIndexTables:
         pattern[np.ix_(later, later)] = True
         fill.append(later.astype(np.int32))
 
-    def columns(matrix: NDArray[np.bool_]) -> tuple[_Indices, ...]:
+    def columns(matrix: BoolArray) -> tuple[_Indices, ...]:
         return tuple(np.flatnonzero(line).astype(np.int32) for line in matrix)
 
     varying = (columns(matrix) for matrix in (rows_old, p1_old, p1_new))
@@ -314,7 +315,7 @@ def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
     return generator.dump()
 
 
-def nonzero_indices(sparsity: ca.Sparsity) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def nonzero_indices(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
     """Row and column indices of the structural nonzeros of a sparsity pattern."""
     row, column = sparsity.get_triplet()
     return np.array(row, np.int64), np.array(column, np.int64)

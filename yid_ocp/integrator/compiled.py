@@ -10,8 +10,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import ModelError
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator import codegen, compiler
@@ -31,8 +32,6 @@ from yid_ocp.integrator.step_model import (
     rollout_with_status,
 )
 from yid_ocp.parallel import LockedCache, batched_call, map_in_threads
-
-Array = NDArray[np.float64]
 
 _BATCH_COST, _BATCH_COST_PER_COLUMN = 1.7, 0.11
 """Cost of a batch in rollouts of one member, whatever its size, and the extra cost per sensitivity column."""
@@ -101,7 +100,7 @@ class _ThetaColumns:
     """Compiled derivatives by some parameters; patterns are CasADi's compressed columns."""
 
     address: int
-    patterns: tuple[NDArray[np.int64], ...]
+    patterns: tuple[IntArray, ...]
     work: int
     library: ctypes.CDLL
 

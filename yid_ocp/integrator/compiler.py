@@ -20,8 +20,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import platformdirs
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator.codegen import casadi_c_source, nonzero_indices
@@ -234,7 +234,7 @@ int yid_map(int count, const double **in, double **out) {{
 }}
 """
 
-    def __call__(self, *inputs: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    def __call__(self, *inputs: Array) -> list[Array]:
         """Values at all points, (count, rows, columns), dense, for inputs (count, size) or, where shared, (size,)."""
         count = next((len(x) for i, x in enumerate(inputs) if i not in self.shared_inputs), 1)
         arrays = [np.ascontiguousarray(x, dtype=float) for x in inputs]

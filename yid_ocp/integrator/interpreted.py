@@ -14,6 +14,7 @@ import numpy as np
 import scipy.linalg.lapack
 from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.discrete import equilibrium_equations
 from yid_ocp.integrator.step_model import (
     EQUILIBRIUM_ITERATION_LIMIT,
@@ -32,7 +33,6 @@ from yid_ocp.integrator.step_model import (
 )
 from yid_ocp.parallel import LockedCache
 
-Array = NDArray[np.float64]
 _PointEvaluator = Callable[[Array], Array]
 
 
@@ -85,7 +85,7 @@ class InterpretedKernel:
         parts = (before[:n], after[:n], before[n : 2 * n], before[2 * n :], after[2 * n :], lam, u, theta)
         return np.concatenate([*parts, [self._model.time_step]])
 
-    def _columns(self, names: Sequence[str]) -> NDArray[np.int64]:
+    def _columns(self, names: Sequence[str]) -> IntArray:
         """Where parameters stand in a point."""
         return self._at["theta"][[self._model.system.parameters.index(name) for name in names]]
 

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import Step, float_array_of_shape
 from yid_ocp.integrator.step_model import CostGradient, Rollout, RolloutInputs, SensitivityDirections, TrackingFeedback
 from yid_ocp.parallel import CASADI_LOCK
-
-Array = NDArray[np.float64]
 
 _STEPS_PER_CHUNK = 50  # linearised at once, few because their matrices are dense
 _MIN_SLOPE = 1e-12  # derivatives by an internal state up to here are rounding
@@ -96,7 +95,7 @@ def rollout_inputs(
     return RolloutInputs(values, begin, inputs, course, feedback, directions)
 
 
-def applied_joint_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> NDArray[np.float64]:
+def applied_joint_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
     """Torque at driven joints in every step, shape (N, nu) [N m]: the input, or the torque of position servos."""
     system, h = step.system, step.time_step
     if not system.servos:
@@ -181,9 +180,7 @@ class AdditionalLoads:
     next_momentum: Array
 
 
-def active_state_mask(
-    step: Step, steps: Sequence[LinearizedStep], seen: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_]:
+def active_state_mask(step: Step, steps: Sequence[LinearizedStep], seen: BoolArray | None = None) -> BoolArray:
     """Mask of the states that move and that affect others, efforts or sensors, shape (nx,).
 
     Internal states of a neutral effect are excluded. `steps` are a representative sample, `seen` (nx,) says which

@@ -9,16 +9,15 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import scipy.linalg.lapack
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array
 from yid_ocp.integrator.codegen import nonzero_indices
 from yid_ocp.integrator.discrete import EquilibriumEquations, equilibrium_equations
 from yid_ocp.integrator.interpreted import damped_newton
 from yid_ocp.integrator.step import Step, float_array_of_shape
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK, LockedCache
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator import codegen, compiler
@@ -25,8 +26,6 @@ from yid_ocp.integrator.step_model import (
     newton_tolerance,
 )
 from yid_ocp.model.system import System
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError, ResourceError
 from yid_ocp.integrator import codegen
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, DiscreteEquations, ForceSplit, discrete_equations
 from yid_ocp.model.system import System
-
-Array = NDArray[np.float64]
 
 NEWTON_ITERATION_LIMIT = 60
 """Newton iterations of one step before it is given up."""

@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 import scipy.linalg
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.integrator.step_model import NEWTON_ITERATION_LIMIT, TrackingFeedback
 from yid_ocp.parallel import LockedCache
 
-Array = NDArray[np.float64]
 _Wanted = Sequence[tuple[int, int]]  # a column of derivatives, and which of the parameters it is by
 _NEWTON_ITERATIONS = 5  # for a law of an internal coordinate that is nonlinear in its next value
 _ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors that weigh the same in the LQR [rad], [rad/s], [N m]

@@ -9,8 +9,9 @@ from typing import Literal, NoReturn
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, LinkChain, Mechanism, Placement
@@ -242,7 +243,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
     parts.layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, radius, mass, segment.parent)
 
 
-def polyline_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[NDArray[np.float64]]:
+def polyline_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
     """Rotation from each edge's frame to the next one's by the smallest angle (no twist), one (3, 3) for every edge.
 
     They are what `Segment.rest_rotation` and `Segment.link_rest_rotations` take.
@@ -274,7 +275,7 @@ def polyline_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = No
     return rotations
 
 
-def _shortest_turn(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shortest_turn(direction: Array) -> Array:
     axis = np.cross([0.0, 0.0, 1.0], direction)
     sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
     if sine < 1e-12:

@@ -9,12 +9,10 @@ from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ConfigError, nearest_name_hint
-
-_Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ class Parameters(ReprMixin):
             raise ConfigError(f"there is no parameter '{name}'", hint=nearest_name_hint(name, self._index))
         return self._index[name]
 
-    def vector(self, values: Mapping[str, float] | None = None) -> _Vector:
+    def vector(self, values: Mapping[str, float] | None = None) -> Array:
         """The vector theta of nominal values, some of them replaced, shape (ntheta,).
 
         `ConfigError` for an unknown name or a value that is not finite.
@@ -121,7 +119,7 @@ class Parameters(ReprMixin):
         """These parameters followed by others."""
         return Parameters([*self._entries, *(entry for other in others for entry in other)])
 
-    def bounds(self, names: Sequence[str]) -> tuple[_Vector, _Vector]:
+    def bounds(self, names: Sequence[str]) -> tuple[Array, Array]:
         """Lower and upper bounds of the named parameters, two arrays of shape (len(names),)."""
         chosen = [self[name] for name in names]
         return np.array([e.lower for e in chosen], dtype=float), np.array([e.upper for e in chosen], dtype=float)

@@ -7,15 +7,15 @@ from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Matrix = NDArray[np.float64]
+from yid_ocp.arrays import Array
 
 # URDF writers round pi to a dozen digits; entries this close to 0 and 1 are meant to be exactly that.
 _SNAP_TOLERANCE = 1e-11
 
 
-def snap_to_unit_entries(matrix: Matrix) -> Matrix:
+def snap_to_unit_entries(matrix: Array) -> Array:
     """The matrix with entries within `_SNAP_TOLERANCE` of -1, 0 and 1 replaced by these numbers."""
     result = np.array(matrix, dtype=float)
     for exact in (-1.0, 0.0, 1.0):
@@ -23,14 +23,14 @@ def snap_to_unit_entries(matrix: Matrix) -> Matrix:
     return result
 
 
-def homogeneous_transform(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
+def homogeneous_transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
     """Homogeneous 4x4 matrix from a rotation (3, 3) and a translation (3,) [m]."""
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = np.asarray(rotation, float), np.asarray(translation, float)
     return matrix
 
 
-def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll), the URDF convention [rad]."""
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
     x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
@@ -38,7 +38,7 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Matrix:
     return np.array([x, y, [-sp, cp * sr, cp * cr]])
 
 
-def rpy_from_rotation(rotation: Matrix) -> tuple[float, float, float]:
+def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:
     """Roll, pitch and yaw [rad] of a rotation matrix, the inverse of `rotation_from_rpy`."""
     # the roll is taken in the frame that yaw and pitch leave, which holds at and near pitch = 90 degrees too
     yaw = math.atan2(rotation[1, 0], rotation[0, 0])
@@ -47,7 +47,7 @@ def rpy_from_rotation(rotation: Matrix) -> tuple[float, float, float]:
     return math.atan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1]), pitch, yaw
 
 
-def axis_angle_rotation(axis: ArrayLike, sine: float, cosine: float) -> Matrix:
+def axis_angle_rotation(axis: ArrayLike, sine: float, cosine: float) -> Array:
     """Rotation matrix about a unit axis, from the sine and cosine of the angle (Rodrigues' formula)."""
     skew = _skew(np.asarray(axis, float))
     return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
@@ -74,11 +74,11 @@ def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = No
     return ca.densify(turned if yaw is None else symbolic_axis_rotation((0.0, 0.0, 1.0), yaw) @ turned)
 
 
-def _skew(u: Matrix) -> Matrix:
+def _skew(u: Array) -> Array:
     return np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
 
 
-def transform_from_xyz_rpy(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
+def transform_from_xyz_rpy(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """Homogeneous 4x4 matrix from a translation [m] and roll, pitch, yaw [rad]."""
     angles = np.asarray(rpy, float)
     return homogeneous_transform(rotation_from_rpy(*angles), xyz)

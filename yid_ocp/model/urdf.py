@@ -17,14 +17,13 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.files import is_file
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import (
-    Matrix,
     axis_angle_rotation,
     homogeneous_transform,
     rpy_from_rotation,
@@ -212,7 +211,7 @@ def _numbers(text: str, count: int, what: str, where: str, infinite: bool = Fals
     return numbers
 
 
-def _check_bodies(link: str, tensor: Matrix, where: str) -> None:
+def _check_bodies(link: str, tensor: Array, where: str) -> None:
     """Refuse negative moments of inertia; warn of moments that no mass distribution has."""
     least, middle, most = np.linalg.eigvalsh(0.5 * (tensor + tensor.T))
     values = ", ".join(f"{value:.3g}" for value in (least, middle, most))
@@ -278,16 +277,16 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
 
 def _walk(
     robot: Any, root: str, dropped: Set[str], kept: Collection[str], locked: Mapping[str, float], where: str
-) -> tuple[dict[str, tuple[_Carrier, Matrix, Any]], dict[_Carrier, list[Inertia]], dict[str, tuple[_Carrier, Matrix]]]:
+) -> tuple[dict[str, tuple[_Carrier, Array, Any]], dict[_Carrier, list[Inertia]], dict[str, tuple[_Carrier, Array]]]:
     """Kept joints, bodies by carrier, and links from the root on, each with carrier and placement (4, 4) in its frame.
 
     A carrier is a kept joint, None for the world; what is fixed together is merged.
     """
     links = {link.name: link.inertial for link in robot.links}
-    joints: dict[str, tuple[_Carrier, Matrix, Any]] = {}
+    joints: dict[str, tuple[_Carrier, Array, Any]] = {}
     bodies: dict[_Carrier, list[Inertia]] = {}
-    frames: dict[str, tuple[_Carrier, Matrix]] = {}
-    stack: list[tuple[str, _Carrier, Matrix]] = [(root, None, np.eye(4))]
+    frames: dict[str, tuple[_Carrier, Array]] = {}
+    stack: list[tuple[str, _Carrier, Array]] = [(root, None, np.eye(4))]
     while stack:
         link, carrier, at = stack.pop()
         frames[link] = (carrier, at)
@@ -313,7 +312,7 @@ def _walk(
     return joints, bodies, frames
 
 
-def _origin(element: Any) -> Matrix:
+def _origin(element: Any) -> Array:
     return np.eye(4) if element.origin is None else np.asarray(element.origin, float)
 
 
@@ -340,7 +339,7 @@ def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia
     )
 
 
-def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Matrix:
+def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Array:
     if joint.type == "fixed":
         return np.eye(4)
     value = _locked_value(joint, locked)
@@ -372,7 +371,7 @@ def _with_all_below(excluded: Sequence[str], robot: Any, where: str) -> set[str]
     return found
 
 
-def _unit_axis(joint: Any) -> NDArray[np.float64]:
+def _unit_axis(joint: Any) -> Array:
     axis = np.asarray([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)
     return axis / np.linalg.norm(axis)
 

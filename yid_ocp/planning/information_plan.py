@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.experiment_design import with_observable_frames
 from yid_ocp.analysis.identifiability import identifiability
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_UNINFORMED_RELATIVE_STD
@@ -29,8 +29,6 @@ from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
-
-Array = NDArray[np.float64]
 
 _UNOBSERVABLE_STDS = 1e-2  # stds by which no reading moves when a parameter changes by its whole value: nothing sees it
 _RANDOM_COEFFICIENT_STD = 0.3  # of random motions from which a search begins, before limits shrink them [rad or m]
@@ -372,7 +370,7 @@ def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: 
     """Limits that a motion reaches."""
     mover, found = search.experiment.simulator, {}
 
-    def reached(names: Sequence[str], is_near: NDArray[np.bool_]) -> tuple[str, ...]:
+    def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
 
     for rows, own in limits.limits_with_values(limits.limit_values(mover.simulate_path(w), w).value):

@@ -18,15 +18,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from yid_ocp.arrays import Array
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
 from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, scaled_bounds
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.progress import NULL_PROGRESS, Progress
-
-Array = NDArray[np.float64]
 
 
 def _prior(columns: int, bounded: Sequence[int]) -> Array:

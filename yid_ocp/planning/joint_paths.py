@@ -10,10 +10,10 @@ from typing import Annotated, Literal
 import casadi as ca
 import numpy as np
 from annotated_types import Ge, Gt, Le
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
@@ -23,8 +23,6 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo
 from yid_ocp.parallel import CASADI_LOCK
-
-Array = NDArray[np.float64]
 
 _Vector3 = tuple[float, float, float]
 _PlanGoal = Literal["place", "path", "box", "information"]
@@ -231,7 +229,7 @@ class PathSimulator:
         return np.asarray(self.step.time_step * np.arange(moving + standing + 1))
 
     @cached_property
-    def standstill_nodes(self) -> NDArray[np.int64]:
+    def standstill_nodes(self) -> IntArray:
         """Indices of the nodes at which the joints stand still at the end."""
         return np.flatnonzero(self.node_times >= self.path.duration - 1e-9)
 

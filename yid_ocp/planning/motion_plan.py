@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
@@ -30,8 +30,6 @@ from yid_ocp.planning.joint_paths import (
 from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShooting, PlanShootingResult
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
-
-Array = NDArray[np.float64]
 
 _MAX_STEP_HALVINGS = 3  # of the time step
 _CONVERGED_TOLERANCE_FRACTION = 0.1  # change by halving it, in parts of the tolerances, that counts as none

@@ -11,14 +11,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 
+from yid_ocp.arrays import Array
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.planning.joint_paths import FramePositions, PathSimulator, PlanOptions
-
-Array = NDArray[np.float64]
 
 _LIMIT_NODE_STRIDE = 2  # nodes between those at which limits on what moves freely are asked for
 _QUASI_STATIC_DISTANCE = 1.0  # RMS distance of the joints from the quasi-static motion that counts as one [rad or m]

@@ -14,10 +14,10 @@ from functools import cached_property
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from yid_ocp.analysis.experiment_design import DEFAULT_TORQUE_STD
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError, SolverError
 from yid_ocp.inference.linearized_residual import residual_without_weak_priors
@@ -37,8 +37,6 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.signal_filters import effort_filter
 from yid_ocp.sensors.joints import POSITION_GROUP
-
-Array = NDArray[np.float64]
 
 _PLANNED_RECORDING_NAME = "planned"
 _MIN_POINT_RATE = 20.0  # at least so often a slow sensor's information is spread over the motion [Hz]

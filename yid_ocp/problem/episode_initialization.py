@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, InitialState, truncate_episode
@@ -16,8 +16,6 @@ from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.model_functions import NodeValues
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads
 from yid_ocp.problem.unknown_vector import initial_state_limits
-
-Array = NDArray[np.float64]
 
 _MAX_FIRST_SAMPLE_TIME = 1.0
 """Latest time at which a point's first sample still shows the initial equilibrium [s]."""

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.rollout import adjoint_gradient, rollout_inputs, simulate_batch
 from yid_ocp.integrator.statics import Equilibrium
@@ -31,7 +31,6 @@ from yid_ocp.problem.recorded_inputs import mean_step_inputs, mean_step_inputs_b
 from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeSmoother
 from yid_ocp.problem.unknown_vector import UnknownVectorLayout
 
-Array = NDArray[np.float64]
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
 """Largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]."""
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.rollout import generalized_momentum
@@ -40,8 +40,6 @@ from yid_ocp.sensors.joints import (
     joint_torque_bias_std,
     joint_torque_noise_std,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,7 @@ class InputErrors:
     torque_std: Array
     torque_bias_std: Array
     angle_std: Array
-    sample_of_step: NDArray[np.int64]
+    sample_of_step: IntArray
     encoder_noise_steps: float
     has_encoder_measurements: bool
     torque_bias: Array

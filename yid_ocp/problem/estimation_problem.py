@@ -8,8 +8,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError
@@ -40,8 +41,6 @@ from yid_ocp.problem.unknown_vector import (
     stated_prior_std,
     with_named_entries,
 )
-
-Array = NDArray[np.float64]
 
 
 class EstimationProblem(ReprMixin):
@@ -152,7 +151,7 @@ class EstimationProblem(ReprMixin):
         self._prior_std = stated_prior_std(self.unknowns, options, model_functions.step.system, inertia)
         bare = options.weighting == "paper" or options.weak_prior_factor <= 1
         weak = np.zeros(len(self.unknown_names), bool) if bare else self.is_positive & ~np.isfinite(self._prior_std)
-        self._weak: NDArray[np.int64] = np.flatnonzero(weak)
+        self._weak: IntArray = np.flatnonzero(weak)
         self._stated = stated_prior_jacobian(self.unknowns, options, self._prior_std)
         self.residual_rows = ResidualRows.from_episodes(episodes, len(self._stated), len(self._weak))
 
@@ -233,7 +232,7 @@ class EstimationProblem(ReprMixin):
         return np.where(size > 0, size, fallback)
 
     @property
-    def is_positive(self) -> NDArray[np.bool_]:
+    def is_positive(self) -> BoolArray:
         """Mask of unknowns that must be positive and have a positive initial value, shape (nx,)."""
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrors
 from yid_ocp.problem.measurements import (
@@ -20,7 +20,6 @@ from yid_ocp.problem.measurements import (
     huber_loss,
 )
 
-Array = NDArray[np.float64]
 EquilibriumGuesses = tuple[Array | None, ...]
 """For each recording, a configuration near the equilibrium from which it starts; None where it is not known."""
 

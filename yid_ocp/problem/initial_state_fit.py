@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.rollout import generalized_momentum
 from yid_ocp.integrator.statics import relaxed_internal_coordinates
@@ -20,8 +20,6 @@ from yid_ocp.model.objects.cable import START_SHAPE_SUFFIXES, START_SPEED_PARAME
 from yid_ocp.parallel import LockedCache
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.sensors import Sensor, sensor_function
-
-Array = NDArray[np.float64]
 
 # Width of the elastic prior: a bend of this size at a joint of mean stiffness costs as much as one standard
 # deviation of a measured point [rad]; other joints in proportion to their stiffness.

@@ -10,14 +10,12 @@ from typing import Any, Literal
 
 import numpy as np
 import scipy.sparse
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
 from yid_ocp.sensors import Sensor, SensorData
-
-Array = NDArray[np.float64]
-
 
 _MAX_STEPS = 200_000
 """Steps of a rollout: half an hour in steps of 10 ms; a clock in milliseconds or one that jumps asks for more."""
@@ -39,7 +37,7 @@ class TimeGrid:
         """Times of all nodes, shape (steps + 1,) [s]."""
         return np.asarray(self.start_time + self.time_step * np.arange(self.steps + 1), dtype=float)
 
-    def node_and_fraction(self, t: ArrayLike) -> tuple[NDArray[np.int64], Array]:
+    def node_and_fraction(self, t: ArrayLike) -> tuple[IntArray, Array]:
         """Return the node before each time and the fraction of a step after it, to within 1e-6 of a step."""
         position = (np.asarray(t, float) - self.start_time) / self.time_step
         near = np.rint(position)
@@ -123,7 +121,7 @@ class Measurements:
     """
 
     sensor: Sensor
-    node: NDArray[np.int64]
+    node: IntArray
     fraction: Array
     value: Array
     weight: Array
@@ -138,7 +136,7 @@ class Measurements:
         return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
     @property
-    def evaluation_nodes(self) -> NDArray[np.int64]:
+    def evaluation_nodes(self) -> IntArray:
         """Nodes at which the sensor function must be evaluated, sorted."""
         if self.node.ndim > 1:
             # with the neighbours that a slope needs
@@ -149,7 +147,7 @@ class Measurements:
         return np.unique(np.concatenate([self.node, after]))
 
     @property
-    def is_used(self) -> NDArray[np.bool_]:
+    def is_used(self) -> BoolArray:
         """Mask of measured outputs with positive weight, shape (M, k)."""
         return self.weight > 0
 
@@ -224,7 +222,7 @@ class Measurements:
             return np.zeros((0, at_nodes.shape[1]))
         place = self.node - nodes[0]
 
-        def at(index: NDArray[np.int64]) -> Array:
+        def at(index: IntArray) -> Array:
             return np.asarray(at_nodes[np.clip(index, 0, len(nodes) - 1), column])
 
         on = np.isclose(self.fraction, np.rint(self.fraction), rtol=0, atol=1e-9)

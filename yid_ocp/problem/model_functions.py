@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step
@@ -19,8 +19,6 @@ from yid_ocp.model.system import RecordingErrorEffect, System
 from yid_ocp.parallel import LockedCache
 from yid_ocp.problem.initial_state_fit import InitialStateFitter
 from yid_ocp.sensors import Sensor, sensor_function
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -297,19 +295,19 @@ class NodeValues:
         lam = np.zeros((len(state), step.sizes["m"])) if lam is None else lam
         return NodeValues(q, v, z, np.zeros_like(q) if load is None else load, lam)
 
-    def at(self, nodes: NDArray[np.int64]) -> NodeValues:
+    def at(self, nodes: IntArray) -> NodeValues:
         """The values at some of the nodes."""
         return NodeValues(self.q[nodes], self.v[nodes], self.z[nodes], self.load[nodes], self.lam[nodes])
 
 
-def node_velocity(q: Array, nodes: NDArray[np.int64], time_step: float) -> Array:
+def node_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
     """Mean midpoint velocity of the steps beside some nodes of a trajectory (K, ...), shape (len(nodes), ...)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, len(q) - 1)
     span = np.maximum(after - before, 1) * time_step
     return np.asarray((q[after] - q[before]) / span.reshape(-1, *[1] * (q.ndim - 1)))
 
 
-def node_velocity_adjoint(pull: Array, nodes: NDArray[np.int64], count: int, time_step: float) -> Array:
+def node_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
     """Transpose of `node_velocity`, shape (len(nodes), n) to (count, n)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, count - 1)
     scaled, result = pull / ((after - before) * time_step)[:, None], np.zeros((count, pull.shape[1]))

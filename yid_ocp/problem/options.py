@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Len
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.issues import Issue
 from yid_ocp.model.objects.base import ClampPath
 from yid_ocp.options import OptionInfo
@@ -30,7 +31,7 @@ class MultivariateGaussianPrior:
     """
 
     parameter_names: tuple[str, ...] = ()
-    covariance: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def scaled_by(self, factors: Mapping[str, float]) -> MultivariateGaussianPrior:
         """Prior of the parameters multiplied by given factors; parameters without a factor are unchanged."""

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
-
-Array = NDArray[np.float64]
 
 
 def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGroup:

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import scipy.interpolate
 import scipy.signal
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import sensor_kinds
 from yid_ocp.errors import DataError, nearest_name_hint
@@ -19,7 +19,6 @@ from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import CHANNELS, recorded_camera_pose, recorded_joint_columns
 
-Array = NDArray[np.float64]
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
 """Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
 
@@ -155,7 +154,7 @@ def smoothed_joint_efforts(
     return np.stack([np.interp(grid.node_times, joints.t, column) for column in effort.T], axis=1)
 
 
-def denoised_gear_loads(measured: Array, own: Array, nodes: NDArray[np.int64], times: Array, cutoff: float) -> Array:
+def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
     """Gear loads: the model's own plus the slow part of measured minus own, so that effort noise is not fed back.
 
     Parameters

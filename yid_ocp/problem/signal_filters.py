@@ -11,11 +11,9 @@ import scipy.interpolate
 import scipy.signal
 import scipy.sparse
 import scipy.special
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import DataError
-
-Array = NDArray[np.float64]
 
 _MIN_CUTOFF_FRACTION = 1e-4  # of half the sampling rate; below it the filter's sections are singular to rounding
 _FILTER_ORDER = 4
@@ -78,7 +76,7 @@ class LowPassFilter:
         second[1:-1] = (response[2:] - 2 * response[1:-1] + response[:-2]) / step**2
         return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
 
-    def node_smoother(self, nodes: NDArray[np.int64], count: int, step: float) -> NodeSmoother:
+    def node_smoother(self, nodes: IntArray, count: int, step: float) -> NodeSmoother:
         """Filter as a matrix for some of `count` nodes, `step` apart [s]; nodes beyond are left out.
 
         Values before node 1 and after the last node are taken as constant.
@@ -123,7 +121,7 @@ class NodeSmoother:
         From values at all nodes.
     """
 
-    nodes: NDArray[np.int64]
+    nodes: IntArray
     matrix: scipy.sparse.csr_array
 
     def smooth(self, values: Array) -> Array:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import ChannelGroup, JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.errors import SolverError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
@@ -20,8 +20,6 @@ from yid_ocp.sensors.joints import (
     joint_torque_bias_std,
     joint_torque_noise_std,
 )
-
-Array = NDArray[np.float64]
 
 
 def recording_from_prediction(

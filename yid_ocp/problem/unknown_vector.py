@@ -8,14 +8,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.model.system import System
 from yid_ocp.problem.options import ProblemOptions
 
-Array = NDArray[np.float64]
 INITIAL_STATE_PREFIX = "start."
 MIN_LOG_RATIO = 1e-3
 """Ratio of an unknown to its initial value below which the weak prior's logarithm is replaced by a parabola."""
@@ -52,7 +52,7 @@ class UnknownVectorLayout:
         """Free parameters, shared then local, in the order of one recording's derivative columns."""
         return (*self.shared_parameters, *self.local_parameters)
 
-    def recording_columns(self, recording: int) -> NDArray[np.int64]:
+    def recording_columns(self, recording: int) -> IntArray:
         """Indices of one recording's (shared, local, start) unknowns in the vector."""
         shared, own = len(self.shared_parameters), len(self.local_parameters) + len(self.initial_state_names)
         return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])

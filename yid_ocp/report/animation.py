@@ -9,13 +9,12 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 
-Array = NDArray[np.float64]
 _MAX_FRAMES = 150  # moments of a motion that a page holds; between two it goes straight
 _ARM_RADIUS = 0.03  # how thick an arm is drawn [m]
 _POSITION_SCALE = 1e4  # places are kept as whole numbers of a tenth of a millimetre
@@ -43,7 +42,7 @@ class _AnimatedMotion:
     sticks: Sequence[_Stick]
     positions: Array
     point_indices: Mapping[str, int]
-    is_new_measurement: NDArray[np.bool_] | None = None
+    is_new_measurement: BoolArray | None = None
 
     def to_dict(self) -> dict[str, Any]:
         fresh, places = self.is_new_measurement, self.positions.reshape(len(self.positions), -1)
@@ -207,7 +206,7 @@ def _measured_motion(told: ModelTrajectory, recording: Recording, t: Array) -> _
         figure = _StickFigure(system, told.theta)
         sticks, places = [stick for stick in figure.sticks if not stick.is_object_part], figure.positions_at(q)
     seen: dict[str, Array] = {}
-    fresh: dict[str, NDArray[np.bool_]] = {}
+    fresh: dict[str, BoolArray] = {}
     for group in recording.points:
         near = np.ceil(np.interp(t, group.t, np.arange(len(group.t))) - 0.5).astype(int)
         apart, period = np.abs(group.t[near] - t) - _TIME_TOLERANCE, max(_spacing(group.t), _spacing(t))

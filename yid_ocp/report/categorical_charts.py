@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.report.figures import (
     AFTER_COLOR,
     BACKGROUND_COLOR,
@@ -26,7 +26,6 @@ from yid_ocp.report.figures import (
 if TYPE_CHECKING:
     import plotly.graph_objects
 
-Array = NDArray[np.float64]
 
 _MIN_CLOSURE_PERCENT = -50.0  # lower end of an axis of closures [%]
 _SYMBOLS = ("circle", "diamond", "square", "cross")

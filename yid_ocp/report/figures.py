@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.report.terminal import display_scale_and_unit
 
 if TYPE_CHECKING:
     import plotly.graph_objects
 
-Array = NDArray[np.float64]
 
 # on a dark page each becomes what templates/dark.json says; figures use no other colors
 TEXT_COLOR, GRID_COLOR, BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"

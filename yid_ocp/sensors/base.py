@@ -11,8 +11,8 @@ from typing import Annotated, ClassVar, Literal, Protocol
 import casadi as ca
 import numpy as np
 from annotated_types import Ge, Gt
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Placement
@@ -20,7 +20,6 @@ from yid_ocp.model.system import NodeState, System
 from yid_ocp.options import OptionInfo
 from yid_ocp.registry import Registry
 
-Array = NDArray[np.float64]
 EffortKind = Literal["sample", "mean", "command"]
 """What a recorded effort is: the sampled torque, its mean until the next sample, or a command held until then."""
 _Positive = Annotated[float, Gt(0)]

@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 import scipy.special
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNELS,
     SENSOR_READERS,
-    Array,
     Channel,
     JointData,
     PointData,

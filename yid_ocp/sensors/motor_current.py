@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNELS,
     SENSOR_READERS,
-    Array,
     Channel,
     ChannelData,
     SensorContext,

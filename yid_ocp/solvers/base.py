@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import threadpoolctl
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.inference.linearized_residual import is_stationary
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     import pandas
 
 log = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 
 
 class Status(str, Enum):
@@ -458,7 +456,7 @@ def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: It
     return _Fit(result, weighted.evaluate(x, equilibrium_guesses=warm), weighted, evaluations, history)
 
 
-def _doubtful(fit: _Fit, first: Array) -> NDArray[np.bool_]:
+def _doubtful(fit: _Fit, first: Array) -> BoolArray:
     """Positive unknowns that the data inform, but loosely, and those that have all but vanished."""
     x = fit.result.x
     if not fit.evaluation.ok or fit.evaluation.jacobian is None:

@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar
 
 import numpy as np
 from annotated_types import Ge, Gt
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.inference.linearized_residual import (
     achievable_reduction,
     bounded_least_squares_step,
@@ -29,8 +29,6 @@ from yid_ocp.solvers.base import (
     Status,
     projected_gradient_norm,
 )
-
-Array = NDArray[np.float64]
 
 # A positive unknown falls by no more than this factor in one step, until it is this part of its typical size.
 _MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3

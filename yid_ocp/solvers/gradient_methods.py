@@ -8,8 +8,8 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 import scipy.optimize
 from annotated_types import Ge, Gt, Lt
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.solvers.base import (
@@ -20,8 +20,6 @@ from yid_ocp.solvers.base import (
     Status,
     projected_gradient_norm,
 )
-
-Array = NDArray[np.float64]
 
 
 @SOLVERS.register("single_shooting")

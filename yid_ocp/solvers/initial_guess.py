@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step, predicted_reduction
 from yid_ocp.integrator.rollout import generalized_momentum, simulate
@@ -20,8 +20,6 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.signal_filters import LowPassFilter
 
 log = logging.getLogger(__name__)
-
-Array = NDArray[np.float64]
 
 
 _MisfitFunction = Callable[[int, Array, Array], float]
@@ -54,7 +52,7 @@ class NodeStateGuess:
 
 
 def guess_node_states(
-    problem: EstimationProblem, nodes: Sequence[NDArray[np.int64]], x: Array, misfit: _MisfitFunction
+    problem: EstimationProblem, nodes: Sequence[IntArray], x: Array, misfit: _MisfitFunction
 ) -> NodeStateGuess:
     """Guess node states near a solution, at an unknown vector or, where that fits poorly, at multiples of it.
 
@@ -101,7 +99,7 @@ def mean_square_residual(problem: EstimationProblem, i: int, trajectory: Array, 
 
 
 def _tracked(
-    problem: EstimationProblem, episode: Episode, nodes: NDArray[np.int64], theta: Array, start: Array
+    problem: EstimationProblem, episode: Episode, nodes: IntArray, theta: Array, start: Array
 ) -> list[tuple[Array, Array]]:
     """Node states and multipliers of the rollout under the tracking filter; none where it fails."""
     feedback = episode.tracking_feedback
@@ -115,7 +113,7 @@ def _tracked(
 
 
 def _resting(
-    problem: EstimationProblem, episode: Episode, nodes: NDArray[np.int64], theta: Array, start: Array
+    problem: EstimationProblem, episode: Episode, nodes: IntArray, theta: Array, start: Array
 ) -> tuple[Array, Array]:
     """Node states at rest at the measured postures, with the momentum of moving from one to the next."""
     step, statics = problem.step, problem.model_functions.equilibrium_solver

@@ -10,8 +10,8 @@ from typing import Annotated, Any, ClassVar
 import casadi as ca
 import numpy as np
 from annotated_types import Ge, Gt
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import bounded_least_squares_step, predicted_reduction
 from yid_ocp.integrator.rollout import simulate
@@ -38,7 +38,6 @@ from yid_ocp.solvers.symbolic_transcription import (
 
 log = logging.getLogger(__name__)
 
-Array = NDArray[np.float64]
 
 _MEMORY_WARNING_BYTES = 2e9
 _CONDENSING_NODE_INTERVAL = 20
@@ -368,7 +367,7 @@ class _ShootingIntervals:
 
     def __init__(self, problem: EstimationProblem, node_interval: int) -> None:
         check_inputs_as_recorded(problem, "multiple shooting")
-        self.problem, self.node_steps = problem, list[NDArray[np.int64]]()
+        self.problem, self.node_steps = problem, list[IntArray]()
         for episode in problem.episodes:
             steps = episode.grid.steps
             if steps < node_interval:

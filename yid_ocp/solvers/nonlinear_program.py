@@ -16,13 +16,13 @@ from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import SolverError, nearest_name_hint
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.solvers.program_terms import (
-    IndexArray,
     MadeOnce,
     ProgramTerm,
     ResidualTerm,
@@ -31,7 +31,6 @@ from yid_ocp.solvers.program_terms import (
     sum_duplicate_entries,
 )
 
-Array = NDArray[np.float64]
 HessianKind = Literal["gauss_newton", "exact"]
 # Measured with IPOPT and MUMPS on 40 to 50 coordinates and 500 to 2000 steps [bytes an entry of Jacobian and Hessian].
 _BYTES_PER_ENTRY = 250.0
@@ -48,7 +47,7 @@ _SIZE_DEPENDENT_OPTIONS = ("iteration_callback", "discrete", "equality", "struct
 class VectorBlock:
     """Named block of a program's variables or parameters: indices in the vector, shape (rows, columns), rows' names."""
 
-    index: IndexArray
+    index: IntArray
     row_names: tuple[str, ...]
     unit: str = ""
 
@@ -63,7 +62,7 @@ class VectorLayout:
     lower: list[Array] = field(default_factory=list)
     upper: list[Array] = field(default_factory=list)
 
-    def extend(self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf) -> IndexArray:
+    def extend(self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf) -> IntArray:
         """Lay values down; their places."""
         self.values.append(values)
         self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
@@ -71,12 +70,12 @@ class VectorLayout:
         self.size += len(values)
         return np.arange(self.size - len(values), self.size)
 
-    def name(self, name: str, index: IndexArray, rows: Sequence[str], unit: str = "") -> None:
+    def name(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
         """Name places, unless there are none."""
         if index.size:
             self.blocks[name] = VectorBlock(index, tuple(rows), unit)
 
-    def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IndexArray:
+    def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IntArray:
         """Lay a block down, column by column; its places, (rows, columns)."""
         table = np.asarray(values, float)
         table = table[:, None] if table.ndim == 1 else table

@@ -13,13 +13,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.compiler import compiled_function
 from yid_ocp.parallel import CASADI_LOCK
-
-Array = NDArray[np.float64]
-IndexArray = NDArray[np.int64]
 
 
 class MadeOnce(cached_property[Any]):
@@ -97,9 +94,9 @@ class ProgramTerm:
     name: str
     row_names: tuple[str, ...]
     local_function: LocalFunction
-    variable_indices: IndexArray
-    data_indices: IndexArray
-    shared_data_indices: IndexArray
+    variable_indices: IntArray
+    data_indices: IntArray
+    shared_data_indices: IntArray
 
     @property
     def n_values(self) -> int:
@@ -122,13 +119,13 @@ class ProgramTerm:
         """Nonzero entries of the Jacobian, in the order of `jacobian_indices`."""
         return _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))
 
-    def jacobian_indices(self) -> tuple[IndexArray, IndexArray]:
+    def jacobian_indices(self) -> tuple[IntArray, IntArray]:
         """Row and column indices of the Jacobian's entries."""
         row, column = (np.array(x, np.int64) for x in self.local_function.jacobian.sparsity_out(0).get_triplet())
         first = len(self.row_names) * np.arange(len(self.variable_indices))[:, None]
         return (first + row).ravel(), self.variable_indices[:, column].ravel()
 
-    def hessian_entries(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IndexArray, IndexArray] | None:
+    def hessian_entries(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
         """Hessian of weight . values as entries, rows and columns, which may repeat; None where it is zero."""
         function = self.local_function.curvature
         if function is None:
@@ -155,8 +152,8 @@ class ResidualTerm:
 
     term: ProgramTerm
     combination: ca.DM | None = None
-    weight_indices: IndexArray | None = None
-    target_indices: IndexArray | None = None
+    weight_indices: IntArray | None = None
+    target_indices: IntArray | None = None
     huber_threshold: float = math.inf
 
     @property
@@ -224,7 +221,7 @@ class RidgeRegularization:
     The factor is a number, or a function of the unknowns that gives one, which may change from iterate to iterate.
     """
 
-    index: IndexArray
+    index: IntArray
     scale: Array
     factor: float | ca.Function
 
@@ -234,7 +231,7 @@ def _nonzero_values(matrix: ca.MX) -> ca.MX:
     return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
 
 
-def assemble_sparse(entries: ca.MX, row: IndexArray, column: IndexArray, shape: tuple[int, int]) -> ca.MX:
+def assemble_sparse(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
     """Assemble a sparse matrix from entries at distinct positions."""
     order = np.lexsort((row, column))
     start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
@@ -242,7 +239,7 @@ def assemble_sparse(entries: ca.MX, row: IndexArray, column: IndexArray, shape: 
     return ca.MX(sparsity, entries[order.tolist()])
 
 
-def sum_duplicate_entries(entries: ca.MX, row: IndexArray, column: IndexArray, size: int) -> ca.MX:
+def sum_duplicate_entries(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:
     """Assemble a sparse square matrix from entries, summing those at the same position."""
     keys, place = np.unique(column * size + row, return_inverse=True)
     start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])

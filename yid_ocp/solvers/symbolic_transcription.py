@@ -20,8 +20,9 @@ from dataclasses import dataclass, replace
 import casadi as ca
 import numpy as np
 import scipy.sparse
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.nlp_stage import NlpStage, nlp_stage
 from yid_ocp.integrator.statics import holding_spring_stiffness
@@ -33,9 +34,7 @@ from yid_ocp.problem.unknown_vector import MIN_LOG_RATIO
 from yid_ocp.sensors import Sensor, sensor_function
 from yid_ocp.solvers.initial_guess import NodeStateGuess, guess_node_states, mean_square_residual
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorLayout
-from yid_ocp.solvers.program_terms import IndexArray, LocalFunction, ProgramTerm, ResidualTerm, RidgeRegularization
-
-Array = NDArray[np.float64]
+from yid_ocp.solvers.program_terms import LocalFunction, ProgramTerm, ResidualTerm, RidgeRegularization
 
 # Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
 MIN_RIDGE_FACTOR = 0.1
@@ -139,24 +138,24 @@ def unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram,
 class _Places:
     """Places of a recording's unknowns and inputs; `errors` of each step's torque, `first` of the first angles."""
 
-    free: IndexArray
-    rest: IndexArray
-    state: IndexArray
-    multipliers: IndexArray
-    errors: IndexArray
-    first: IndexArray
-    theta: IndexArray
-    torque: IndexArray
-    gain: IndexArray
-    reference: IndexArray
+    free: IntArray
+    rest: IntArray
+    state: IntArray
+    multipliers: IntArray
+    errors: IntArray
+    first: IntArray
+    theta: IntArray
+    torque: IntArray
+    gain: IntArray
+    reference: IntArray
 
-    def stages(self) -> IndexArray:
+    def stages(self) -> IntArray:
         """(free, x_k, x_{k+1}, lam_k, errors) of every step, (N, nv)."""
         steps = len(self.multipliers)
         free = np.broadcast_to(self.free, (steps, len(self.free)))
         return np.hstack([free, self.state[:-1], self.state[1:], self.multipliers, self.errors])
 
-    def inputs(self) -> IndexArray:
+    def inputs(self) -> IntArray:
         """(torque, gain, reference) of every step, (N, nd)."""
         return np.hstack([self.torque.T, self.gain.T, self.reference.T])
 
@@ -297,7 +296,7 @@ class _Maker:
 
     # -- layout -------------------------------------------------------------------------------------------------------
 
-    def _laid_out(self, i: int, found: NodeStateGuess, free: IndexArray) -> tuple[_Places, list[ResidualTerm]]:
+    def _laid_out(self, i: int, found: NodeStateGuess, free: IntArray) -> tuple[_Places, list[ResidualTerm]]:
         """The unknowns of a recording at their guess and what drives it; priors of errors."""
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
@@ -332,7 +331,7 @@ class _Maker:
         errors, first, priors = self._erring(episode)
         return _Places(free, rest_at, states, multipliers, errors, first, known[:, 0], torque, gain, reference), priors
 
-    def _followed(self, episode: Episode) -> tuple[IndexArray, IndexArray]:
+    def _followed(self, episode: Episode) -> tuple[IntArray, IntArray]:
         """Gains (row by row) and reference of the tracking filter at every step."""
         feedback, steps = episode.tracking_feedback, episode.grid.steps
         if feedback is None or not _kind(episode)[0]:
@@ -358,7 +357,7 @@ class _Maker:
             self._stages[key] = made
         return self._stages[key]
 
-    def _erring(self, episode: Episode) -> tuple[IndexArray, IndexArray, list[ResidualTerm]]:
+    def _erring(self, episode: Episode) -> tuple[IntArray, IntArray, list[ResidualTerm]]:
         """Places of the torque's errors at every step and of the first angles', and their priors."""
         errors, steps, name = episode.input_errors, episode.grid.steps, episode.name
         if errors is None:
@@ -562,7 +561,7 @@ def _constant(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> ca.DM:
     return ca.DM(columns)
 
 
-def _between(samples: Measurements, nodes: NDArray[np.int64]) -> scipy.sparse.csc_matrix:
+def _between(samples: Measurements, nodes: IntArray) -> scipy.sparse.csc_matrix:
     """What makes predictions of samples, those that count, from readings at nodes, node by node."""
     width = samples.value.shape[1]
     sample, column = np.nonzero(samples.is_used)

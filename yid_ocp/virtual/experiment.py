@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.effects.base import joints_by_arm
 from yid_ocp.errors import ConfigError, ModelError
@@ -27,7 +28,6 @@ from yid_ocp.virtual.joint_motion import (
 from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, SimulatorTerms, simulate_in_mujoco
 
-Array = NDArray[np.float64]
 _Generators = Mapping[str, np.random.Generator]
 
 # every sensor draws from a stream of its own, so that leaving one out changes no other; the order is part of the seed

@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.effects.base import object_joints
@@ -26,7 +26,6 @@ from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment, with_sensor_error
 from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
 
-Array = NDArray[np.float64]
 _ForceCallback = Callable[[Any, Any], None]  # of MuJoCo's model and data; adds to `qfrc_passive`
 _Values = Mapping[str, float]
 

@@ -9,16 +9,15 @@ from typing import Protocol
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
 from yid_ocp.model.mechanism import Mechanism, Placement
 from yid_ocp.model.system import System
 from yid_ocp.virtual.mjcf import ParameterEvaluator
-
-Array = NDArray[np.float64]
 
 BAXTER_ARM_JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
 _ELBOW_UP_ANGLES: Mapping[str, float] = {

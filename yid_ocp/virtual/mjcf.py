@@ -16,16 +16,14 @@ from xml.etree.ElementTree import Element, SubElement
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, UNLIMITED_EFFORT
 from yid_ocp.model.system import Effect, MidpointState, RecordingErrorEffect, System
-
-Array = NDArray[np.float64]
 
 MODEL_ASPECTS: Mapping[str, str] = {
     "stiffness": "stiffness of joints",

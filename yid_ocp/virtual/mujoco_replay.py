@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ModelError
 from yid_ocp.model.system import System
@@ -22,8 +22,6 @@ from yid_ocp.virtual.mujoco_simulation import (
     settle_to_equilibrium,
     settle_under_servos,
 )
-
-Array = NDArray[np.float64]
 
 REPLAY_BANDWIDTH = 5.0
 """Bandwidth of the feedback against drift of driven joints [rad/s]; low, so that recorded torque dominates."""

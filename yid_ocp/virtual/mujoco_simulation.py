@@ -15,16 +15,14 @@ from types import ModuleType
 from typing import Any, Protocol, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.sensors.base import EffortKind
 from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
 from yid_ocp.virtual.mjcf import compile_mjcf, import_mujoco, mujoco_xml
-
-Array = NDArray[np.float64]
-_Integers = NDArray[np.int64]
 
 DEFAULT_SIMULATOR_STEP = 1e-4
 """Default time step of the simulator [s]."""
@@ -206,8 +204,8 @@ class MujocoScene:
     mujoco: ModuleType
     model: Any
     data: Any
-    joint_ids: _Integers
-    moved_joint_ids: _Integers
+    joint_ids: IntArray
+    moved_joint_ids: IntArray
     point_site_ids: list[int]
     grasp_site_ids: list[list[int]]
 
@@ -376,7 +374,7 @@ def _play(
     scene: MujocoScene,
     controller: TrackingController | _ServoCommander,
     simulation: SimulationOptions,
-    frames: _Integers,
+    frames: IntArray,
 ) -> SimulationResult:
     """Simulate period by period of the controller, the torque held in each; `frames` count the simulator's steps."""
     mujoco, model, data = scene.mujoco, scene.model, scene.data

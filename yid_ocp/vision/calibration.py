@@ -15,8 +15,8 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
 from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.camera_registration import (
@@ -37,8 +37,6 @@ from yid_ocp.vision.camera_registration import (
     surface_visibility,
 )
 from yid_ocp.vision.point_cloud import weighted_median
-
-Array = NDArray[np.float64]
 
 _OFF_ARM_DISTANCE = 0.04  # at which a point stops to be the arm's [m]
 _THIN = 5000  # points of a frame among which starts are tried

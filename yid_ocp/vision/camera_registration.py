@@ -28,18 +28,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.linalg import eigh
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.vision.frames import CameraIntrinsics
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 ROTATION_SLICE, TRANSLATION_SLICE = slice(0, 3), slice(3, 6)
 DEPTH_SCALE_INDEX, DEPTH_OFFSET_INDEX, CLOCK_OFFSET_INDEX, CLOCK_DRIFT_INDEX = 6, 7, 8, 9
@@ -149,7 +146,7 @@ class _CalibrationEquations:
 
     jacobian: Array
     residuals: Array
-    patch_indices: Integers
+    patch_indices: IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,14 +160,14 @@ class ArmSurface:
     grasp_exclusion_radius: float
 
     @cached_property
-    def _moving(self) -> Mask:
+    def _moving(self) -> BoolArray:
         return np.array([joint >= 0 for joint in self.robot_surfaces.part_joints])
 
     def part_poses_at(self, t: float) -> Array:
         """Poses of the parts, shape (parts, 4, 4)."""
         return self.robot_surfaces.part_poses_at(self.configuration_at(t))
 
-    def visible_points(self, state: CameraState, stamp: float) -> tuple[Array, Integers]:
+    def visible_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
         """Points of moving surfaces that the camera sees if nothing is before the robot, in the world; their parts."""
         q = self.configuration_at(float(state.to_joint_time(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_image(_LOOK, state.pose, q)
@@ -178,7 +175,7 @@ class ArmSurface:
         points = _LOOK.pixel_rays[seen] * depth[seen][:, None]
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
 
-    def is_near_surface(self, points: Array, t: float, within: float) -> Mask:
+    def is_near_surface(self, points: Array, t: float, within: float) -> BoolArray:
         """Whether world points are near a moving surface and not near a grasp."""
         q = self.configuration_at(t)
         result = self.robot_surfaces.is_within_distance(points, q, within, moving_only=True)
@@ -229,11 +226,11 @@ class ArmSurface:
 class _SurfaceMatches:
     """Points matched to the arm: indices, normal distance e [m], normal, normal velocity [m/s], part, local place."""
 
-    point_indices: Integers
+    point_indices: IntArray
     normal_distance: Array
     normal: Array
     normal_velocity: Array
-    part: Integers
+    part: IntArray
     part_coordinates: Array
 
 
@@ -284,7 +281,7 @@ def evaluate_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) ->
         frame = np.repeat(np.arange(len(rows)), [len(r.residuals) for r in rows])
         patch = np.unique(np.concatenate([r.patch_indices for r in rows]), axis=0, return_inverse=True)[1].ravel()
 
-        def summed(group: Integers) -> Array:
+        def summed(group: IntArray) -> Array:
             totals = np.stack([np.bincount(group, stacked[:, k]) for k in range(STATE_SIZE)], axis=1)
             return np.asarray(totals.T @ totals)
 
@@ -334,7 +331,7 @@ def initial_camera_states(
 
 
 def _add_costs(
-    total: Array, arm: ArmSurface, told: CameraState, glimpse: CalibrationFrame, delays: Array, cells: Integers
+    total: Array, arm: ArmSurface, told: CameraState, glimpse: CalibrationFrame, delays: Array, cells: IntArray
 ) -> None:
     """Mean costs of the arm's visible points as they were `delays` [s] earlier, shifted by cells of the camera's frame.
 

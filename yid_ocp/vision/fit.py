@@ -19,8 +19,9 @@ from typing import Annotated
 import casadi as ca
 import numpy as np
 from annotated_types import Ge
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
@@ -42,11 +43,7 @@ from yid_ocp.vision.shape_evidence import (
 )
 from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_sizes
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-
-Mask = NDArray[np.bool_]
-_Left = tuple[Mask, Mask]
+_Left = tuple[BoolArray, BoolArray]
 """Which of a frame's nodes and points count."""
 _GRASP_FRAMES = ("holder_frame", "held_frame")
 _NODE_RADIUS_FRACTION = math.pi / 4
@@ -220,7 +217,7 @@ class ShapeFitter:
         trial[again] = self.rest_configuration[again]
         return trial
 
-    def _links_of(self, tubes: Collection[str]) -> Mask:
+    def _links_of(self, tubes: Collection[str]) -> BoolArray:
         return np.array([owner in tubes for owner in self.link_segments])
 
     def _rivals(self, best: _Minimum, evidence: ShapeEvidence, sight: CloudObservation) -> list[Array]:
@@ -250,7 +247,7 @@ class ShapeFitter:
                 failed.add(name)
         return failed
 
-    def _without(self, best: _Minimum, evidence: ShapeEvidence, sight: CloudObservation, links: Mask) -> _Left:
+    def _without(self, best: _Minimum, evidence: ShapeEvidence, sight: CloudObservation, links: BoolArray) -> _Left:
         """All nodes and points but those on which some links lie."""
         tubes, nodes = self.tubes_at(best.q), sight.skeleton_nodes
         link = nearest_on_tubes(tubes.link_ends, tubes.radius, sight.points)[0]
@@ -278,7 +275,9 @@ class ShapeFitter:
         """Distance from the surface beyond which a point says nothing of the shape [m]."""
         return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _NEAR
 
-    def _tasks(self, sight: CloudObservation, at_nodes: Mask, at_points: Mask) -> tuple[list[_Task], list[_Task]]:
+    def _tasks(
+        self, sight: CloudObservation, at_nodes: BoolArray, at_points: BoolArray
+    ) -> tuple[list[_Task], list[_Task]]:
         """The passes on the nodes and those on the points."""
         options, camera = self.options, sight.camera_position
         factor = 1.0 / (options.correlated_points * options.surface_noise_std**2)

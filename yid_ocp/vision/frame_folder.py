@@ -18,13 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, OutputError, unknown_name_details
 from yid_ocp.files import atomic_write, is_file, write_text
 from yid_ocp.vision.frames import CameraIntrinsics, Colours, FrameSequence, import_open3d, validated_pose
-
-Array = NDArray[np.float64]
 
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
 _DEPTH_IMAGE_SUFFIX = ".png"

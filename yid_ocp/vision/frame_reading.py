@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.readers.bags import JOINT_STATE, BagMessage, OpenBag, bag_clock
 from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.vision.frame_folder import METRES_PER_UNIT, STAMP_FILE, read_frame_folder
 from yid_ocp.vision.frames import CameraIntrinsics, Colours, FrameSequence, import_open3d, validated_pose
-
-Array = NDArray[np.float64]
 
 _CLOUD_MESSAGE, _IMAGE_MESSAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
 _CAMERA_INFO_MESSAGE = "sensor_msgs/msg/CameraInfo"

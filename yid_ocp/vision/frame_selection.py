@@ -7,18 +7,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.sparse.csgraph import shortest_path
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.sequence_calibration import DimensionCheck, ForeignObject, SequenceCalibration
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.track_result import FrameReport
-
-Array = NDArray[np.float64]
 
 _NO_FIT, _END_ELSEWHERE = "the shape does not fit", "an end is not where its gripper is"
 _MISFITS = (_NO_FIT, _END_ELSEWHERE)

@@ -25,11 +25,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import DataError, unknown_name_details
 
-Array = NDArray[np.float64]
 Colours = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 _DISTORTION_COEFFICIENT_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """Models of distortion, and how many coefficients each may have: k1, k2, p1, p2, k3 (k4, k5, k6), or k1 to k4."""
@@ -98,7 +97,7 @@ class CameraIntrinsics:
         points *= image.ravel().take(seen)[:, None]
         return points
 
-    def is_measured(self, depth: Array) -> NDArray[np.bool_]:
+    def is_measured(self, depth: Array) -> BoolArray:
         """Whether each pixel of a depth image is measured, shape (height, width); `DataError` for another size."""
         if depth.shape != (self.height, self.width):
             raise DataError(f"the depth image has shape {depth.shape}", allowed=f"({self.height}, {self.width})")
@@ -275,7 +274,7 @@ class OcclusionMap:
     expected_points: Array | None = None
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
-    def is_hidden(self, places: Array, radius: Array, margin: float) -> Mask:
+    def is_hidden(self, places: Array, radius: Array, margin: float) -> BoolArray:
         """Whether something nearer stands before world places (S, 3) or throws its shadow on them, or the picture ends.
 
         What is nearer to the camera than a place by more than its radius (S,), by which it reaches about its line of

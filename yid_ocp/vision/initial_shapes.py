@@ -17,21 +17,18 @@ from itertools import permutations
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import DataError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System, floating_clamp
 from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud
 from yid_ocp.vision.surface_meshes import numeric_mechanism
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 _NEIGHBOURS = 10
 _SPACINGS = 3.0  # points further apart than so many of their usual distance do not hang together
@@ -47,12 +44,12 @@ class _Centerline:
     """Centerline of an object in a cloud, as a tree of nodes."""
 
     nodes: Array
-    edges: Integers
+    edges: IntArray
     loop_positions: Array
     slice_width: float
 
     @property
-    def end_nodes(self) -> Integers:
+    def end_nodes(self) -> IntArray:
         """Nodes at which only one edge ends."""
         count = np.bincount(self.edges.ravel(), minlength=len(self.nodes))
         return np.flatnonzero(count <= 1)
@@ -71,7 +68,7 @@ class _Centerline:
         way = self.nodes[end] - self.nodes[near].mean(axis=0)
         return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
 
-    def path_lengths_from(self, start: int) -> tuple[Array, Integers]:
+    def path_lengths_from(self, start: int) -> tuple[Array, IntArray]:
         """Path length from a node to every other one [m], and the predecessor of each."""
         far, before = dijkstra(_graph(self.nodes, self.edges), directed=False, indices=start, return_predecessors=True)
         return np.asarray(far), np.asarray(before, dtype=np.int64)
@@ -109,7 +106,7 @@ def trace_centerline(cloud: WeightedCloud, diameter: float, gap: float, rng: np.
     return _pruned(_Centerline(nodes, tree, loops, width), _TWIG * diameter)
 
 
-def _graph(nodes: Array, edges: Integers) -> csr_matrix:
+def _graph(nodes: Array, edges: IntArray) -> csr_matrix:
     lengths = np.maximum(np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1), 1e-9)
     return coo_matrix((lengths, (edges[:, 0], edges[:, 1])), shape=(len(nodes),) * 2).tocsr()
 
@@ -142,7 +139,7 @@ def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
     return points[kept], _graph(points[kept], both)
 
 
-def _slices(points: Array, graph: csr_matrix, slices: Integers) -> tuple[Array, Integers]:
+def _slices(points: Array, graph: csr_matrix, slices: IntArray) -> tuple[Array, IntArray]:
     """Connected parts of every slice, and which of them touch."""
     links = graph.tocoo()
     same = slices[links.row] == slices[links.col]
@@ -155,7 +152,7 @@ def _slices(points: Array, graph: csr_matrix, slices: Integers) -> tuple[Array, 
     return nodes / size[:, None], edges.astype(np.int64)
 
 
-def _tree(nodes: Array, edges: Integers, loop: float) -> tuple[Integers, Array]:
+def _tree(nodes: Array, edges: IntArray, loop: float) -> tuple[IntArray, Array]:
     """Shortest edges that join all nodes, and where an edge left out closes a longer way than `loop` [m]."""
     if not len(edges):
         return edges, np.empty((0, 3))
@@ -184,7 +181,7 @@ def _pruned(trace: _Centerline, twig: float) -> _Centerline:
     return _Centerline(nodes[used], renamed[edges], trace.loop_positions, trace.slice_width)
 
 
-def _branch(nodes: Array, edges: Integers, count: Integers, end: int) -> tuple[float, list[int]]:
+def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[float, list[int]]:
     """Length of the branch from an end to where another one leaves [m], and its nodes with that one last."""
     order, _ = breadth_first_order(_graph(nodes, edges), end, directed=False)
     way, length = [end], 0.0

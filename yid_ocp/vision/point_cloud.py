@@ -10,20 +10,18 @@ from typing import Annotated
 import casadi as ca
 import numpy as np
 from annotated_types import Ge, Gt, Le
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import Fraction, OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_sizes
 
-Array = NDArray[np.float64]
 Coordinates = tuple[float, float, float]
-Mask = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 _ColourComponent = Annotated[float, Ge(0), Le(255)]
 _RgbColour = tuple[_ColourComponent, _ColourComponent, _ColourComponent]
 
@@ -41,7 +39,7 @@ class WeightedCloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    def select(self, mask: NDArray[np.bool_] | NDArray[np.int64]) -> WeightedCloud:
+    def select(self, mask: BoolArray | IntArray) -> WeightedCloud:
         """The points that a mask or a list of indices selects."""
         return WeightedCloud(self.points[mask], self.point_weights[mask])
 
@@ -160,7 +158,7 @@ class ObjectRegion:
         bases = [np.array(ca.DM(joint.placement.translation)).ravel() for joint in roots]
         self._base = np.mean(bases, axis=0) if bases else None
 
-    def membership_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], Mask]:
+    def membership_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
         """Test whether points (N, 3) lie inside, the robot at a configuration (n,), seen from a camera at (3,) [m]."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
@@ -170,7 +168,7 @@ class ObjectRegion:
             ahead = ahead / length if length > 0 else np.zeros(3)
             limit = float(ahead @ self._base) + self._behind
 
-        def contains(points: Array) -> Mask:
+        def contains(points: Array) -> BoolArray:
             inside = np.ones(len(points), bool)
             for axis in range(3):  # column by column, which is quicker than whole rows on large clouds
                 inside &= (points[:, axis] >= self._lower[axis]) & (points[:, axis] <= self._upper[axis])
@@ -196,7 +194,7 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
     return WeightedCloud(total / count[:, None], count.astype(np.float64))
 
 
-def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: Mask | None = None) -> Mask:
+def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: BoolArray | None = None) -> BoolArray:
     """Whether points are inliers of statistical outlier removal, shape (N,); False for those that are not asked.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
@@ -207,7 +205,7 @@ def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: M
         return np.zeros(len(cloud), bool)
     tree = cKDTree(cloud.points, compact_nodes=False, balanced_tree=False)
 
-    def apart(index: NDArray[np.int64]) -> Array:
+    def apart(index: IntArray) -> Array:
         return np.asarray(tree.query(cloud.points[index], k=neighbours + 1)[0][:, 1:].mean(axis=1))
 
     some = np.arange(0, len(cloud), max(1, len(cloud) // _USUAL))
@@ -220,7 +218,7 @@ def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: M
     return stays
 
 
-def has_any_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> Mask:
+def has_any_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> BoolArray:
     """Whether points have one of the wanted colours, shape (N,).
 
     Colours are red, green and blue, 0 to 255 (sRGB), shapes (N, 3) and (C, 3). `angle` is the largest between two of
@@ -272,19 +270,19 @@ class CloudSkeleton:
 
     nodes: Array  # (K, 3), centroids of the kept segments, in the order of the walk [m]
     node_weights: Array  # (K,), points (weights) of each segment
-    node_of_point: Integers  # (N,), node to which each point of the cloud belongs, -1 for none
-    edges: Integers  # (E, 2), minimum spanning forest of the graph of nearest neighbours
-    component_of_node: Integers  # (K,), connected part of each node, the one with most points first
+    node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none
+    edges: IntArray  # (E, 2), minimum spanning forest of the graph of nearest neighbours
+    component_of_node: IntArray  # (K,), connected part of each node, the one with most points first
 
     @property
-    def has_node(self) -> NDArray[np.bool_]:
+    def has_node(self) -> BoolArray:
         """Whether each point of the cloud belongs to a node, shape (N,)."""
         return self.node_of_point >= 0
 
 
 def _thin_to_nodes(
     cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions, down: ArrayLike
-) -> tuple[Array, Array, Integers]:
+) -> tuple[Array, Array, IntArray]:
     """Thin a cloud to nodes, segment by segment: nodes, their weights, and the node of each point."""
     label, alive = np.full(len(cloud), -1), np.arange(len(cloud))
     points, weight = cloud.points, cloud.point_weights
@@ -315,7 +313,7 @@ def _thin_to_nodes(
     return np.array(nodes).reshape(-1, 3), np.array(size), label
 
 
-def _near(points: Array, centre: Array, options: SkeletonOptions) -> Integers:
+def _near(points: Array, centre: Array, options: SkeletonOptions) -> IntArray:
     """The nearest points of a centre within the radius, no more than a segment has."""
     away = points - centre
     square = np.einsum("ij,ij->i", away, away)
@@ -326,7 +324,7 @@ def _near(points: Array, centre: Array, options: SkeletonOptions) -> Integers:
     return np.flatnonzero(square <= within)
 
 
-def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[Integers, Integers]:
+def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[IntArray, IntArray]:
     """The shortest edges that connect nodes to their nearest neighbours, and the connected part of each node."""
     count = len(nodes)
     if count < 2:

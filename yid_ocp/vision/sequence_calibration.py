@@ -19,16 +19,13 @@ from typing import Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, nearest_on_tubes
 from yid_ocp.vision.surface_meshes import tube_sizes
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 _NOISE_STDS = 3.0  # of a point, within which it is the background's
 _MOST = 0.5  # of the frames, in which what stands still must be seen: arm and object hide it from time to time
@@ -50,7 +47,7 @@ class BackgroundPoints:
     def _tree(self) -> cKDTree:
         return cKDTree(self.points)
 
-    def contains(self, points: Array, beyond: float = 0.0) -> Mask:
+    def contains(self, points: Array, beyond: float = 0.0) -> BoolArray:
         """Whether points, shape (N, 3), lie within `match_distance + beyond` [m] of the background, shape (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
@@ -201,12 +198,12 @@ class DimensionCheck:
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
-    def is_determined(self) -> Mask:
+    def is_determined(self) -> BoolArray:
         """Which dimensions the frames determine, shape (2 s,)."""
         return np.asarray((self.log_ratio_std < _KNOWN) & (self.n_frames > 0))
 
     @property
-    def is_contradicted(self) -> Mask:
+    def is_contradicted(self) -> BoolArray:
         """Which of the model's values contradict the frames, shape (2 s,)."""
         return np.asarray(self.is_determined & (np.abs(self.log_ratio) > _SIGMAS * self.log_ratio_std))
 

@@ -13,19 +13,16 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.vision.frames import OcclusionMap
 from yid_ocp.vision.initial_shapes import EndAnchor
 from yid_ocp.vision.point_cloud import weighted_median
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-_FilteredOutTest = Callable[[Array], Mask]
+_FilteredOutTest = Callable[[Array], BoolArray]
 
 _AWAY = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
 _STATIONS = 6  # per link at least, where it is asked whether points are near
@@ -52,7 +49,7 @@ class TubeLinks:
 
 def nearest_on_tubes(
     corners: Array, radius: Array, points: Array, share: float = 1.0
-) -> tuple[Integers, Array, Array, Array]:
+) -> tuple[IntArray, Array, Array, Array]:
     """Nearest place on tubes of links (K, 2, 3) and radii (K,) for points (N, 3) that lie at a share of the radius [m].
 
     Index of the link and place along it from 0 to 1, both (N,), unit vectors (N, 3) from the centre line to the points,
@@ -72,7 +69,7 @@ def nearest_on_tubes(
     return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
 
 
-def _faces_away_from_camera(normal: Array, sight: Array) -> Mask:
+def _faces_away_from_camera(normal: Array, sight: Array) -> BoolArray:
     """Whether surface normals (N, 3) face away from the camera, by lines of sight (N, 3)."""
     return np.asarray(np.einsum("ij,ij->i", normal, sight) > -_AWAY * np.linalg.norm(sight, axis=1))
 
@@ -112,9 +109,9 @@ class ShapeEvidence(ShapeQuality):
     """Classification of a frame's points by a shape, and how much of the shape they cover."""
 
     # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
-    is_own: Mask
-    is_contested: Mask
-    is_foreign: Mask
+    is_own: BoolArray
+    is_contested: BoolArray
+    is_foreign: BoolArray
     excess_variance: Array  # (K,), variance across each link beyond that of its tube [m^2]
 
 
@@ -142,7 +139,7 @@ class CloudObservation:
             return math.inf
         return max(float(np.median(self._point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)
 
-    def is_hidden(self, places: Array, radius: Array, margin: float) -> Mask:
+    def is_hidden(self, places: Array, radius: Array, margin: float) -> BoolArray:
         """Whether places are hidden from the camera or removed by filters, shape (S,)."""
         hidden = np.zeros(len(places), bool)
         if self.occlusion_map is not None:
@@ -202,7 +199,7 @@ def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> Shape
     )
 
 
-def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[Mask, Mask]:
+def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[BoolArray, BoolArray]:
     """Which nodes (K,), and points (N,) nearest to them, lie where the surface is as narrow as a tube of a radius [m].
 
     About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
@@ -219,7 +216,7 @@ def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[
     return thin, thin[cKDTree(sight.skeleton_nodes).query(sight.points)[1]]
 
 
-def _things(tree: cKDTree, chosen: Mask, within: float, least: float) -> Integers:
+def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> IntArray:
     """Connected parts of some of the points that are large enough, the largest 0; -1 for all other points."""
     part, index = np.full(len(chosen), -1), np.flatnonzero(chosen)
     if not len(index):
@@ -236,7 +233,7 @@ def _things(tree: cKDTree, chosen: Mask, within: float, least: float) -> Integer
     return part
 
 
-def _contacts(tree: cKDTree, seen: CloudObservation, shape: Mask, foreign: Mask, within: float) -> Mask:
+def _contacts(tree: cKDTree, seen: CloudObservation, shape: BoolArray, foreign: BoolArray, within: float) -> BoolArray:
     """Points of the shape from which a thing's surface goes on, nearly as dense as the shape's."""
     contact = np.zeros(len(shape), bool)
     if not foreign.any():
@@ -250,7 +247,7 @@ def _contacts(tree: cKDTree, seen: CloudObservation, shape: Mask, foreign: Mask,
 
 
 def _coverage(
-    tubes: TubeLinks, seen: CloudObservation, own: Mask, link: Integers, along: Array, gate: float
+    tubes: TubeLinks, seen: CloudObservation, own: BoolArray, link: IntArray, along: Array, gate: float
 ) -> tuple[Array, Array]:
     """Shares of each link that have own points, and that visibly have none."""
     lengths = np.linalg.norm(tubes.link_ends[:, 1] - tubes.link_ends[:, 0], axis=1)
@@ -269,7 +266,7 @@ def _coverage(
     return np.bincount(owner, filled) / count, np.bincount(owner, empty) / count
 
 
-def _swath(tubes: TubeLinks, seen: CloudObservation, counted: Mask, link: Integers, offset: Array) -> Array:
+def _swath(tubes: TubeLinks, seen: CloudObservation, counted: BoolArray, link: IntArray, offset: Array) -> Array:
     """Variance of points across each link, seen from the camera, beyond that of a tube of its radius."""
     edge = tubes.link_ends[:, 1] - tubes.link_ends[:, 0]
     across = np.cross(edge, tubes.link_ends.mean(axis=1) - seen.camera_position)
@@ -281,7 +278,7 @@ def _swath(tubes: TubeLinks, seen: CloudObservation, counted: Mask, link: Intege
     return np.maximum(total / np.maximum(weight, 1e-12) - tubes.radius**2 / 3, 0.0)
 
 
-def _end_offset(tubes: TubeLinks, link: int, seen: CloudObservation, gate: float) -> tuple[float, Mask]:
+def _end_offset(tubes: TubeLinks, link: int, seen: CloudObservation, gate: float) -> tuple[float, BoolArray]:
     """Where points end along the axis of a tube's last link, from its tip [m], NaN where that cannot be seen.
 
     And which points lie about the axis between the tip and there.
@@ -317,8 +314,8 @@ _RIM = 0.85  # of the radius to either side, within which a tube's depth is comp
 class _SurfaceResiduals:
     """Signed distances of points from the tubes' surface, with derivatives."""
 
-    point_indices: Integers
-    link_indices: Integers
+    point_indices: IntArray
+    link_indices: IntArray
     signed_distance: Array
     jacobian_by_link_ends: Array
     derivative_by_radius: Array
@@ -387,7 +384,7 @@ class FrameShapeFit(ShapeQuality):
     point_positions: Array  # (np, 3), the system's points there [m]
     point_std: Array  # (np, 3), standard deviation of each coordinate by the curvature of the cost [m]
     # (np,), whether there are points enough about each of the system's points, or a gripper that holds it
-    is_point_seen: Mask
+    is_point_seen: BoolArray
     grasp_gaps: Array  # (grasps, 3), from what each gripper holds to the gripper [m]
     # share of the points on the shape that may belong to a thing which touches it; they are left out
     contested_fraction: float

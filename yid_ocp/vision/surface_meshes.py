@@ -15,6 +15,7 @@ import numpy as np
 from annotated_types import Gt
 from numpy.typing import ArrayLike, NDArray
 
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
 from yid_ocp.files import is_file
 from yid_ocp.model.kinematics import forward_kinematics
@@ -25,9 +26,6 @@ from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.options import OptionInfo, PositiveFloat
 from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 MeshKind = Literal["visual", "collision"]
 _Triple = tuple[float, float, float]
 
@@ -74,7 +72,7 @@ class TriangleMesh:
     """Triangles: `vertices` (V, 3) [m], `faces` (F, 3) indices."""
 
     vertices: Array
-    faces: Integers
+    faces: IntArray
 
     def transformed(self, pose: ArrayLike) -> TriangleMesh:
         """Mesh transformed by a pose, shape (4, 4)."""
@@ -129,7 +127,7 @@ class _Cells:
         """Distance of points of the part's frame to its surface, shape (N,) [m]."""
         return np.asarray(self._scene.compute_distance(_tensor(points), nthreads=1).numpy().astype(np.float64))
 
-    def within(self, points: Array, reach: float) -> Mask:
+    def within(self, points: Array, reach: float) -> BoolArray:
         """Which points are no further than `reach` [m], shape (N,)."""
         cell = np.floor((points - self._origin) / _CELL).astype(np.int64) + _CELLS // 2
         key = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
@@ -179,7 +177,7 @@ class ArticulatedSurfaces:
         stacked = np.array(self._poses(np.asarray(q, float)))
         return np.asarray(stacked.reshape(4, len(self.part_joints), 4).transpose(1, 0, 2))
 
-    def _near(self, points: Array, part: int, pose: Array, margin: float) -> tuple[Integers, Array]:
+    def _near(self, points: Array, part: int, pose: Array, margin: float) -> tuple[IntArray, Array]:
         """Points of the world in a part's box, widened by a margin [m]: their indices, and they in the part's frame."""
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         (low, high), inside = self._boxes[part], np.ones(len(local), bool)
@@ -188,7 +186,7 @@ class ArticulatedSurfaces:
         near = np.flatnonzero(inside)
         return near, local[near]
 
-    def is_within_distance(self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False) -> Mask:
+    def is_within_distance(self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False) -> BoolArray:
         """Whether world points (N, 3) lie within `reach` [m] of a surface at a configuration (n,), shape (N,).
 
         No distance differs from that of a place by more than the way there: the cell in which a point lies, whose
@@ -203,7 +201,7 @@ class ArticulatedSurfaces:
                     result[asked[near]] = self._cells[part].within(local, reach)
         return result
 
-    def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, Integers]:
+    def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
         """Nearest moving surface of world points: distance (N,) [m], unit normal (N, 3) towards the point, part (N,).
 
         Beyond `within` [m] they are infinite, zero and -1.
@@ -230,7 +228,7 @@ class ArticulatedSurfaces:
 
     def render_depth_image(
         self, pinhole: CameraIntrinsics, pose: ArrayLike, q: ArrayLike
-    ) -> tuple[Array, Array, Integers]:
+    ) -> tuple[Array, Array, IntArray]:
         """Noise-free depth along the optical axis [m], cosine of incidence and surface part of each pixel.
 
         All have shape (height, width): infinite, 0 and -1 where there is nothing. `pose` (4, 4) is in the world.
@@ -252,7 +250,7 @@ class ArticulatedSurfaces:
                 image[window] = np.where(nearer, own, image[window])
         return depth, cosine, owner
 
-    def intersect_rays(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, Integers]:
+    def intersect_rays(self, origin: Array, directions: Array, q: ArrayLike) -> tuple[Array, Array, IntArray]:
         """First intersection of rays from one place (3,) in the world along directions (N, 3) with any surface.
 
         Distances (N,) in lengths of the directions, unit normals (N, 3) towards the origin, and parts (N,); infinite,

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
 from yid_ocp.model.system import System
@@ -66,10 +66,8 @@ from yid_ocp.vision.surface_meshes import (
 )
 from yid_ocp.vision.track_result import FrameReport, FrameStages, TrackResult
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 _ProgressCallback = Callable[[int, int, str], None]
-_Given = tuple[Array, OcclusionMap, Callable[[Array], Mask]]
+_Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
 
 _ASKED = 8  # frames, at most, that are asked about the object's sizes
 _SOME = 2000  # points that tell how far away a cloud is
@@ -287,12 +285,12 @@ class FrameTracker:
 
     def _removed(
         self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
-    ) -> Callable[[Array], Mask]:
+    ) -> Callable[[Array], BoolArray]:
         """Which places the filters leave no points of, the robot at a configuration."""
         is_inside = self.object_region.membership_at(q, calibration.camera_position)
         within = self.options.filters.robot_padding + self._widest
 
-        def removed(places: Array) -> Mask:
+        def removed(places: Array) -> BoolArray:
             gone = ~is_inside(places) | background.contains(places, self._widest)
             if self.robot_surfaces is not None:
                 gone |= self.robot_surfaces.is_within_distance(places, q, within)
@@ -301,10 +299,10 @@ class FrameTracker:
         return removed
 
     @staticmethod
-    def _finite(sequence: FrameSequence, index: int) -> tuple[Array, Mask]:
+    def _finite(sequence: FrameSequence, index: int) -> tuple[Array, BoolArray]:
         """A frame's finite points in the camera's frame, and which of all its points they are."""
         points = sequence.load_cloud(index)
-        finite: Mask = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
+        finite: BoolArray = np.isfinite(points[:, 0] + points[:, 1] + points[:, 2])
         points = points if finite.all() else points[finite]
         if not len(points):
             raise DataError("the cloud is empty")

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import PointGroup, Recording, validate_recording
 from yid_ocp.errors import OutputError
 from yid_ocp.files import atomic_write
@@ -22,8 +22,6 @@ from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.point_cloud import CloudSkeleton
 from yid_ocp.vision.sequence_calibration import DimensionCheck, ForeignObject
 from yid_ocp.vision.shape_evidence import FrameShapeFit
-
-Array = NDArray[np.float64]
 
 _CAMERA_POINT_GROUP = "points_camera"
 

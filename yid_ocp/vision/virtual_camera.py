@@ -14,10 +14,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.rotations import homogeneous_transform
 from yid_ocp.vision.frames import XTION_INTRINSICS, CameraIntrinsics, FrameSequence, validated_pose
@@ -29,8 +30,6 @@ from yid_ocp.vision.surface_meshes import (
     numeric_mechanism,
     tube_meshes_by_joint,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ class DepthCamera:
         lost |= self._shadow(far)
         return np.where(lost, np.nan, measured)
 
-    def _shadow(self, depth: Array) -> NDArray[np.bool_]:
+    def _shadow(self, depth: Array) -> BoolArray:
         """Pixels that the projector, on the camera's left, does not reach: another one of its line is nearer."""
         if self.baseline <= 0:
             return np.zeros(depth.shape, bool)

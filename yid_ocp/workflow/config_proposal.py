@@ -10,9 +10,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import quantization_step, white_noise_std
 from yid_ocp.data.readers import mean_sample_rate
-from yid_ocp.data.recording import Array, JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics

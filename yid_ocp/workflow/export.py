@@ -10,8 +10,8 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ParameterSettings, RunSettings, dump_config
 from yid_ocp.data import read_recording
@@ -51,7 +51,6 @@ _PREDICTION_TOPICS: Mapping[str, Mapping[str, str]] = {
 """Arrays of a sensor's group, and the first part of the topics that tell them."""
 _RESERVED_GROUPS = ("where", "events", "unknowns", "recordings")
 _UNKNOWN_SHAPES: Mapping[str, Any] = {"push": "wrench", "offset": "vector", "bias": "vector"}  # by kind of unknown
-Array = NDArray[np.float64]
 
 
 def run(arguments: argparse.Namespace) -> int:

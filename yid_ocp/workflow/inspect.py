@@ -11,7 +11,6 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.sparsity_patterns import (
     SparsityPattern,
@@ -29,6 +28,7 @@ from yid_ocp.analysis.step_diagnostics import (
     step_structure,
 )
 from yid_ocp.analysis.step_symbols import EquationEntry, StepSymbols
+from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.hdf5_io import create_hdf5_atomically
 from yid_ocp.errors import ModelError
@@ -50,7 +50,6 @@ _RESULT_FORMAT = "yid-inspect/1"
 _SHOWN_STEPS = 2  # of the NLP in its picture: what comes after looks the same
 _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
 _PARAMETER_KEYS = ("value", "unit", "lower", "upper", "description")
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

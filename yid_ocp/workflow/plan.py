@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.hdf5_io import open_checked_hdf5
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
@@ -38,7 +38,6 @@ from yid_ocp.workflow.run_inputs import locate_errors, read_recordings
 _RESULT_FORMAT = "yid-plan/1"
 _EFFORT_STD, _POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
 _MAX_DISCRIMINATED_EFFECTS = 3  # effects that one motion is asked to separate, the likeliest ones
-Array = NDArray[np.float64]
 
 
 def run(arguments: argparse.Namespace) -> int:

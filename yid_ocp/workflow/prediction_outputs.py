@@ -9,8 +9,9 @@ from typing import Any
 
 import h5py
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.hdf5_io import create_hdf5_atomically
 from yid_ocp.data.issues import MAX_LIMIT_RATIO, Issue
 from yid_ocp.diagnosis import DiagnosisResult
@@ -22,8 +23,6 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.report.animation import ModelTrajectory
 from yid_ocp.solvers import Solution
-
-Array = NDArray[np.float64]
 
 _WORSE_RATIO = 1.05  # two errors nearer than that are alike
 _START_FRAMES = 2  # frames from which the baselines of a cable start, as its own start state does
@@ -314,9 +313,7 @@ def _file(path: Path, form: str) -> Iterator[h5py.File]:
         yield file
 
 
-def _store_sensor(
-    parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, NDArray[np.float64]]
-) -> None:
+def _store_sensor(parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, Array]) -> None:
     group = parent.create_group(samples.sensor.group_name)
     _store_texts(group, {"channels": samples.sensor.channel_names})
     group.attrs["unit"] = samples.sensor.unit

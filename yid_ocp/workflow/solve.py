@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from yid_ocp.analysis.clock_checks import check_fit_residuals
 from yid_ocp.analysis.compare import CableMemoryDecision, decide_cable_memory
@@ -23,6 +22,7 @@ from yid_ocp.analysis.discretisation import (
     largest_error_growth,
 )
 from yid_ocp.analysis.profile import with_profile_intervals
+from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
 from yid_ocp.data.recording import Recording
@@ -49,7 +49,6 @@ from yid_ocp.workflow.prediction_outputs import (
 )
 from yid_ocp.workflow.run_folder import RunFolder, new_run_folder
 
-Array = NDArray[np.float64]
 _Refinement = Literal["links", "time_step"]
 
 _MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time

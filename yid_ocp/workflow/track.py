@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import OutputSettings, RecordingSettings, RunSettings, VirtualFramesSettings, dump_config
@@ -46,7 +45,6 @@ from yid_ocp.workflow.run_inputs import locate_errors, recording_path
 
 _RESULT_FORMAT = "yid-track/1"
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
-Array = NDArray[np.float64]
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.readers.base import (
     PREVIEWS,
     READERS,
@@ -26,7 +27,7 @@ from yid_ocp.data.readers.base import (
     parse_renamings,
     zero_order_hold,
 )
-from yid_ocp.data.recording import Array, JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import file_sha256
 from yid_ocp.progress import NULL_PROGRESS, Progress

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, Array, JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.arrays import Array, BoolArray
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.registry import Registry
 
@@ -310,7 +310,7 @@ def zero_order_hold(group: JointGroup, t: Array) -> Array:
     return group.position[np.maximum(np.searchsorted(group.t, t + 1e-9, side="right") - 1, 0)]
 
 
-def _can_interpolate(known: Array, t: Array) -> NDArray[np.bool_]:
+def _can_interpolate(known: Array, t: Array) -> BoolArray:
     """Whether each time is a sample or lies between two samples close enough to interpolate."""
     after = np.searchsorted(known, t)
     before = np.searchsorted(known, t, side="right") - 1

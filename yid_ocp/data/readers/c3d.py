@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.hdf5_io import check_readable_in_fork
 from yid_ocp.data.readers.base import (
     PREVIEWS,
@@ -22,7 +22,7 @@ from yid_ocp.data.readers.base import (
     FileSource,
     convert_to_si_and_validate,
 )
-from yid_ocp.data.recording import Array, PointGroup, Recording
+from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.files import file_sha256
 
@@ -82,7 +82,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> FileContents:
     file_sha256(path)
     found = _markers(path)
     rate = 1.0 / float(found.t[1] - found.t[0]) if len(found.t) > 1 else math.nan
-    seen: NDArray[np.bool_] = np.asarray(np.isfinite(found.position).all(axis=2))
+    seen: BoolArray = np.asarray(np.isfinite(found.position).all(axis=2))
     sources = [
         FileSource(
             name,
@@ -124,7 +124,7 @@ def _markers(path: Path) -> _Markers:
     if unit and unit not in _UNITS:
         raise DataError(f"the unit of the markers is '{unit}'", where=str(path), allowed=", ".join(_UNITS))
     position = position[:, : len(labels)]
-    unseen: NDArray[np.bool_] = np.asarray(
+    unseen: BoolArray = np.asarray(
         (residuals[:, : len(labels)] < 0) | (position == 0).all(axis=2) | ~np.isfinite(position).all(axis=2)
     )
     position[unseen] = np.nan

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.readers.base import (
     PREVIEWS,
     READERS,
@@ -24,7 +25,7 @@ from yid_ocp.data.readers.base import (
     guess_units,
     mean_sample_rate,
 )
-from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, Array, ClockKind, JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, ClockKind, JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import file_sha256
 

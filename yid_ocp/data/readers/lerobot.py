@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.readers.base import (
     PREVIEWS,
     READERS,
@@ -21,7 +22,7 @@ from yid_ocp.data.readers.base import (
     convert_to_si_and_validate,
     guess_units,
 )
-from yid_ocp.data.recording import Array, JointGroup, Recording
+from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.files import file_sha256
 

@@ -10,8 +10,8 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
@@ -113,8 +113,6 @@ def _dealt(count: int, parts: Mapping[_Key, float]) -> dict[_Key, int]:
         found[key] += 1
     return found
 
-
-Array = NDArray[np.float64]
 
 MAX_CASE_DRAWS = 64
 """Motions, objects and effects drawn for a case until one can be simulated; of 300, one was given up after eight."""

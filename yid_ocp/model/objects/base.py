@@ -11,8 +11,9 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol, runtime_checkabl
 
 import numpy as np
 from annotated_types import Ge, Le
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
 from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
 from yid_ocp.model.rotations import transform_from_xyz_rpy
@@ -20,7 +21,6 @@ from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.registry import Registry
 
-Array = NDArray[np.float64]
 START_CLAMP, END_CLAMP = "clamp_start", "clamp_end"
 _Vector3 = tuple[float, float, float]
 _STANDARD_GRAVITY = 9.81

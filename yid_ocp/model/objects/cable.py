@@ -25,8 +25,8 @@ from typing import Annotated, ClassVar, Literal
 import casadi as ca
 import numpy as np
 from annotated_types import Ge, Gt, Le, Len
-from numpy.typing import NDArray
 
+from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, ModelError, nearest_name_hint
 from yid_ocp.model.flexible import UNIT_AXES, ElasticJoint, FlexibleObject, Segment, flexible_object, polyline_rotations
 from yid_ocp.model.mechanism import Frame, LinkChain, Mechanism, Placement
@@ -38,7 +38,6 @@ from yid_ocp.model.rotations import symbolic_axis_rotation
 from yid_ocp.model.system import Grasp, System, floating_clamp
 from yid_ocp.options import OptionInfo
 
-Array = NDArray[np.float64]
 _Vector3 = tuple[float, float, float]
 _START_ROLL_PARAMETER, _END_ROLL_PARAMETER = f"{_START_CLAMP}.roll", f"{_END_CLAMP}.roll"
 _REST_ANGLE_SUFFIX = ".rest"

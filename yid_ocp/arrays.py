@@ -1,0 +1,10 @@
+"""NumPy arrays by what they hold: numbers, whole numbers or truth values."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
