@@ -300,6 +300,8 @@ ANY_NUMBER = {
     "plan.start_joint_positions.NAME",
     "import.torque_constants.NAME",
     "import.gears.NAME",
+    "sensors.NAME.constants.NAME",
+    "sensors.NAME.constants.NAME.NAME",
     "model.arms.locked_joints.NAME",
     "model.springs.NAME.rest_position",
     "model.effects.values.NAME",
