@@ -197,7 +197,7 @@ def test_drag_of_a_turning_link() -> None:
 
 def rest_of(system: System, *effects):
     step = compile_step(system.with_effects(effects), H, use_compiler=False)
-    rest = EquilibriumSolver(step).solve([], step.system.parameters.vector(), tolerance=1e-9)
+    rest = EquilibriumSolver(step).solve([], step.system.parameters.vector())
     assert rest.is_converged
     return step, rest
 
