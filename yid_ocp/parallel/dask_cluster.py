@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import importlib
 import logging
 import secrets
@@ -39,17 +40,21 @@ def dask_executor(
         raise WorkerError(what, where="--scheduler", hint=hint) from error
     path = Path(scheduler).expanduser()
     where = {"scheduler_file": str(path)} if path.is_file() else {"address": scheduler}
+    refusal: WorkerError | None = None
     try:
         client = _client(distributed, where)
-    except AssertionError as error:
+    except AssertionError:
         what = f"Dask's event loop did not start in {_MAX_CLIENT_STARTS} times ten seconds"
         hint = "run it again once this machine is less busy"
-        raise WorkerError(what, where=scheduler, allowed="a machine that has time for it", hint=hint) from error
+        refusal = WorkerError(what, where=scheduler, allowed="a machine that has time for it", hint=hint)
     except (OSError, ValueError, TypeError, LookupError) as error:  # TimeoutError is an OSError
         what = f"no scheduler answers: {next(iter(str(error).splitlines()), type(error).__name__)}"
         allowed = "HOST:PORT of a running `dask scheduler`, or the path of its scheduler file"
         hint = "start one with `dask scheduler` and workers with `dask worker HOST:PORT --nthreads 1`"
-        raise WorkerError(what, where=scheduler, allowed=allowed, hint=hint) from error
+        refusal = WorkerError(what, where=scheduler, allowed=allowed, hint=hint)
+    if refusal is not None:
+        gc.collect()  # a half-built client that is finalized while another one starts makes both wait for ever
+        raise refusal
 
     def look() -> None:
         if not client.nthreads():
@@ -71,6 +76,7 @@ def _client(distributed: Any, where: dict[str, str]) -> Any:
             if attempt == _MAX_CLIENT_STARTS:
                 raise
             log.info("Dask's event loop did not start; it is tried again")
+        gc.collect()
     return None
 
 
