@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 import yid_ocp as yid
-from yid_ocp.data.channel_checks import median_edge_lengths
+from yid_ocp.data.channel_checks import median_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.model.objects.base import CableTopology
@@ -33,8 +33,8 @@ from yid_ocp.model.objects.cable import (
     CableBranchOptions,
     CableOptions,
     cable_system,
-    edge_length_parameters,
-    estimable_parameters,
+    edge_length_parameter_values,
+    estimable_parameter_names,
     read_vertex_positions,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -42,7 +42,7 @@ from yid_ocp.problem.prediction_errors import (
     clamp_displacement_baseline,
     constant_position_baseline,
     interpolated_displacement_baseline,
-    measured_positions,
+    measured_point_positions,
     point_rmse_by_recording,
     position_rmse,
 )
@@ -72,12 +72,15 @@ def branched_cable(folder: Path = FOLDER) -> CableTopology:
 
 def cable_options(cable: CableTopology, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
     """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
-    known = {r.name: edge_length_parameters(cable, median_edge_lengths(cable.edges, [r], 2)) for r in recordings}
-    names = [name for name in estimable_parameters(cable, options) if name.endswith(".rest")]
+    known = {
+        r.name: edge_length_parameter_values(cable, median_point_pair_distances(cable.edges, [r], 2))
+        for r in recordings
+    }
+    names = [name for name in estimable_parameter_names(cable, options) if name.endswith(".rest")]
     return ProblemOptions(
         initial_state="fitted_to_points",
         path_cutoff=8.0,
-        sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.free_vertices)},
+        sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.free_vertex_names)},
         clamp_paths=cable.clamp_paths,
         prior_stds=dict.fromkeys(names, 0.2),
         start_fit_window=TIME_STEP,
@@ -89,12 +92,12 @@ def cable_options(cable: CableTopology, recordings: list[Recording], options: Ca
 
 def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
     """Prediction errors without a model [m]."""
-    free, measured = cable.free_vertices, measured_positions(recording, cable.free_vertices)
+    free, measured = cable.free_vertex_names, measured_point_positions(recording, cable.free_vertex_names)
     predictions = {
         "stay": constant_position_baseline(recording, free),
-        "move_with_clamps": clamp_displacement_baseline(recording, free, cable.clamped_vertices),
+        "move_with_clamps": clamp_displacement_baseline(recording, free, cable.clamped_vertex_names),
         "linear_carry": interpolated_displacement_baseline(
-            recording, free, cable.parent_vertices, cable.child_vertices, cable.clamped_vertices
+            recording, free, cable.parent_vertices, cable.child_vertices, cable.clamped_vertex_names
         ),
     }
     return {name: position_rmse(predicted, measured) for name, predicted in predictions.items()}
@@ -106,17 +109,17 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     recordings = {name: read_recording(folder / f"bdlo1_train_{name}.h5") for name in (*ESTIMATE, *HELD_OUT)}
     estimate, held_out = [recordings[n] for n in ESTIMATE], [recordings[n] for n in HELD_OUT]
     clock = time.perf_counter()
-    system = cable_system(median_edge_lengths(cable.edges, estimate), cable, OPTIONS)
+    system = cable_system(median_point_pair_distances(cable.edges, estimate), cable, OPTIONS)
     step = yid.compile_step(system, TIME_STEP)
     seconds = {"build_and_compile": time.perf_counter() - clock}
     options = cable_options(cable, estimate + held_out, OPTIONS)
     plain = {name: 0.0 for name in system.parameters.names if name.endswith(".memory")}
-    names = estimable_parameters(cable, CableOptions(default_branch=BRANCH))
+    names = estimable_parameter_names(cable, CableOptions(default_branch=BRANCH))
     undeformed = EstimationProblem(step, estimate, names, replace(options, prior_stds={}), plain, held_out)
-    problem = EstimationProblem(step, estimate, estimable_parameters(cable, OPTIONS), options, None, held_out)
+    problem = EstimationProblem(step, estimate, estimable_parameter_names(cable, OPTIONS), options, None, held_out)
     clock = time.perf_counter()
-    nominal = point_rmse_by_recording(undeformed, undeformed.initial_unknowns, cable.free_vertices)
-    point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertices)
+    nominal = point_rmse_by_recording(undeformed, undeformed.initial_unknowns, cable.free_vertex_names)
+    point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)
     seconds["starts"] = time.perf_counter() - clock
     episode, (theta, offset) = problem.episodes[0], problem.split(problem.initial_unknowns, 0)
     clock = time.perf_counter()
@@ -125,11 +128,11 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     clock = time.perf_counter()
     solution = solve(problem, GaussNewton(max_iterations=iterations))
     seconds["fit"] = time.perf_counter() - clock
-    fitted = point_rmse_by_recording(problem, solution.x, cable.free_vertices)
+    fitted = point_rmse_by_recording(problem, solution.x, cable.free_vertex_names)
     clock = time.perf_counter()
     simple = solve(undeformed, GaussNewton(max_iterations=iterations))
     seconds["fit_undeformed_rest"] = time.perf_counter() - clock
-    by_simple = point_rmse_by_recording(undeformed, simple.x, cable.free_vertices)
+    by_simple = point_rmse_by_recording(undeformed, simple.x, cable.free_vertex_names)
     files = {}
     for recording in (*estimate, *held_out):
         errors = baselines(recording, cable)
@@ -146,7 +149,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
         "format": "yid-cable/1",
         "unit": "m",
         "given": "held vertices throughout, free vertices in the first two frames",
-        "free_vertices": list(cable.free_vertices),
+        "free_vertices": list(cable.free_vertex_names),
         "files": files,
         "held_out_median": medians([entry for entry in files.values() if entry["held_out"]]),
         "parameters": parameters(cable, solution.x, solution.covariance, problem.unknown_names),
@@ -171,7 +174,7 @@ def parameters(cable: CableTopology, x: Any, covariance: Any, names: tuple[str, 
     for i, name in enumerate(names):
         branch, _, quantity = name.partition(".")
         result[name] = {"value": float(x[i]), "std": float(covariance[i, i]) ** 0.5}
-        if branch in cable.branch_vertices and quantity in units:
+        if branch in cable.branch_vertex_names and quantity in units:
             weight = OPTIONS.branches.get(branch, OPTIONS.default_branch).linear_density * GRAVITY
             result[name] |= {"per_weight": float(x[i]) / weight, "per_weight_unit": units[quantity]}
     return result

@@ -38,11 +38,16 @@ from yid_ocp.files import json_sha256, write_json
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.summaries import solve_summary
-from yid_ocp.report.terminal import aligned_table_lines, terminal_lines
+from yid_ocp.report.terminal import aligned_table_lines, summary_terminal_lines
 from yid_ocp.sensors.base import EffortKind
 from yid_ocp.version import source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
-from yid_ocp.virtual.joint_motion import MultisineMotion, MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.joint_motion import (
+    MultisineMotion,
+    MultisineOptions,
+    grasping_joint_angles,
+    random_multisine_motion,
+)
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.workflow.solve import run_solve
 
@@ -179,7 +184,7 @@ def gentle_enough(
     trial = replace(simulation, time_step=TRIAL_STEP)
     for _ in range(ATTEMPTS):
         seed = int(rng.integers(2**31))
-        motion = random_multisine(system, truth, seed=seed, initial_joint_angles=posture, excitation=excitation)
+        motion = random_multisine_motion(system, truth, seed=seed, initial_joint_angles=posture, excitation=excitation)
         if within_limits(system, simulate_in_mujoco(system, truth, motion, trial, initial_joint_angles=posture)):
             return motion, seed
     raise ModelError(f"none of {ATTEMPTS} motions stays within the limits", hint="let the arms travel less")
@@ -207,7 +212,7 @@ def solve_twin(config: Path, recording: Path, settings: Sequence[str]) -> dict[s
             for name, entry in result["parameters"].items()
             if entry["free"]
         },
-        "diagnose": any("diagnose" in line for line in terminal_lines(solve_summary(result))),
+        "diagnose": any("diagnose" in line for line in summary_terminal_lines(solve_summary(result))),
     }
 
 

@@ -26,15 +26,15 @@ from make_recordings import TRAVEL, TRUTH
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
-from yid_ocp.diagnosis.blind import finer_chain_parameters
+from yid_ocp.diagnosis.blind import scale_parameters_to_more_links
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.verdict import failed_transfer_checks
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import VirtualExperiment
-from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
 
@@ -149,9 +149,9 @@ def record(case: Case, motion_seed: int, noise_seed: int) -> Recording:
     nominal = build_system(run)
     links = len(nominal.segment_layouts[0].link_joints) * case.links
     system = nominal if case.links == 1 else build_system(run, links)
-    values = TRUTH if case.links == 1 else finer_chain_parameters(nominal, system, TRUTH)
+    values = TRUTH if case.links == 1 else scale_parameters_to_more_links(nominal, system, TRUTH)
     posture = grasping_joint_angles(nominal, TRUTH)
-    motion = random_multisine(
+    motion = random_multisine_motion(
         nominal,
         TRUTH,
         seed=motion_seed,
@@ -161,7 +161,7 @@ def record(case: Case, motion_seed: int, noise_seed: int) -> Recording:
     experiment = VirtualExperiment(
         motion=motion, initial_joint_angles=posture, seed=noise_seed, recording_name=f"motion_{motion_seed}"
     )
-    return run_injected_experiment(system, values, case.withheld, experiment)
+    return run_experiment_with_effects(system, values, case.withheld, experiment)
 
 
 def found(name: str, seeds: Sequence[int], truth: bool = True) -> tuple[DiagnosisResult, float, float]:

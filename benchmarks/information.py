@@ -33,10 +33,10 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
-from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import LineProgress
+from yid_ocp.workflow.command_runner import StderrLineProgress
 from yid_ocp.workflow.plan import parameter_and_effect_values
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.yaml"
@@ -55,7 +55,7 @@ NOISE_SEED = 500
 def recorded(plan: InformativeMotionPlan, seed: int) -> Recording:
     """The planned motion as the virtual robot carries it out and its sensors see it."""
     movement = PlannedMovement(plan.joint_names, plan.simulator.path, plan.spline_coefficients)
-    posture = dict(zip(plan.joint_names, map(float, plan.simulator.start_positions), strict=True))
+    posture = dict(zip(plan.joint_names, map(float, plan.simulator.moved_joint_start_positions), strict=True))
     simulation = replace(ROUGH.simulation, duration=float(plan.t[-1]))
     experiment = VirtualExperiment(
         motion=movement, initial_joint_angles=posture, simulation=simulation, arm_noise=ROUGH.noise(1),
@@ -69,7 +69,9 @@ def parameter(starts: int, recordings: int) -> None:
     problem = build_problem(load_config(CONFIG))
     solution = solve(problem, GaussNewton(cost_tolerance=1e-5))
     values = {name: entry.value for name, entry in solution.parameters.items() if name in problem.free}
-    plan = plan_informative_motion(problem, replace(OPTIONS, n_random_starts=starts), values, None, LineProgress())
+    plan = plan_informative_motion(
+        problem, replace(OPTIONS, n_random_starts=starts), values, None, StderrLineProgress()
+    )
     rows: list[tuple[str, ...]] = [("", SOUGHT, "± std", "of it", "true value off by")]
     rows.append(_row("the configuration's recording, 5 s", solution))
     for i in range(recordings):
@@ -120,17 +122,17 @@ def pair(name: str, starts: int, share: float) -> None:
     planned = []
     for seed in (0, 100):
         options = replace(OPTIONS, identify=None, discriminate=labels, n_random_starts=starts, seed=seed)
-        plan = plan_informative_motion(problem, options, values, sizes, LineProgress())
+        plan = plan_informative_motion(problem, options, values, sizes, StderrLineProgress())
         for (first, second), (then, now) in plan.effect_distances.items():
             print(f"seed {seed}: {first} beside {second}: {then:.3g} std in the recording, {now:.3g} in the plan")
         movement = PlannedMovement(plan.joint_names, plan.simulator.path, plan.spline_coefficients)
-        posture = dict(zip(plan.joint_names, map(float, plan.simulator.start_positions), strict=True))
+        posture = dict(zip(plan.joint_names, map(float, plan.simulator.moved_joint_start_positions), strict=True))
         experiment = VirtualExperiment(
             motion=movement, initial_joint_angles=posture, simulation=SimulationOptions(float(plan.t[-1])),
             seed=NOISE_SEED + seed,
             recording_name=f"planned_{seed}",
         )  # fmt: skip
-        planned.append(run_injected_experiment(baxter_foam_y_system(1), TRUTH, case.withheld, experiment))
+        planned.append(run_experiment_with_effects(baxter_foam_y_system(1), TRUTH, case.withheld, experiment))
     after = _diagnosed(nominal, [made[0], planned[0]], [made[1], planned[1]])
     rivals = [rival.label for rival in after.selected_effects[0].equivalent_effects] if after.accepted_effects else []
     print(f"after: {after.verdict}, {', '.join(rivals)}")
@@ -163,7 +165,7 @@ def _share(effect: InjectedEffect, share: float) -> InjectedEffect:
 
 def _diagnosed(nominal: EstimationProblem, estimate: list[Recording], held_out: list[Recording]) -> DiagnosisResult:
     problem = EstimationProblem(nominal.step, estimate, nominal.free, nominal.options)
-    return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=LineProgress())
+    return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=StderrLineProgress())
 
 
 def main() -> None:

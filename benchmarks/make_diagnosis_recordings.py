@@ -17,11 +17,16 @@ from make_recordings import TRAVEL, TRUTH, compress
 import yid_ocp
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model import Grasp, System, flexible_object
-from yid_ocp.model.objects.foam_y import y_segments
+from yid_ocp.model.objects.foam_y import foam_y_segments
 from yid_ocp.model.rotations import transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
-from yid_ocp.virtual.joint_motion import BAXTER_ARM_JOINTS, MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.joint_motion import (
+    BAXTER_ARM_JOINT_NAMES,
+    MultisineOptions,
+    grasping_joint_angles,
+    random_multisine_motion,
+)
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 TAU = 0.05
@@ -43,8 +48,10 @@ def damped(segment: str, tau: float) -> dict[str, float]:
 
 def experiment() -> System:
     """The paper's single arm, with a damping of its own for the twists of every tube."""
-    names = [f"left_{joint}" for joint in BAXTER_ARM_JOINTS]
-    segments = [replace(segment, damping=NOMINAL_DAMPING, twist_damping=NOMINAL_DAMPING) for segment in y_segments()]
+    names = [f"left_{joint}" for joint in BAXTER_ARM_JOINT_NAMES]
+    segments = [
+        replace(segment, damping=NOMINAL_DAMPING, twist_damping=NOMINAL_DAMPING) for segment in foam_y_segments()
+    ]
     return System.build(
         read_urdf("package:baxter", joints=names),
         objects=[(flexible_object(segments, transform_from_xyz_rpy((0.85, 0.0, -0.93))), None, None)],
@@ -60,7 +67,7 @@ def make(folder: Path) -> None:
     posture = grasping_joint_angles(system, TRUTH)
     for purpose, seed in MOTION_SEEDS.items():
         excitation = MultisineOptions(gripper_travel=TRAVEL[1])
-        motion = random_multisine(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation)
+        motion = random_multisine_motion(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation)
         name = f"diagnosis_{purpose}"
         described = VirtualExperiment(
             motion=motion,

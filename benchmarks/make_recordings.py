@@ -30,7 +30,7 @@ from yid_ocp.virtual.experiment import (
     baxter_foam_y_system,
     run_virtual_experiment,
 )
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult
 
 # the paper's answer for one arm with vision, the only one of its four in which no stiffness is zero, rounded
@@ -111,7 +111,7 @@ ROUGH = Torques(
 
 def within_limits(system: System, run: SimulationResult) -> bool:
     """Whether no arm joint exceeds its torque or velocity, and no joint of the object is as fast as in a snap."""
-    driven = list(system.driven_indices)
+    driven = list(system.driven_coordinate_indices)
     torque = np.array([system.mechanism.joints[j].effort_limit for j in driven])
     speed = np.array([system.mechanism.joints[j].velocity_limit for j in driven])
     of_object = np.setdiff1d(np.arange(system.n_coordinates), driven)
@@ -140,7 +140,9 @@ def make(folder: Path, torques: Torques) -> None:
         for purpose in ("estimate", "held_out"):
             seed = torques.motion_seeds[arms, purpose]
             excitation = MultisineOptions(gripper_travel=torques.travel[arms], shake_torque_rms=torques.shake)
-            motion = random_multisine(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation)
+            motion = random_multisine_motion(
+                system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation
+            )
             for vision in (False, True):
                 name = f"{word}_arm_{'vision' if vision else 'no_vision'}_{purpose}"
                 experiment = VirtualExperiment(

@@ -29,7 +29,7 @@ from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, YidError
 from yid_ocp.solvers import solve
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.run_inputs import recording_path
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 Damage = Callable[[Recording], Recording]
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -285,7 +285,7 @@ def renamed(old: str, new: str) -> Damage:
 
 def other_arm(recording: Recording) -> Recording:
     """The right arm's recording under the left arm's names."""
-    other = read_recording(recording_path("default:dual_arm_vision_held_out.h5"))
+    other = read_recording(resolve_recording_path("default:dual_arm_vision_held_out.h5"))
     group = other.joints
     assert group is not None
     columns = [i for i, name in enumerate(group.names) if name.startswith("right")]
@@ -459,7 +459,7 @@ def clean_recording(case: Case) -> Path | None:
     """The recording that a case damages, None where it is not here."""
     if case.config in REAL:
         return _real(case.config) if _real(case.config).is_file() else None
-    return Path(recording_path(f"default:{case.config}_estimate.h5"))
+    return Path(resolve_recording_path(f"default:{case.config}_estimate.h5"))
 
 
 def prepared(case: Case, folder: Path) -> RunSettings:
@@ -498,8 +498,8 @@ def tried(case: Case, folder: Path, solving: bool = True) -> dict[str, Any]:
     causes = sorted({doubt.cause for doubt in doubts})
     found: list[str] = []
     wrong: list[str] = []
-    if solving and problem.options.has_trusted_data:
-        outcome = solve(problem, run.solver, limits=run.diagnosis.fit_gap_limits)
+    if solving and problem.options.has_no_serious_data_issues:
+        outcome = solve(problem, run.solver, limits=run.diagnosis.null_test_residual_limits)
         verdicts = {name: entry for name, entry in outcome.parameters.items() if entry.verdict == "identifiable"}
         found = list(verdicts)
         truth = problem.episodes[0].recording.true_parameters
@@ -508,7 +508,7 @@ def tried(case: Case, folder: Path, solving: bool = True) -> dict[str, Any]:
         "outcome": "doubted" if doubts else "believed",
         "named": bool(set(causes) & set(case.causes)),
         "causes": causes,
-        "harmless": problem.options.has_trusted_data and bool(doubts),
+        "harmless": problem.options.has_no_serious_data_issues and bool(doubts),
         "found": found,
         "wrong": wrong,
         "doubts": [f"{doubt.where}: {doubt.what}" for doubt in doubts],

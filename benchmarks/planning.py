@@ -32,14 +32,19 @@ from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
-from yid_ocp.planning.joint_paths import FramePositions, SplinePath, solve_end_equilibrium, solve_start_equilibrium
-from yid_ocp.planning.motion_plan import MotionPlan, plan_motion
+from yid_ocp.planning.joint_paths import (
+    FramePositionFunction,
+    SplinePath,
+    solve_end_equilibrium,
+    solve_start_equilibrium,
+)
+from yid_ocp.planning.motion_plan import TargetMotionPlan, plan_motion_to_target
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system
-from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.plan import compile_planning_step, identified_parameters, start_configuration
+from yid_ocp.workflow.plan import compile_step_for_planning, identified_parameters_with_covariance, start_configuration
 from yid_ocp.workflow.solve import run_solve
 
 Array = NDArray[np.float64]
@@ -63,7 +68,7 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
     turned by more than `TRAVEL`.
     """
     system, rng = step.system, np.random.default_rng(11)
-    theta, tip = system.parameters.vector(TRUTH), FramePositions(system, [TIP])
+    theta, tip = system.parameters.vector(TRUTH), FramePositionFunction(system, [TIP])
     posture = grasping_joint_angles(system, TRUTH)
     start = solve_start_equilibrium(step, theta, np.array([posture[name] for name in system.prescribed]))
     begin = tip.positions_and_jacobian(start.state[None, : system.n_coordinates], theta)[0][0]
@@ -74,7 +79,7 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
         end = solve_end_equilibrium(step, theta, start, tip, begin + np.array((x, y, z)), 1e-3)
         if (
             end.target_distance < 1e-4
-            and np.abs(end.joint_positions - start.state[list(system.prescribed_indices)]).max() < TRAVEL
+            and np.abs(end.joint_positions - start.state[list(system.prescribed_coordinate_indices)]).max() < TRAVEL
         ):
             found.append((float(x), float(y), float(z)))
     return found
@@ -98,8 +103,8 @@ class PlannedMovement:
 def straight(step: Step, posture: Array, shift: Array, path: SplinePath) -> PlannedMovement:
     """The gripper along a straight line, its orientation as little changed as the arm allows."""
     system = step.system
-    gripper, n = FramePositions(system, [GRIPPER]), system.n_coordinates
-    joints = list(system.prescribed_indices)
+    gripper, n = FramePositionFunction(system, [GRIPPER]), system.n_coordinates
+    joints = list(system.prescribed_coordinate_indices)
     theta = system.parameters.vector()
 
     def at(x: Array) -> tuple[Array, Array]:
@@ -133,7 +138,7 @@ class Servo:
 
     STIFFNESS, DAMPING = 5e3, 300.0  # [N m/rad], [N m s/rad]
 
-    def __init__(self, movement: PlannedMovement, planned: MotionPlan | None) -> None:
+    def __init__(self, movement: PlannedMovement, planned: TargetMotionPlan | None) -> None:
         self._movement, self._planned = movement, planned
         self._joints, self._first = np.zeros(0, int), np.zeros(0)
         self._kept: tuple[float, Array, Array | None] | None = None
@@ -170,7 +175,11 @@ class Servo:
 
 
 def carried_out(
-    system: System, values: Mapping[str, float], movement: PlannedMovement, planned: MotionPlan | None, by: MotionPlan
+    system: System,
+    values: Mapping[str, float],
+    movement: PlannedMovement,
+    planned: TargetMotionPlan | None,
+    by: TargetMotionPlan,
 ) -> tuple[float, float]:
     """Error [m] and swing [m/s] of a plan's point in the simulator, where the plan begins and as long as it takes."""
     duration, settle = by.simulator.path.duration, by.simulator.hold_duration
@@ -186,7 +195,7 @@ def carried_out(
     return float(np.max(np.linalg.norm(tip - by.target_position, axis=1))), float(np.max(speed))
 
 
-def movement(planned: MotionPlan) -> PlannedMovement:
+def movement(planned: TargetMotionPlan) -> PlannedMovement:
     return PlannedMovement(planned.joint_names, planned.simulator.path, planned.spline_coefficients)
 
 
@@ -205,10 +214,12 @@ def record(folder: Path, noise: int = NOISE, effects: Sequence[InjectedEffect] =
     files = []
     for i, motion_seed in enumerate(MOTIONS):
         excitation = MultisineOptions(gripper_travel=ROUGH.travel[1], shake_torque_rms=ROUGH.shake, duration=RECORDED)
-        motion = random_multisine(system, TRUTH, seed=motion_seed, initial_joint_angles=posture, excitation=excitation)
+        motion = random_multisine_motion(
+            system, TRUTH, seed=motion_seed, initial_joint_angles=posture, excitation=excitation
+        )
         experiment = VirtualExperiment(motion, posture, simulation, ROUGH.noise(1), CAMERA, seed=noise + i)
         files.append(folder / f"motion_{motion_seed}.h5")
-        write_recording(run_injected_experiment(system, TRUTH, effects, experiment), files[-1])
+        write_recording(run_experiment_with_effects(system, TRUTH, effects, experiment), files[-1])
     return files
 
 
@@ -219,8 +230,10 @@ def found(run: RunSettings, folder: Path) -> tuple[Array, Step]:
         if entry["free"]:
             std = "unknown" if entry["std"] is None else f"{entry['std']:.2g}"
             print(f"  {name}: {entry['value']:.4g} +- {std} {entry['unit']} (true {TRUTH.get(name, HANGING.values)})")
-    step = compile_planning_step(run)
-    return identified_parameters(replace(run, plan=replace(run.plan, parameter_run=str(folder))), step)[0], step
+    step = compile_step_for_planning(run)
+    return identified_parameters_with_covariance(replace(run, plan=replace(run.plan, parameter_run=str(folder))), step)[
+        0
+    ], step
 
 
 def ten_goals(folder: Path, count: int, noise: int) -> None:
@@ -236,10 +249,10 @@ def ten_goals(folder: Path, count: int, noise: int) -> None:
     ratios = []
     for i, shift in enumerate(goals(step, count)):
         options = replace(run.plan, target_offset=shift, start_joint_positions=posture)
-        best = plan_motion(step, options, true)
+        best = plan_motion_to_target(step, options, true)
         # the same place in the world, whatever a model believes of where the tip rests
         there = replace(options, target_offset=None, target_position=tuple(best.target_position))
-        plans = [plan_motion(step, there, theta), best, plan_motion(step, there, guess)]
+        plans = [plan_motion_to_target(step, there, theta), best, plan_motion_to_target(step, there, guess)]
         cells = [carried_out(twin, TRUTH, movement(one), one, one) for one in plans]
         first = np.array([posture[name] for name in step.system.prescribed])
         cells.append(carried_out(twin, TRUTH, straight(step, first, np.array(shift), best.simulator.path), None, best))
@@ -268,14 +281,14 @@ def withheld_effect(folder: Path) -> None:
         [make_effect(HANGING.kind, HANGING.location, baxter_foam_y_system(1), HANGING.values)]
     )
     posture = grasping_joint_angles(twin, TRUTH)
-    tip, theta = FramePositions(twin, [TIP]), twin.parameters.vector(TRUTH)
+    tip, theta = FramePositionFunction(twin, [TIP]), twin.parameters.vector(TRUTH)
     true = compile_step(replace(twin, driven=(), prescribed=twin.driven), 0.01)
     rest = solve_start_equilibrium(true, theta, np.array(list(posture.values()))).state[None, : twin.n_coordinates]
     x, y, z = map(float, tip.positions_and_jacobian(rest, theta)[0][0] + HANGING_SHIFT)
     print("| model | error [mm] | swing [mm/s] |\n|---|---|---|")
     for name, chosen in (("before", run), ("after", with_effects(run, result["effects"]))):
         values, step = found(chosen, folder / name)
-        made = plan_motion(
+        made = plan_motion_to_target(
             step,
             replace(run.plan, target_offset=None, target_position=(x, y, z), start_joint_positions=posture),
             values,
@@ -294,8 +307,8 @@ def two_hands() -> None:
         ("middle of a cable", "plan_cable", []),
     ):
         run = load_config(CONFIG.with_name(f"{config}.yaml"), more)
-        step = compile_planning_step(run)
-        made = plan_motion(step, replace(run.plan, start_joint_positions=start_configuration(run, step)))
+        step = compile_step_for_planning(run)
+        made = plan_motion_to_target(step, replace(run.plan, start_joint_positions=start_configuration(run, step)))
         points = tuple(dict.fromkeys((*step.system.point_frames, made.target_point)))
         twin = replace(step.system, driven=step.system.prescribed, prescribed=(), point_frames=points)
         smooth = replace(

@@ -29,8 +29,8 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
-from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import run_diagnose
@@ -83,7 +83,7 @@ def recorded(system: System, seed: int, effects: Sequence[InjectedEffect] = ()) 
     posture = UPRIGHT if any(effect.kind == "backlash" for effect in effects) else POSTURE
     excitation = MultisineOptions(max_joint_speed=2.5, duration=DURATION, frequency_band=(0.3, 2.0))
     experiment = VirtualExperiment(
-        motion=random_multisine(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation),
+        motion=random_multisine_motion(system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=excitation),
         initial_joint_angles=posture,
         simulation=SimulationOptions(DURATION, sample_rate=RATE, time_step=INNER_STEP),
         arm_noise=ArmSensorNoise(position_std=ANGLE_STD),
@@ -93,7 +93,7 @@ def recorded(system: System, seed: int, effects: Sequence[InjectedEffect] = ()) 
         seed=seed,
         recording_name=f"servo_arm_{seed}",
     )
-    made = run_injected_experiment(system, TRUTH, effects, experiment)
+    made = run_experiment_with_effects(system, TRUTH, effects, experiment)
     [seen] = made.points
     markers = PointGroup("points", seen.names, seen.t, seen.position, seen.std, "motion capture")
     assert made.joints is not None

@@ -27,7 +27,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.virtual.experiment import baxter_foam_y_system
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ class Estimate:
 def played(system: System, seed: int, duration: float) -> SimulationResult:
     """The twin in MuJoCo, sampled at the controller's rate."""
     posture = grasping_joint_angles(system, TRUTH)
-    motion = random_multisine(
+    motion = random_multisine_motion(
         system, TRUTH, seed=seed, initial_joint_angles=posture, excitation=MultisineOptions(duration=duration)
     )
     simulation = SimulationOptions(duration=duration, sample_rate=CONTROLLER, time_step=1e-4)
@@ -63,7 +63,7 @@ def played(system: System, seed: int, duration: float) -> SimulationResult:
 def recorded(system: System, run: SimulationResult, every: int, noise: float, name: str) -> Recording:
     """Every n-th sample of joints, torque (its mean) and grasped points, and the junction ten times a second."""
     rng = np.random.default_rng(11)
-    driven = list(system.driven_indices)
+    driven = list(system.driven_coordinate_indices)
     rows = slice(None, None, every)
     whole = (len(run.t) - 1) // every
     torque = run.effort[: whole * every].reshape(whole, every, -1).mean(axis=1)

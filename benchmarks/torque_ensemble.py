@@ -22,7 +22,7 @@ import numpy as np
 from coverage import CONFIGS, PACKAGE, print_progress, solve_twin, working
 from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
 
-from yid_ocp.analysis.compare import PAPER_ESTIMATES, is_within_ensemble
+from yid_ocp.analysis.compare import PAPER_ESTIMATES, is_within_ensemble_range
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import ModelError
 from yid_ocp.files import json_sha256, write_json
@@ -30,7 +30,7 @@ from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import source_hash
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 
 ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "none": ((), ()),
@@ -52,7 +52,7 @@ def make_member(experiment: str, errors: Sequence[Sequence[float]], number: int,
     system = baxter_foam_y_system(arms)
     posture = grasping_joint_angles(system, TRUTH, offsets=OFFSETS[arms])
     excitation = MultisineOptions(gripper_travel=ROUGH.travel[arms], shake_torque_rms=ROUGH.shake)
-    motion = random_multisine(
+    motion = random_multisine_motion(
         system, TRUTH, seed=ROUGH.motion_seeds[arms, "estimate"], initial_joint_angles=posture, excitation=excitation
     )
     torques = replace(ROUGH, white=tuple(errors[0]), offset=tuple(errors[1]))
@@ -134,7 +134,7 @@ def _range(values: Sequence[float], published: float) -> str:
     if not values:
         return "-"
     low, middle, high = np.quantile(values, [0.0, 0.5, 1.0])
-    return f"{low:.3g} .. {middle:.3g} .. {high:.3g}{'*' if is_within_ensemble(published, values) else ''}"
+    return f"{low:.3g} .. {middle:.3g} .. {high:.3g}{'*' if is_within_ensemble_range(published, values) else ''}"
 
 
 def main() -> None:

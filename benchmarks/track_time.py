@@ -37,7 +37,7 @@ from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.vision.frame_folder import read_frame_folder, write_frame_folder
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.track import camera_scene, simulate_frames
+from yid_ocp.workflow.track import camera_scene, simulate_recording_and_camera_frames
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
 SHIPPED = (CONFIGS / "track_single_arm.yaml", CONFIGS / "track_dual_arm.yaml")
@@ -64,7 +64,7 @@ def main() -> int:
 
 def _film(run: RunSettings, folder: Path, count: int = 0) -> Recording:
     """Write a virtual film as depth images, over and over until it has so many frames; the joints' recording."""
-    recording, made = simulate_frames(run, build_system(run), run.track.virtual_frames)
+    recording, made = simulate_recording_and_camera_frames(run, build_system(run), run.track.virtual_frames)
     write_frame_folder(made.sequence, folder, depth=made.depth_images)
     joints = recording.joints
     assert joints is not None

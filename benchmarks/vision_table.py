@@ -33,11 +33,16 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import YidError
-from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.report.terminal import aligned_table_lines
-from yid_ocp.virtual.joint_motion import BAXTER_ARM_JOINTS, MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.joint_motion import (
+    BAXTER_ARM_JOINT_NAMES,
+    MultisineOptions,
+    grasping_joint_angles,
+    random_multisine_motion,
+)
 from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.vision import (
@@ -130,10 +135,12 @@ ROWS: dict[str, Row] = {
 def y_system(arms: int, links: int, damping: float = 0.05) -> System:
     """Baxter with one or two arms holding the foam Y, of so many links a tube."""
     sides = ("left", "right")[:arms]
-    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_ARM_JOINTS]
+    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_ARM_JOINT_NAMES]
     grasps = [Grasp(side, f"{side}_gripper", held) for side, held in zip(sides, ("w_T2", "w_T3"), strict=False)]
     robot = read_urdf("package:baxter", joints=names)
-    return System.build(robot, objects=[(y_object(links), None, None)], grasps=grasps, driven=names, damping=damping)
+    return System.build(
+        robot, objects=[(foam_y_object(links), None, None)], grasps=grasps, driven=names, damping=damping
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +162,7 @@ class Played:
 
     def joints(self, seed: int) -> JointGroup:
         """What the encoders recorded."""
-        driven = list(self.system.driven_indices)
+        driven = list(self.system.driven_coordinate_indices)
         noise = 2e-4 * np.random.default_rng([seed, 5]).standard_normal((len(self.t), len(driven)))
         position = self.q[:, driven] + noise
         stated = {"position_std": 2e-4, "effort_std": 0.0, "effort_kind": "command"}
@@ -190,7 +197,7 @@ def played(
             return Played(arms, system, values, file["t"], file["q"], file["effort"], file["points"])
     posture = grasping_joint_angles(system, values)
     excitation = MultisineOptions(gripper_travel=TRAVEL[arms] * travel, duration=duration)
-    motion = random_multisine(system, values, seed=seed, initial_joint_angles=posture, excitation=excitation)
+    motion = random_multisine_motion(system, values, seed=seed, initial_joint_angles=posture, excitation=excitation)
     run = simulate_in_mujoco(
         system, values, motion, SimulationOptions(duration, time_step=step), initial_joint_angles=posture
     )
@@ -451,7 +458,7 @@ def tracked(made: Film, options: TrackOptions) -> tuple[TrackResult | None, Outc
         "",
         spent,
         found.camera_calibration.message,
-        found.drop_reason_counts,
+        found.frame_drop_reason_counts,
     )
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
-from yid_ocp.inference.linearized_residual import bounded_least_squares_step
+from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.integrator import compiled
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step
@@ -249,7 +249,7 @@ def gauss_newton_iteration(bench: Bench) -> int:
     now = problem.evaluate(x, equilibrium_guesses=bench.warm(x))
     assert now.jacobian is not None
     wide = np.full(len(problem.initial_unknowns), np.inf)
-    bounded_least_squares_step(now.jacobian, now.residual, 1e-6, -wide, wide)
+    bounded_levenberg_marquardt_step(now.jacobian, now.residual, 1e-6, -wide, wide)
     return 1
 
 

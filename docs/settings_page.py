@@ -10,10 +10,10 @@ from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.schema import option_info, section_variants
+from yid_ocp.config.schema import option_info_from_annotation, section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.model.objects import OBJECTS
-from yid_ocp.options import Option, dataclass_options, describe_type, mapping_value_type, sequence_entry_type
+from yid_ocp.model.objects import OBJECT_KINDS
+from yid_ocp.options import Option, dataclass_options, describe_type, mapping_value_type, tuple_entry_type
 
 HEAD = """\
 # Settings
@@ -38,7 +38,7 @@ def page() -> str:
 
 def tables(hint: Any, path: str) -> Iterator[tuple[str, str, list[str]]]:
     """Title, first sentence and rows of a section and of all below it."""
-    sections = section_variants(hint)
+    sections = section_variants_from_annotation(hint)
     for word, kind in sections.classes.items() if sections is not None else ():
         options = dataclass_options(kind)
         title = (
@@ -49,8 +49,8 @@ def tables(hint: Any, path: str) -> Iterator[tuple[str, str, list[str]]]:
         yield title, (kind.__doc__ or "").splitlines()[0], [row(*item) for item in options.items()]
         for name, option in options.items():
             yield from tables(option.type_hint, f"{path}.{name}" if path else name)
-    values, entries = mapping_value_type(hint), sequence_entry_type(hint)
-    named = section_variants(values)
+    values, entries = mapping_value_type(hint), tuple_entry_type(hint)
+    named = section_variants_from_annotation(values)
     if values is not None and (named is None or named.selector_key != "name"):
         yield from tables(values, f"{path}.NAME")
     if entries is not None:
@@ -60,7 +60,12 @@ def tables(hint: Any, path: str) -> Iterator[tuple[str, str, list[str]]]:
 def row(name: str, option: Option) -> str:
     """The row of one key in a section's table."""
     usual = "needed" if option.default_value is MISSING else default(option.default_value)
-    cells = (f"`{name}`", option_info(option.type_hint).description, describe_type(option.type_hint), usual)
+    cells = (
+        f"`{name}`",
+        option_info_from_annotation(option.type_hint).description,
+        describe_type(option.type_hint),
+        usual,
+    )
     return "| " + " | ".join(cells) + " |"
 
 
@@ -74,7 +79,7 @@ def default(value: Any) -> str:
 
 
 EXAMPLES: Mapping[str, str] = {
-    **{section: text for kind in OBJECTS for section, text in OBJECTS[kind].settings_examples.items()},
+    **{section: text for kind in OBJECT_KINDS for section, text in OBJECT_KINDS[kind].settings_examples.items()},
     "The file": """\
 description: A cable of 1 m, swung by a UR5
 model: {robot: package:ur5, object: {kind: segments, segments: {cable: {length: 1.0, mass: 0.1, radius: 0.005}}}}

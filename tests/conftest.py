@@ -22,7 +22,7 @@ from pendulum_run import pendulum_data as pendulum_data
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs
 from yid_ocp.model import Grasp, System
-from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import read_urdf
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -97,7 +97,7 @@ def paper_systems():
         robot = read_urdf("package:baxter", joints=names)
         held = dict(zip(("left", "right"), ("w_T2", "w_T3"), strict=True))
         grasps = [Grasp(side, f"{side}_gripper", held[side]) for side in sides]
-        objects = [(y_object(), None, None)]
+        objects = [(foam_y_object(), None, None)]
         return System.build(robot, objects=objects, grasps=grasps, driven=names, damping=0.05)
 
     return {name: build(sides) for name, sides in SIDES.items()}
@@ -141,7 +141,7 @@ def roll():
         sizes = step.sizes
         start = np.concatenate([q0, p0, np.zeros(sizes["nz"]) if z0 is None else z0])
         torque = np.zeros((steps, sizes["nu"])) if torque is None else torque
-        fixed = list(step.system.prescribed_indices)
+        fixed = list(step.system.prescribed_coordinate_indices)
         path = np.tile(start[fixed], (steps + 1, 1)) if path is None else path
         start[fixed] = path[0]
         return step.kernel.rollout(RolloutInputs(np.asarray(theta, float), start, torque, path, feedback, directions))

@@ -9,7 +9,7 @@ import numpy as np
 from made_series import samples
 
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.problem.evaluation import Evaluation, ResidualRows
+from yid_ocp.problem.evaluation import Evaluation, ResidualVectorLayout
 from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.solvers.base import Iterate, SolverResult, Status
 
@@ -55,7 +55,7 @@ class MadeUp:
         priors: Mapping[str, float] | None = None,
     ) -> None:
         self._rows, self._stated, self._weak, self.duration = rows, stated, weak, duration
-        self.data_noise_unit = noise
+        self.data_residual_noise_std = noise
         self.initial_unknowns = np.array(start, float)
         size = len(self.initial_unknowns)
         self.unknown_names = tuple(f"k{i}" for i in range(size))
@@ -63,7 +63,7 @@ class MadeUp:
         self.bounds = np.full(size, lower), np.full(size, upper)
         self.unknown_scales = np.abs(self.initial_unknowns) if scales is None else np.array(scales, float)
         self.options = SimpleNamespace(
-            has_trusted_data=True,
+            has_no_serious_data_issues=True,
             weighting=weighting,
             prior_stds=dict(priors or {}),
             path_cutoff=np.inf,
@@ -84,27 +84,30 @@ class MadeUp:
         data = (self._count - self._stated - self._weak) if i == 0 else 0
         node = np.linspace(0, steps, data).astype(int)
         group = samples(
-            ("points.tip",), np.full((data, 1), self.data_noise_unit), is_used=np.ones((data, 1), bool),
-            value=np.zeros((data, 1)), node=node, fraction=np.zeros(data), n_residuals=data,
+            ("points.tip",), np.full((data, 1), self.data_residual_noise_std),
+            used_output_mask=np.ones((data, 1), bool), value=np.zeros((data, 1)), node=node,
+            fraction=np.zeros(data), n_residuals=data,
         )  # fmt: skip
         grid = SimpleNamespace(steps=steps, time_step=0.1)
-        return SimpleNamespace(name=f"run {i}", grid=grid, measurements=(group,), has_constant_sensor_errors=False)
+        return SimpleNamespace(name=f"run {i}", grid=grid, measurements=(group,), has_uncertain_sensor_biases=False)
 
     @property
-    def is_positive(self) -> np.ndarray:
+    def positive_unknowns_mask(self) -> np.ndarray:
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 
     @property
-    def residual_rows(self) -> ResidualRows:
+    def residual_rows(self) -> ResidualVectorLayout:
         total = self._count
         data = total - self._stated - self._weak
-        made = ResidualRows.from_episodes(self.episodes, self._stated, self._weak)
-        return ResidualRows(made.measurements, slice(0, data), slice(data, data + self._stated), slice(data, total))
+        made = ResidualVectorLayout.from_episodes(self.episodes, self._stated, self._weak)
+        return ResidualVectorLayout(
+            made.measurements, slice(0, data), slice(data, data + self._stated), slice(data, total)
+        )
 
-    def residual_without_weak_priors(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
+    def linearization_without_weak_priors(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         count = len(evaluation.residual) - self._weak
         unit = np.ones(count)
-        unit[: count - self._stated] = self.data_noise_unit
+        unit[: count - self._stated] = self.data_residual_noise_std
         return evaluation.residual[:count] / unit, evaluation.jacobian[:count] / unit[:, None]
 
     def split(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
@@ -123,7 +126,7 @@ class MadeUp:
         cost = 0.5 * float(residual @ residual)
         return Evaluation(cost, residual, jacobian if derivatives else None, True, "", done)
 
-    def truncated_to(self, duration: float) -> MadeUp:
+    def truncated_to_duration(self, duration: float) -> MadeUp:
         lower, upper = self.bounds
         bounds = {"lower": lower[0], "upper": upper[0]}
         return MadeUp(self._rows, self.initial_unknowns, **bounds, duration=duration, count=self._count)

@@ -7,23 +7,23 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from yid_ocp.inference.null_test import ResidualChannel
+from yid_ocp.inference.null_test import ResidualChannelSamples
 
 WHITE = (1.0,)
 
 
-def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> ResidualChannel:
+def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> ResidualChannelSamples:
     """One output of one recording; times at even intervals unless given."""
     rows = np.asarray(rows)
     t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
-    return ResidualChannel(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
+    return ResidualChannelSamples(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
 
 
 def samples(channels: Sequence[str], std, unit="m", width=1, **more):
     """What one sensor measured, as far as rules look at it."""
     columns = tuple(channel for channel in channels for _ in range(width))
     return SimpleNamespace(
-        sensor=seeing(channels, unit, width), channel_of_column=columns, std=np.asarray(std, float), **more
+        sensor=seeing(channels, unit, width), output_channel_names=columns, std=np.asarray(std, float), **more
     )
 
 

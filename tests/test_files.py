@@ -11,7 +11,7 @@ import pytest
 
 from yid_ocp.errors import DataError, OutputError
 from yid_ocp.files import atomic_write, file_sha256, is_file, json_sha256, to_json_types, write_json
-from yid_ocp.version import fingerprint_differences, package_source_hash, software_fingerprint, source_hash
+from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences, source_hash
 
 
 def test_an_interruption_leaves_nothing(tmp_path):
@@ -109,10 +109,12 @@ def test_the_hash_of_sources_follows_their_names_and_content(tmp_path):
 def test_where_two_processes_differ_is_said():
     here = software_fingerprint()
     assert here["code"] == package_source_hash()
-    assert fingerprint_differences(here, software_fingerprint()) == []
-    assert fingerprint_differences(here, {**here, "casadi": "1.0"}) == [f"casadi 1.0 instead of {here['casadi']}"]
-    assert fingerprint_differences(here, {**here, "code": "f" * 64}) == [
+    assert software_fingerprint_differences(here, software_fingerprint()) == []
+    assert software_fingerprint_differences(here, {**here, "casadi": "1.0"}) == [
+        f"casadi 1.0 instead of {here['casadi']}"
+    ]
+    assert software_fingerprint_differences(here, {**here, "code": "f" * 64}) == [
         f"code {'f' * 12} instead of {here['code'][:12]}"
     ]
     del here["numpy"]
-    assert fingerprint_differences({**here, "numpy": "2"}, here) == ["numpy unknown instead of 2"]
+    assert software_fingerprint_differences({**here, "numpy": "2"}, here) == ["numpy unknown instead of 2"]

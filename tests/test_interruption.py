@@ -24,7 +24,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 folder = Path(sys.argv[1])
 folder.mkdir()
 try:
-    with interruption.raise_on_signals(), interruption.remove_on_forced_exit(folder):
+    with interruption.raise_on_signals(), interruption.remove_folder_on_forced_exit(folder):
 {body}
 except interruption.InterruptedBySignal as error:
     print("ENDED", error, flush=True)
@@ -75,7 +75,7 @@ def test_handlers_are_put_back_and_a_second_use_is_new():
     for _ in range(2):
         with pytest.raises(interruption.InterruptedBySignal), interruption.raise_on_signals():
             signal.raise_signal(signal.SIGTERM)
-        assert interruption.received_signal() == signal.SIGTERM
+        assert interruption.received_signal_number() == signal.SIGTERM
     assert {number: signal.getsignal(number) for number in before} == before
     assert signal.set_wakeup_fd(-1) == -1
 

@@ -6,7 +6,7 @@ import pytest
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.run_inputs import recording_path
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 QUICK = {
     "single_arm_vision": ["effort x 0.1", "gap of 2 s", "camera mirrored", "wrist angles x 20", "a link renamed"],
@@ -46,7 +46,7 @@ def test_a_wrong_recording_is_named(benchmark, tmp_path, config, name):
 @pytest.mark.parametrize("config", CONFIGS)
 def test_shipped_recordings_are_not_in_doubt(repository, config):
     run = load_config(repository / "configs" / f"{config}.yaml")
-    files = [recording_path(path) for path in (*run.recordings.estimate, *run.recordings.held_out)]
+    files = [resolve_recording_path(path) for path in (*run.recordings.estimate, *run.recordings.held_out)]
     missing = [file for file in files if not file.is_file()]
     if missing:
         pytest.skip(f"its recordings are not here: {missing[0]}")

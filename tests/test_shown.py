@@ -66,7 +66,7 @@ def shown(urdf_folder):
     system = step.system
     things = [made, step, system, system.mechanism, system.parameters, tube, problem, solution, solution.evaluation]
     things += [
-        *solution.channel_predictions()[:1],
+        *solution.channel_measurements_and_predictions()[:1],
         yid.identifiability(problem, solution),
         yid.StepSymbols.from_equations(step.equations),
     ]

@@ -21,14 +21,14 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from yid_ocp import interruption
-from yid_ocp.errors import ConfigError, OutputError, ResourceError, YidError, unknown_name_details
+from yid_ocp.errors import ConfigError, InsufficientMemoryError, OutputError, YidError, unknown_name_details
 
 _EXIT_WRONG_INPUT, _EXIT_BUG, _EXIT_INTERRUPTED = 2, 3, 130
 _ERROR_FORMAT = "yid-error/1"
 
 
 @dataclass(frozen=True)
-class CliCommand:
+class _CliCommand:
     """A command: name, help, and the file of `workflow` whose `run` takes the parsed arguments and returns the code."""
 
     name: str
@@ -239,41 +239,43 @@ def _schema(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="file to write; printed when absent")
 
 
-COMMANDS: tuple[CliCommand, ...] = (
-    CliCommand("init", "write a commented configuration from a robot and recordings of it", "init", _init),
-    CliCommand("solve", "estimate the free parameters from recordings", "solve", partial(_doubting, optional=True)),
-    CliCommand("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
-    CliCommand(
+COMMANDS: tuple[_CliCommand, ...] = (
+    _CliCommand("init", "write a commented configuration from a robot and recordings of it", "init", _init),
+    _CliCommand("solve", "estimate the free parameters from recordings", "solve", partial(_doubting, optional=True)),
+    _CliCommand("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
+    _CliCommand(
         "identifiability",
         "say which parameters the recordings determine, and which experiment would tell more",
         "identifiability",
         _identifiability,
     ),
-    CliCommand("diagnose", "find the gap between model and recordings, and what makes it", "diagnose", _diagnose),
-    CliCommand(
+    _CliCommand("diagnose", "find the gap between model and recordings, and what makes it", "diagnose", _diagnose),
+    _CliCommand(
         "blind",
         "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted",
         "blind",
         _blind,
     ),
-    CliCommand("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
-    CliCommand("report", "compare runs of one model: what drifted, which run to distrust", "run_history", _report),
-    CliCommand("plan", "plan a motion of the arms with the identified model", "plan", _configured),
-    CliCommand("simulate", "write what the model says would be recorded", "simulate", _simulate),
-    CliCommand("check", "validate a configuration, its recordings and the model before a long run", "check", _doubting),
-    CliCommand("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
-    CliCommand("track", "measure the object's points in the frames of a depth camera", "track", _track),
-    CliCommand("import", "turn a file of another tool into a recording", "import_recording", _import),
-    CliCommand(
+    _CliCommand("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
+    _CliCommand("report", "compare runs of one model: what drifted, which run to distrust", "run_history", _report),
+    _CliCommand("plan", "plan a motion of the arms with the identified model", "plan", _configured),
+    _CliCommand("simulate", "write what the model says would be recorded", "simulate", _simulate),
+    _CliCommand(
+        "check", "validate a configuration, its recordings and the model before a long run", "check", _doubting
+    ),
+    _CliCommand("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
+    _CliCommand("track", "measure the object's points in the frames of a depth camera", "track", _track),
+    _CliCommand("import", "turn a file of another tool into a recording", "import_recording", _import),
+    _CliCommand(
         "export", "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP", "export", _export
     ),
-    CliCommand(
+    _CliCommand(
         "completion",
         "print what makes a shell complete commands, options, files and settings",
         "editor_support",
         _completion,
     ),
-    CliCommand("schema", "print the JSON Schema of configuration files, for editors", "editor_support", _schema),
+    _CliCommand("schema", "print the JSON Schema of configuration files, for editors", "editor_support", _schema),
 )
 
 
@@ -367,7 +369,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         printed as `yid-error/1` as well: kind, what, where, allowed, hint and exit_code.
     """
     if "_ARGCOMPLETE" in os.environ:
-        import_module("yid_ocp.workflow.editor_support").complete_arguments(build_argument_parser())
+        import_module("yid_ocp.workflow.editor_support").print_shell_completions(build_argument_parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)
     try:
         arguments = build_argument_parser().parse_args(argv)
@@ -400,7 +402,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
         sys.stdout.flush()
         return code
     except Exception as error:
-        number = interruption.received_signal()
+        number = interruption.received_signal_number()
         if number is not None:  # what a library makes of being interrupted is no cause
             raise interruption.InterruptedBySignal(number) from error
         return _failed(error, as_json)
@@ -420,7 +422,7 @@ def _failed(error: Exception, as_json: bool) -> int:
         return _wrong(OutputError(what, where=str(error.filename or ""), hint=hint), as_json)
     if isinstance(error, MemoryError):
         what = f"there is not enough memory: {error}"
-        return _wrong(ResourceError(what, hint="shorten the run, or take fewer links"), as_json)
+        return _wrong(InsufficientMemoryError(what, hint="shorten the run, or take fewer links"), as_json)
     # whatever else comes up here is a mistake of ours
     with tempfile.NamedTemporaryFile("w", prefix="yid-ocp-", suffix=".log", delete=False, encoding="utf-8") as file:
         traceback.print_exception(error, file=file)

@@ -52,7 +52,7 @@ class WorkerError(YidError):
     """Workers cannot be reached, or cannot do their tasks."""
 
 
-class ResourceError(YidError):
+class InsufficientMemoryError(YidError):
     """The machine has too little memory."""
 
 

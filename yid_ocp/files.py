@@ -117,19 +117,19 @@ def to_json_types(value: Any, notes: list[str] | None = None, path: str = "") ->
     return value if value is None or isinstance(value, (bool, int, float, str)) else str(value)
 
 
-def to_plain_data(value: Any) -> Any:
-    """Nested dataclass of numbers, texts and arrays as JSON data, without loss of precision.
+def to_lossless_plain_data(value: Any) -> Any:
+    """Nested dataclasses, containers and arrays as JSON data without loss; NaN and infinities become text.
 
     JSON has no infinities: what is not finite becomes text.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {entry.name: to_plain_data(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
+        return {entry.name: to_lossless_plain_data(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):
-        return {"shape": list(value.shape), "values": to_plain_data(value.ravel().tolist())}
+        return {"shape": list(value.shape), "values": to_lossless_plain_data(value.ravel().tolist())}
     if isinstance(value, Mapping):
-        return {str(key): to_plain_data(entry) for key, entry in value.items()}
+        return {str(key): to_lossless_plain_data(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [to_plain_data(entry) for entry in value]
+        return [to_lossless_plain_data(entry) for entry in value]
     if isinstance(value, np.generic):
         value = value.item()
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
@@ -138,20 +138,20 @@ def to_plain_data(value: Any) -> Any:
 def attributes_to_json(value: Any, names: str) -> dict[str, Any]:
     """Some attributes of an object as JSON data, by name or as `key=name`, separated by blanks."""
     pairs = [name.partition("=") for name in names.split()]
-    return {key: finite_json(getattr(value, name or key)) for key, _, name in pairs}
+    return {key: json_with_nonfinite_as_none(getattr(value, name or key)) for key, _, name in pairs}
 
 
-def finite_json(value: Any) -> Any:
-    """Numbers, texts and their containers as JSON data; what is not finite becomes None."""
+def json_with_nonfinite_as_none(value: Any) -> Any:
+    """Numbers, texts and their containers as JSON data; NaN and infinities become None."""
     if isinstance(value, Mapping):
-        return {key: finite_json(entry) for key, entry in value.items()}
+        return {key: json_with_nonfinite_as_none(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [finite_json(entry) for entry in value]
+        return [json_with_nonfinite_as_none(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:
-    """Dataclass instance restored from the data that `to_plain_data` returned."""
+def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:
+    """Dataclass instance restored from the data that `to_lossless_plain_data` returned."""
     return kind(**{name: _value(hint, data[name]) for name, hint in _hints(typing.cast(typing.Hashable, kind)).items()})
 
 
@@ -176,7 +176,7 @@ def _value(hint: Any, value: Any) -> Any:
     if origin in (dict, Mapping):
         return {key: _value(arguments[1], entry) for key, entry in value.items()}
     if dataclasses.is_dataclass(hint):
-        return from_plain_data(typing.cast(type, hint), value)
+        return dataclass_from_plain_data(typing.cast(type, hint), value)
     return float(value) if hint is float else value
 
 

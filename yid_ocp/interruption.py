@@ -41,14 +41,14 @@ class _State:
 _STATE = _State()
 
 
-def received_signal() -> int | None:
+def received_signal_number() -> int | None:
     """Number of the signal that requested the command's end; None if there was none."""
     return _STATE.asked
 
 
 @contextlib.contextmanager
 def defer_interruption() -> Iterator[None]:
-    """Context manager that delays an interruption until its short block has ended."""
+    """Context manager that delays the handling of termination signals until its short block has ended."""
     _STATE.deferring += 1
     before = _STATE.asked
     try:
@@ -60,7 +60,7 @@ def defer_interruption() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def remove_on_forced_exit(folder: Path) -> Iterator[None]:
+def remove_folder_on_forced_exit(folder: Path) -> Iterator[None]:
     """Context manager that removes a folder if the process is killed during its block."""
     _STATE.unfinished.add(folder)
     try:
@@ -75,8 +75,9 @@ def raise_on_signals() -> Iterator[None]:
 
     An exception can get lost: in what collects garbage, in callbacks of libraries, in a call that does not come back.
     So it is raised again every `_RERAISE_INTERVAL` seconds, and after `_FORCED_EXIT_DELAY` seconds the process is ended
-    with the exit code that shells expect, when nothing but the folders of `remove_on_forced_exit` has to be cleared
-    away. Signals that the parent had ignored stay so, as under `nohup`. Outside the main thread nothing is changed.
+    with the exit code that shells expect, when nothing but the folders of `remove_folder_on_forced_exit` has to be
+    cleared away. Signals that the parent had ignored stay so, as under `nohup`. Outside the main thread nothing is
+    changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

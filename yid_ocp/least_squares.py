@@ -20,7 +20,7 @@ _FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e8
 
 
 @dataclass(frozen=True)
-class LeastSquaresResult:
+class _LeastSquaresResult:
     """Result of `levenberg_marquardt`: minimiser `x` (n,), sum of squares and Jacobian (m, n) there, convergence."""
 
     x: Array
@@ -48,7 +48,7 @@ class LocalQuadraticModel:
 
 
 @dataclass(frozen=True)
-class DampedNewtonResult:
+class _DampedNewtonResult:
     """Result of `minimize_by_damped_newton`: minimiser `x` (n,), the model there, iterations, convergence."""
 
     x: Array
@@ -66,7 +66,7 @@ def levenberg_marquardt(
     max_iterations: int = 200,
     step_tolerance: float = 1e-9,
     cost_tolerance: float = 1e-10,
-) -> LeastSquaresResult:
+) -> _LeastSquaresResult:
     """Minimise |r(x)|^2 by damped Gauss-Newton steps, the damping in units of the columns' norms.
 
     The residual function gives r (m,) and its Jacobian (m, n); a projection brings a trial point back to where it may
@@ -83,7 +83,7 @@ def levenberg_marquardt(
 
     limits = max_step, max_iterations, step_tolerance, cost_tolerance, 1e-12
     x, model, used, converged = _descend(model_at, initial_guess, projection, *limits)
-    return LeastSquaresResult(x, model.cost, model.jacobian, used, converged)
+    return _LeastSquaresResult(x, model.cost, model.jacobian, used, converged)
 
 
 def minimize_by_damped_newton(
@@ -95,14 +95,14 @@ def minimize_by_damped_newton(
     step_tolerance: float = 1e-9,
     cost_tolerance: float = 1e-10,
     min_damping: float = 1e-9,
-) -> DampedNewtonResult:
+) -> _DampedNewtonResult:
     """Minimise a cost given by local quadratic models, with the loop of `levenberg_marquardt`.
 
     No step is damped less than `min_damping`: some damping keeps a search on a robust cost from leaping out of its
     valley.
     """
     limits = max_step, max_iterations, step_tolerance, cost_tolerance, min_damping
-    return DampedNewtonResult(*_descend(quadratic_model, initial_guess, None, *limits))
+    return _DampedNewtonResult(*_descend(quadratic_model, initial_guess, None, *limits))
 
 
 class _SumOfSquares:

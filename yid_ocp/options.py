@@ -23,7 +23,7 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.registry import Registry
 
 PositiveFloat = Annotated[float, annotated_types.Gt(0)]
-Fraction = Annotated[float, annotated_types.Ge(0), annotated_types.Le(1)]
+UnitIntervalFloat = Annotated[float, annotated_types.Ge(0), annotated_types.Le(1)]
 _BOUND_MARKERS = (
     (annotated_types.Gt, "gt", operator.gt, "above"),
     (annotated_types.Ge, "ge", operator.ge, "from"),
@@ -99,7 +99,7 @@ def mapping_value_type(hint: Any) -> Any:
     return next((get_args(bare)[1] for bare in found if get_origin(bare) in (Mapping, dict)), None)
 
 
-def sequence_entry_type(hint: Any) -> Any:
+def tuple_entry_type(hint: Any) -> Any:
     """Entry type of a tuple of any length; None for other types."""
     bare, _ = split_annotated(hint)
     arguments = get_args(bare)
@@ -155,7 +155,7 @@ def check_option_bounds(options: Any, where: str) -> None:
 def _within(hint: Any, value: Any) -> bool:
     """Whether every number of a value is within the bounds of its type; True for other values."""
     if isinstance(value, tuple):
-        entries = sequence_entry_type(hint)
+        entries = tuple_entry_type(hint)
         return entries is None or all(_within(entries, entry) for entry in value)
     if not isinstance(value, (int, float)):
         return True

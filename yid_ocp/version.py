@@ -46,7 +46,7 @@ def software_fingerprint() -> dict[str, str]:
     return {"python": python, **own, "code": package_source_hash()}
 
 
-def fingerprint_differences(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
+def software_fingerprint_differences(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:
     """Descriptions of the entries in which two fingerprints differ."""
     length = {"code": 12}
     return [

@@ -11,7 +11,7 @@ from made_series import samples
 
 from yid_ocp.inference.uncertainty import GoodnessOfFit, ParameterEstimate
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.problem.evaluation import Evaluation, ResidualRows
+from yid_ocp.problem.evaluation import Evaluation, ResidualVectorLayout
 from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.solvers.base import Solution, Status
 
@@ -54,14 +54,14 @@ class Formula:
         sizes = dict(zip(self.unknown_names, np.abs(self.initial_unknowns), strict=True)) | dict(scales or {})
         self.unknown_scales = np.array([sizes[name] or 1.0 for name in self.unknown_names])
         data = residual.numel() - stated - weak
-        self.residual_rows = ResidualRows(
+        self.residual_rows = ResidualVectorLayout(
             ((slice(0, data),),), slice(0, data), slice(data, data + stated), slice(data + stated, data + stated + weak)
         )
-        self.data_noise_unit, self._fails = noise, fails or (lambda values: False)
+        self.data_residual_noise_std, self._fails = noise, fails or (lambda values: False)
         self.whitening_filters, self.has_process_noise = (None,), False
         self.options = SimpleNamespace(
             data_issues=(),
-            has_trusted_data=True,
+            has_no_serious_data_issues=True,
             weighting="paper" if noise != 1 else "whitened",
             initial_state="equilibrium",
             known_initial_states={},
@@ -71,8 +71,8 @@ class Formula:
             path_cutoff=np.inf,
         )
         everything = samples(
-            ("points.tip",), np.full((data, 1), noise), is_used=np.ones((data, 1), bool), value=np.zeros((data, 1)),
-            node=np.arange(data), fraction=np.zeros(data), count=data,
+            ("points.tip",), np.full((data, 1), noise), used_output_mask=np.ones((data, 1), bool),
+            value=np.zeros((data, 1)), node=np.arange(data), fraction=np.zeros(data), count=data,
         )  # fmt: skip
         grid = SimpleNamespace(steps=data, time_step=0.1)
         self.episodes = (SimpleNamespace(name="run", grid=grid, measurements=(everything,)),)
@@ -97,7 +97,7 @@ class Formula:
         return self.split(self.initial_unknowns, 0)[0]
 
     @property
-    def is_positive(self) -> np.ndarray:
+    def positive_unknowns_mask(self) -> np.ndarray:
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 
     def evaluate(self, x: np.ndarray, derivatives: bool = True, equilibrium_guesses: object = None) -> Evaluation:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 
-from yid_ocp.analysis.experiment_design import BaseExperiment
+from yid_ocp.analysis.experiment_design import RecordedExperiment
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
@@ -31,7 +31,7 @@ def setting(*groups, sensors=None, frames=("a", "b", "tip"), **more):
         options=ProblemOptions(sensors=sensors or {}),
         system=SimpleNamespace(mechanism=Mechanism("made", (), dict.fromkeys(frames))),
     )
-    return BaseExperiment(problem, np.zeros(1), **more), episode
+    return RecordedExperiment(problem, np.zeros(1), **more), episode
 
 
 def places(system, frames, q):

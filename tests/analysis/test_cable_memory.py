@@ -9,7 +9,7 @@ import pytest
 
 from yid_ocp.analysis import compare as module
 from yid_ocp.analysis.compare import decide_cable_memory
-from yid_ocp.model.objects.cable import START_SPEED_PARAMETER
+from yid_ocp.model.objects.cable import START_SPEED_PARAMETER_NAME
 
 
 class Means:
@@ -29,7 +29,7 @@ class Means:
     @staticmethod
     def _episode(value, speed):
         samples = SimpleNamespace(whitened_residual=lambda predicted: predicted - value, n_residuals=1)
-        start = None if speed is None else SimpleNamespace(fitted_parameters={START_SPEED_PARAMETER: speed})
+        start = None if speed is None else SimpleNamespace(fitted_parameters={START_SPEED_PARAMETER_NAME: speed})
         return SimpleNamespace(measurements=(samples,), fixed_initial_state=start)
 
     def split(self, x, i):

@@ -150,7 +150,7 @@ def compared(monkeypatch):
             return solutions["all_noise" if problem.has_process_noise else solver.name]
 
         monkeypatch.setattr(module, "solve", solve)
-        monkeypatch.setattr(module, "without_input_errors", lambda problem: Problem(problem.options.weighting))
+        monkeypatch.setattr(module, "problem_without_input_errors", lambda problem: Problem(problem.options.weighting))
         solvers = [SimpleNamespace(name=name) for name in solutions if name != "all_noise"]
         told = []
         found = compare_methods(Problem(weighting, disturbed), solvers, truth, lambda *entry: told.append(entry))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.analysis.pinocchio_comparison import (
-    PinocchioComparison,
+    _PinocchioComparison,
     compare_system_with_pinocchio,
     compare_urdf_with_pinocchio,
 )
@@ -17,7 +17,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.rotations import rotation_from_rpy
-from yid_ocp.model.urdf import example_robot_urdf, read_urdf
+from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 
 GRAVITY = np.array([0.3, -0.2, -9.81])
 
@@ -54,7 +54,7 @@ def test_a_built_model_is_pinocchios(urdf_folder, mixed):
     found = compare_system_with_pinocchio(
         system, system.parameters.vector({"T2.mass": 0.4}), rng.uniform(-1, 1, system.n_coordinates)
     )
-    assert found.agrees
+    assert found.agrees_within_rounding
     assert max(found.mass, found.weight, found.motion) < 1e-12
     assert found.words.startswith("the built model: mass matrix, weight and inverse dynamics are Pinocchio's within ")
 
@@ -70,15 +70,15 @@ def test_effects_are_compared_as_well(urdf_folder, kind, location, value):
     system = system.with_effects([effect])
     theta = system.parameters.vector({names[0]: value})
     found = compare_system_with_pinocchio(system, theta, np.zeros(system.n_coordinates))
-    assert found.agrees, found.words
+    assert found.agrees_within_rounding, found.words
 
 
 def test_differences_are_said():
     assert (
-        PinocchioComparison("it", 0.0, 0.02, 0.0).words
+        _PinocchioComparison("it", 0.0, 0.02, 0.0).words
         == "it differs from Pinocchio's: weight by 2 % of the largest entry"
     )
-    assert PinocchioComparison("it", 0.0, float("nan"), 0.0).agrees is False
+    assert _PinocchioComparison("it", 0.0, float("nan"), 0.0).agrees_within_rounding is False
 
 
 @pytest.mark.parametrize(
@@ -95,10 +95,10 @@ def test_differences_are_said():
 )
 def test_a_file_is_read_as_pinocchio_reads_it(urdf_folder, file, joints, locked):
     package = file.startswith("package:")
-    path = example_robot_urdf(file.removeprefix("package:")) if package else urdf_folder / file
+    path = _example_robot_urdf(file.removeprefix("package:")) if package else urdf_folder / file
     robot = read_urdf(file if package else path, joints=joints, locked=locked)
     found = compare_urdf_with_pinocchio(path, robot, GRAVITY, joints, locked)
-    assert found.agrees, found.words
+    assert found.agrees_within_rounding, found.words
     assert found.words.startswith(f"{path.name} as read: ")
 
 
@@ -109,7 +109,7 @@ def test_a_file_read_wrongly_is_said(urdf_folder):
     placement = replace(joint.placement, translation=joint.placement.translation + ca.SX(ca.DM([0.0, 0.0, 0.001])))
     wrong = replace(robot, joints=(*robot.joints[:-1], replace(joint, placement=placement)))
     found = compare_urdf_with_pinocchio(path, wrong, GRAVITY)
-    assert not found.agrees
+    assert not found.agrees_within_rounding
     assert found.words.startswith("mixed_joints.urdf as read differs from Pinocchio's: ")
 
 
@@ -117,8 +117,8 @@ def test_a_lock_at_another_value_is_noticed(urdf_folder):
     path = urdf_folder / "mixed_joints.urdf"
     kept = ["extend", "hinge", "spin", "swing"]
     robot = read_urdf(path, joints=kept, locked={"nod": 0.7})
-    assert compare_urdf_with_pinocchio(path, robot, GRAVITY, kept, {"nod": 0.7}).agrees
-    assert not compare_urdf_with_pinocchio(path, robot, GRAVITY, kept, {"nod": 0.6}).agrees
+    assert compare_urdf_with_pinocchio(path, robot, GRAVITY, kept, {"nod": 0.7}).agrees_within_rounding
+    assert not compare_urdf_with_pinocchio(path, robot, GRAVITY, kept, {"nod": 0.6}).agrees_within_rounding
 
 
 @pytest.mark.parametrize(
@@ -126,12 +126,14 @@ def test_a_lock_at_another_value_is_noticed(urdf_folder):
     [("package:panda", ["panda_hand"], None), ("double_pendulum.urdf", ["lower"], ["shoulder"])],
 )
 def test_what_is_left_out_of_a_file_is_left_out_of_both(urdf_folder, file, left_out, joints):
-    path = example_robot_urdf("panda") if file.startswith("package:") else urdf_folder / file
+    path = _example_robot_urdf("panda") if file.startswith("package:") else urdf_folder / file
     robot = read_urdf(path, joints=joints, exclude_links=left_out)
     found = compare_urdf_with_pinocchio(path, robot, GRAVITY, joints, None, left_out)
-    assert found.agrees, found.words
+    assert found.agrees_within_rounding, found.words
     whole = read_urdf(path, joints=robot.joint_names)
-    assert not compare_urdf_with_pinocchio(path, whole, GRAVITY, robot.joint_names, None, left_out).agrees
+    assert not compare_urdf_with_pinocchio(
+        path, whole, GRAVITY, robot.joint_names, None, left_out
+    ).agrees_within_rounding
 
 
 def test_a_file_that_pinocchio_does_not_read_is_said(tmp_path, urdf_folder):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.analysis.step_diagnostics import (
-    ParameterDependence,
+    ParameterEquationDependence,
     linearise_step_equations,
     parameter_dependences,
 )
@@ -23,7 +23,7 @@ from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.model_functions import NodeValues
+from yid_ocp.problem.model_functions import NodeStateValues
 
 STD = 2e-3
 STEPS = 60
@@ -164,9 +164,9 @@ def rolled_out(problem, rest, theta):
     for samples in episode.measurements:
         std = np.nanmedian(samples.std, axis=0)
         effort = np.zeros((STEPS + 1, step.sizes["n"]))
-        effort[:, list(system.prescribed_indices)] = rollout.effort
-        values = NodeValues.along_trajectory(step, rollout.state[:-1], effort)
-        found.append(problem.model_functions.compiled_sensor(samples.sensor)(values, theta).output / std)
+        effort[:, list(system.prescribed_coordinate_indices)] = rollout.effort
+        values = NodeStateValues.from_trajectory(step, rollout.state[:-1], effort)
+        found.append(problem.model_functions.compiled_sensor_function(samples.sensor)(values, theta).output / std)
     return found
 
 
@@ -245,5 +245,5 @@ MANY = (*(f"del[{i}]" for i in range(5)), *(f"p1[{i}]" for i in range(4)))
     ],
 )
 def test_words(changes, words):
-    made = ParameterDependence("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
+    made = ParameterEquationDependence("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
     assert replace(made, **changes).words == words

@@ -11,11 +11,11 @@ import pytest
 from made_models import Formula, estimate
 
 from yid_ocp.analysis.discretisation import (
-    DiscretisationShift,
-    RefinedProblem,
-    discretisation_shifts,
-    inflate_estimates,
-    joint_subdivision,
+    DiscretisationEstimateShift,
+    FinerDiscretisationProblem,
+    discretisation_estimate_shifts,
+    fine_joints_by_coarse_joint,
+    inflate_estimates_by_discretisation,
 )
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
@@ -38,7 +38,9 @@ def problem(rows, start, shared=None, **more):
 def shifts(coarse, finer, factors=None, **more):
     """Of the coarse problem's parameters at its initial values."""
     x = coarse.initial_unknowns
-    return discretisation_shifts(RefinedProblem(finer, factors or {}), coarse, x, coarse.evaluate(x), **more)
+    return discretisation_estimate_shifts(
+        FinerDiscretisationProblem(finer, factors or {}), coarse, x, coarse.evaluate(x), **more
+    )
 
 
 @pytest.mark.parametrize("factor", [1.0, 2.0])
@@ -81,14 +83,14 @@ def chain(links):
 
 def test_divided_links_share_their_angle():
     coarse, fine = chain(2), chain(4)
-    divided = joint_subdivision(coarse, fine)
+    divided = fine_joints_by_coarse_joint(coarse, fine)
     assert divided == {
         "T1_0_x": ("T1_0_x", "T1_1_x"),
         "T1_0_y": ("T1_0_y", "T1_1_y"),
         "T1_1_x": ("T1_2_x", "T1_3_x"),
         "T1_1_y": ("T1_2_y", "T1_3_y"),
     }
-    assert joint_subdivision(coarse, coarse) == joint_subdivision(fine, coarse) == {}
+    assert fine_joints_by_coarse_joint(coarse, coarse) == fine_joints_by_coarse_joint(fine, coarse) == {}
 
 
 def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
@@ -110,8 +112,10 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
             SimpleNamespace(equilibrium_guess=None),
         ),
     )
-    refined = RefinedProblem(fine, {"a": 2.0, "c": 3.0}, joint_subdivision(coarse.system, fine.system))
-    discretisation_shifts(refined, coarse, coarse.initial_unknowns, at)
+    refined = FinerDiscretisationProblem(
+        fine, {"a": 2.0, "c": 3.0}, fine_joints_by_coarse_joint(coarse.system, fine.system)
+    )
+    discretisation_estimate_shifts(refined, coarse, coarse.initial_unknowns, at)
     [(x, (warm, none))] = asked
     point = dict(zip(fine.unknown_names, x, strict=True))
     assert point == {"a": 3.0, "c[run]": 6.0, "b": 7.0, **dict(zip(names, (0.2, 0.2, 0.0, 0.0), strict=True))}
@@ -134,7 +138,7 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     ids=["not tried", "within it", "links", "time step", "both"],
 )
 def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_is(links, time_step, std):
-    assert DiscretisationShift(links, time_step).inflated_std(0.1) == pytest.approx(std)
+    assert DiscretisationEstimateShift(links, time_step)._inflated_std(0.1) == pytest.approx(std)
 
 
 @pytest.mark.parametrize(
@@ -154,7 +158,9 @@ def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_
 def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
     """Of a value of 10 and a standard deviation of 0.02: ten percent are reached by a move of half of them."""
     said = {"a": estimate(10.0, 0.02, verdict=before), "b": estimate(10.0, 0.02), "c": estimate(3.0, 0.0, free=False)}
-    found = inflate_estimates(said, {"c": DiscretisationShift(9.0), "a": DiscretisationShift(move)}, {})
+    found = inflate_estimates_by_discretisation(
+        said, {"c": DiscretisationEstimateShift(9.0), "a": DiscretisationEstimateShift(move)}, {}
+    )
     assert found["a"].verdict == after
     assert found["a"].std == (0.02 if move < 0.02 else pytest.approx(math.hypot(0.02, 2 * move)))
     assert found["b"] == said["b"]
@@ -175,7 +181,7 @@ def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
 )
 def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected):
     said = replace(estimate(10.0, 0.2), interval=interval, lower=0.0, upper=20.0)
-    found = inflate_estimates({"a": said}, {"a": DiscretisationShift(0.3)}, {})["a"].interval
+    found = inflate_estimates_by_discretisation({"a": said}, {"a": DiscretisationEstimateShift(0.3)}, {})["a"].interval
     if expected is None:
         assert found is None
     else:
@@ -184,7 +190,7 @@ def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected)
 
 def test_what_nothing_informs_stays_unknown():
     said = {"a": estimate(10.0, math.inf, verdict="not_identifiable")}
-    assert inflate_estimates(said, {"a": DiscretisationShift(5.0, 5.0)}, {}) == said
+    assert inflate_estimates_by_discretisation(said, {"a": DiscretisationEstimateShift(5.0, 5.0)}, {}) == said
 
 
 # -- on a real chain --------------------------------------------------------------------------------------------------
@@ -201,7 +207,7 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     )
     found = solve(coarse, GaussNewton())
     finer = solve(fine, GaussNewton(), initial_unknowns=found.x)
-    own = discretisation_shifts(RefinedProblem(fine), coarse, found.x, found.evaluation)
+    own = discretisation_estimate_shifts(FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
     change = finer.x - found.x
     assert np.abs(change).max() > 1e-5
     np.testing.assert_allclose(

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.joint_checks import RecordedJointsModel, check_dynamic_excitation, check_joint_excitation
+from yid_ocp.analysis.joint_checks import RecordedJointsModel, check_inertial_effort_excitation, check_joint_excitation
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
@@ -30,22 +30,22 @@ def moved(arm: RecordedJointsModel, hertz: float, size: float = 0.3, noise: floa
     phase = 2 * np.pi * hertz * t[:, None] + np.array([0.0, 1.0])
     rate = 2 * np.pi * hertz
     q, v, a = size * np.sin(phase), size * rate * np.cos(phase), -size * rate**2 * np.sin(phase)
-    effort = arm.inverse_dynamics(q, v, a) + noise * rng.standard_normal(q.shape)
+    effort = arm._inverse_dynamics(q, v, a) + noise * rng.standard_normal(q.shape)
     return Recording(JointGroup(arm.joint_names, t, q, effort=effort, effort_std=noise), name="run")
 
 
 @pytest.mark.parametrize(("hertz", "said"), [(0.02, True), (0.5, False), (1.0, False)])
 def test_a_motion_so_slow_that_only_postures_tell(arm, hertz, said):
     for seed in range(3):
-        found = list(check_dynamic_excitation(arm, moved(arm, hertz, 0.03, seed=seed), USUAL))
+        found = list(check_inertial_effort_excitation(arm, moved(arm, hertz, 0.03, seed=seed), USUAL))
         assert [(d.cause, d.weight) for d in found] == ([("weak_excitation", "warning")] if said else [])
 
 
 def test_less_noise_sees_more_and_efforts_that_nobody_uses_do_not_count(arm):
     slow = moved(arm, 0.02, 0.03)
-    assert list(check_dynamic_excitation(arm, slow, replace(USUAL, std=1e-4))) == []
-    assert len(list(check_dynamic_excitation(arm, slow, replace(USUAL, std=10.0)))) == 1
-    assert list(check_dynamic_excitation(arm, slow, replace(USUAL, use=False))) == []
+    assert list(check_inertial_effort_excitation(arm, slow, replace(USUAL, std=1e-4))) == []
+    assert len(list(check_inertial_effort_excitation(arm, slow, replace(USUAL, std=10.0)))) == 1
+    assert list(check_inertial_effort_excitation(arm, slow, replace(USUAL, use=False))) == []
 
 
 def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(arm):

@@ -16,12 +16,12 @@ from yid_ocp.analysis import experiment_design as module
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    BaseExperiment,
     CandidateExperiment,
     CandidateExperimentBuilder,
-    FrameObservation,
+    FrameObservationSchedule,
+    RecordedExperiment,
+    add_observable_frames_to_step,
     observable_frames,
-    with_observable_frames,
 )
 from yid_ocp.analysis.identifiability import identifiability, with_grasp_offset_effects, with_nuisance_unknowns
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -59,8 +59,8 @@ def holding(urdf_folder):
 def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
     for (found, times, std), name, usual in (
-        (made.camera_sampling(episode), camera, (np.arange(7) / 3.0, 5e-3)),
-        (made.arm_sampling(episode), arm, (0.1 * np.arange(21), 1e-3)),
+        (made.camera_sample_times_and_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
+        (made.arm_sample_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
     ):
         assert (None if found is None else found.name) == name
         np.testing.assert_allclose(times, [0.0, 0.5, 1.0] if name else usual[0], atol=1e-12)
@@ -71,12 +71,12 @@ def test_the_typical_noise_is_the_median_or_the_stated_one():
     std = np.full((3, 2, 3), 2e-3)
     std[0] = [9e-3, np.nan, 9e-3]
     made, episode = setting(group(std=std))
-    assert made.camera_sampling(episode)[2] == 2e-3
+    assert made.camera_sample_times_and_std(episode)[2] == 2e-3
     made, episode = setting(group(std=None), sensors={"points_camera": SensorOptions(std=3e-3)})
-    assert made.camera_sampling(episode)[2] == 3e-3
+    assert made.camera_sample_times_and_std(episode)[2] == 3e-3
     unknown, episode = setting(group(std=None))
     with pytest.raises(DataError, match="the noise level of group 'points_camera' is not known"):
-        unknown.recorded_observations(episode)
+        unknown.existing_sensor_observations(episode)
 
 
 def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen():
@@ -91,7 +91,7 @@ def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen
     chosen, episode = setting(
         replace(made, position=position), group("points_arm"), group("points_off"), sensors=sensors
     )
-    found = chosen.recorded_observations(episode)
+    found = chosen.existing_sensor_observations(episode)
     assert [(view.point_group, view.frame) for view in found] == [
         ("points_camera", "a"),
         ("points_camera", "tip"),
@@ -115,7 +115,7 @@ def sloped():
 
 
 def view(times, std, frame="a"):
-    return FrameObservation("camera", frame, np.array(times), np.array(std, float) * np.ones((len(times), 3)))
+    return FrameObservationSchedule("camera", frame, np.array(times), np.array(std, float) * np.ones((len(times), 3)))
 
 
 @pytest.mark.parametrize(
@@ -228,10 +228,10 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
     sensor = SimpleNamespace(effort_joints=made["measured"])
     recording = SimpleNamespace(joints=object() if made["joints"] else None)
     episode = SimpleNamespace(measurements=(SimpleNamespace(sensor=sensor),), recording=recording)
-    base = BaseExperiment(
+    base = RecordedExperiment(
         SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=made.get("second")
     )
-    assert CandidateExperimentBuilder(base).applicable_changes() == possible.split()
+    assert CandidateExperimentBuilder(base).applicable_mechanical_changes() == possible.split()
 
 
 @pytest.fixture(scope="module")
@@ -257,7 +257,7 @@ def swung(urdf_folder):
 def built(problem, *mechanics, heard=None, **settings):
     """The builder of a problem's variants, and the variant with these changes."""
     made = CandidateExperimentBuilder(
-        BaseExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
+        RecordedExperiment(problem, problem.initial_unknowns, **settings), *([heard] if heard else [])
     )
     found = made.build_experiment(frozenset(mechanics))
     assert not isinstance(found, str), found
@@ -266,7 +266,7 @@ def built(problem, *mechanics, heard=None, **settings):
 
 def informed(problem, *mechanics):
     made, found = built(problem, *mechanics)
-    views = [made.setting.recorded_observations(episode) for episode in problem.episodes]
+    views = [made.setting.existing_sensor_observations(episode) for episode in problem.episodes]
     return found, found.fisher_information(views)
 
 
@@ -322,7 +322,7 @@ def test_every_frame_is_in_view_at_every_node(swung):
 
 def test_more_frames_need_no_new_equations(swung):
     step = swung().step
-    more, seen = with_observable_frames(step)
+    more, seen = add_observable_frames_to_step(step)
     assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
     assert more.kernel is step.kernel
     assert built(swung())[1].problem.step.kernel is step.kernel
@@ -331,7 +331,7 @@ def test_more_frames_need_no_new_equations(swung):
 def test_what_cannot_be_evaluated_is_no_variant(swung):
     problem = swung()
     x = np.array([np.nan, 0.1])
-    found = CandidateExperimentBuilder(BaseExperiment(problem, x)).build_experiment(frozenset())
+    found = CandidateExperimentBuilder(RecordedExperiment(problem, x)).build_experiment(frozenset())
     assert found == "elbow.stiffness = nan is not a finite number"
 
 
@@ -435,7 +435,7 @@ def test_another_motion_starts_where_the_recording_does(driven, monkeypatch, nam
         whole = np.hstack([angles, np.zeros((101, system.n_coordinates - 2))])
         return SimpleNamespace(t=t, q=whole, effort=np.tile(effort, (101, 1)))
 
-    monkeypatch.setattr(module, "random_multisine", draw)
+    monkeypatch.setattr(module, "random_multisine_motion", draw)
     monkeypatch.setattr(module, "simulate_in_mujoco", simulate)
     _, made = built(driven, name)
     assert made.feasibility_notes == note

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from formula_reader import FUNCTIONS, read, read_latex
 
-from yid_ocp.analysis.step_symbols import SymbolName, count_operations, format_expressions
+from yid_ocp.analysis.step_symbols import _SymbolName, count_operations, format_expressions
 
 X = ca.SX.sym("x", 4)
 A, B, C, D = ca.vertsplit(X)
-NAMES = [SymbolName(f"v[{i}]", f"v_{{{i}}}") for i in range(4)]
+NAMES = [_SymbolName(f"v[{i}]", f"v_{{{i}}}") for i in range(4)]
 POINT = np.array([0.7, -1.3, 2.1, 0.4])
 EXPRESSIONS = {
     "sums": A - (B - C) - (-D) + 2.5,

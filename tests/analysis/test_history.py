@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from yid_ocp.analysis.estimate_history import RunEstimates, assess_drift, nearest_positive_definite, pool_estimates
+from yid_ocp.analysis.estimate_history import (
+    RunEstimates,
+    assess_drift,
+    nearby_positive_definite_covariance,
+    pool_estimates,
+)
 
 COVARIANCE = np.array([[4.0, 1.5], [1.5, 1.0]]) * 1e-4
 
@@ -91,6 +96,6 @@ def test_of_two_runs_that_differ_neither_is_distrusted():
 
 def test_a_covariance_without_full_rank_can_be_inverted_and_keeps_its_standard_deviations():
     flat = np.array([[1.0, 1.0], [1.0, 1.0]]) * np.outer([1e-3, 1e4], [1e-3, 1e4])
-    found = nearest_positive_definite(flat)
+    found = nearby_positive_definite_covariance(flat)
     assert np.sqrt(np.diag(found)) == pytest.approx([1e-3, 1e4], rel=1e-9)
     assert np.all(np.isfinite(np.linalg.cholesky(found)))

@@ -12,10 +12,10 @@ import pytest
 from made_recordings import holding_pendulum
 
 from yid_ocp.analysis.sparsity_patterns import (
-    NamedRange,
+    NamedIndexRange,
     SparsityPattern,
-    kkt_pattern,
-    kkt_size,
+    full_nlp_size,
+    kkt_sparsity_pattern,
     nlp_stage_sparsity,
     step_sparsity_patterns,
 )
@@ -51,12 +51,12 @@ def test_patterns_of_a_step_hold_its_matrices(step):
     rest = EquilibriumSolver(step).solve(np.array([0.3, -0.6]), theta, None)
     assert rest.is_converged
     state = rest.state + 1e-3 * rng.normal(size=sizes["nx"])
-    path = state[list(step.system.prescribed_indices)]
+    path = state[list(step.system.prescribed_coordinate_indices)]
     torque = rest.holding_torque + rng.normal(size=sizes["nu"])
     pair = (path, path) if len(path) else None
     a, b_input, b_theta = step.jacobians(state[:n], state[n : 2 * n], torque, theta, pair, state[2 * n :])
     rows = linearise_step_equations(step, state, torque, theta, path)
-    kept = np.setdiff1d(np.arange(rows.residual_by_new.shape[1]), step.system.prescribed_indices)
+    kept = np.setdiff1d(np.arange(rows.residual_by_new.shape[1]), step.system.prescribed_coordinate_indices)
     found = step_sparsity_patterns(symbols)
     for name, matrix in (
         ("A", a),
@@ -70,10 +70,10 @@ def test_patterns_of_a_step_hold_its_matrices(step):
         assert pattern.nonzero_mask.shape == matrix.shape, name
         outside = (np.abs(matrix) > 1e-13 * np.abs(matrix).max(initial=0.0)) & ~pattern.nonzero_mask
         assert not np.any(outside), [(pattern.row_labels[i], pattern.column_labels[j]) for i, j in np.argwhere(outside)]
-        marked = pattern.with_marked_nonzeros(matrix, "here")
+        marked = pattern.with_numerical_nonzeros_marked(matrix, "here")
         assert np.count_nonzero(marked.marked_mask & pattern.nonzero_mask) > 0.5 * pattern.n_nonzeros
         assert marked.mark_label == "not zero at here"
-    assert not np.any(found["A"].nonzero_mask[list(step.system.prescribed_indices)])
+    assert not np.any(found["A"].nonzero_mask[list(step.system.prescribed_coordinate_indices)])
 
 
 def test_blocks_cover_rows_and_columns(step):
@@ -130,10 +130,10 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
     followed = () if episode.tracking_feedback is None else tuple(episode.tracking_feedback.state_indices)
     sensors = [samples.sensor for samples in episode.measurements]
     stage = nlp_stage_sparsity(
-        symbols, problem.shared_parameters, sensors, followed, problem.predictor.estimated_state_indices
+        symbols, problem.shared_parameters, sensors, followed, problem.predictor.estimated_initial_state_indices
     )
     steps = episode.grid.steps
-    kkt, size = kkt_pattern(stage, steps), kkt_size(stage, [steps])
+    kkt, size = kkt_sparsity_pattern(stage, steps), full_nlp_size(stage, [steps])
     width = size["variables"]
     jacobian, curved, measured = kkt.nonzero_mask[width:, :width], kkt.nonzero_mask[:width, :width], kkt.marked_mask
     # the program has the equilibrium at the start and the torques' errors besides
@@ -171,13 +171,13 @@ def test_the_size_of_many_steps_is_that_of_the_matrices(urdf_folder):
     problem = made_problem(urdf_folder, "lqr", "equilibrium")
     symbols = StepSymbols.from_equations(problem.step.equations)
     stage = nlp_stage_sparsity(symbols, ("T1.bend",), [], (0, 1), ())
-    size, width, height, nonzeros = kkt_size(stage, [5, 7]), 0, 0, 0
+    size, width, height, nonzeros = full_nlp_size(stage, [5, 7]), 0, 0, 0
     for steps in (5, 7):
-        own = kkt_size(stage, [steps])
-        jacobian = kkt_pattern(stage, steps).nonzero_mask[own["variables"] :, : own["variables"]]
+        own = full_nlp_size(stage, [steps])
+        jacobian = kkt_sparsity_pattern(stage, steps).nonzero_mask[own["variables"] :, : own["variables"]]
         width, height, nonzeros = width + jacobian.shape[1], height + len(jacobian), nonzeros + jacobian.sum()
     assert (size["variables"], size["constraints"], size["jacobian_nonzeros"]) == (width - 1, height, nonzeros)
-    separate = sum(kkt_size(stage, [steps])["hessian_nonzeros"] for steps in (5, 7))
+    separate = sum(full_nlp_size(stage, [steps])["hessian_nonzeros"] for steps in (5, 7))
     assert separate - size["hessian_nonzeros"] == np.count_nonzero(stage.hessian_mask[:1, :1])
 
 
@@ -186,7 +186,7 @@ def test_the_kkt_matrix_is_symmetric_and_its_blocks_are_named(urdf_folder):
     symbols = StepSymbols.from_equations(problem.step.equations)
     sensors = [samples.sensor for samples in problem.episodes[0].measurements]
     stage = nlp_stage_sparsity(symbols, problem.shared_parameters, sensors, (), ())
-    kkt = kkt_pattern(stage, 2)
+    kkt = kkt_sparsity_pattern(stage, 2)
     np.testing.assert_array_equal(kkt.nonzero_mask, kkt.nonzero_mask.T)
     assert [span.name for span in kkt.row_blocks] == [
         "theta", "q0", "p0", "lam0", "q1", "p1", "lam1", "q2", "p2",
@@ -215,8 +215,8 @@ def test_the_kkt_matrix_is_symmetric_and_its_blocks_are_named(urdf_folder):
 def test_a_pattern_counts_what_can_differ():
     mask = np.array([[True, False], [True, True]])
     pattern = SparsityPattern(
-        "p", "made up", mask, (NamedRange("r", 0, 2),), (NamedRange("c", 0, 2),), ("a", "b"), ("c", "d")
+        "p", "made up", mask, (NamedIndexRange("r", 0, 2),), (NamedIndexRange("c", 0, 2),), ("a", "b"), ("c", "d")
     )
     assert pattern.n_nonzeros == 3
-    marked = pattern.with_marked_nonzeros(np.array([[2.0, 0.0], [1e-15, -1.0]]), "rest")
+    marked = pattern.with_numerical_nonzeros_marked(np.array([[2.0, 0.0], [1e-15, -1.0]]), "rest")
     np.testing.assert_array_equal(marked.marked_mask, [[True, False], [False, True]])

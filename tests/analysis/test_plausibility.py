@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.joint_checks import RecordedJointsModel, check_efforts, check_joint_limits
-from yid_ocp.analysis.point_checks import check_cable_points, check_held_points, check_point_distances
+from yid_ocp.analysis.joint_checks import RecordedJointsModel, check_efforts_by_inverse_dynamics, check_joint_limits
+from yid_ocp.analysis.point_checks import check_cable_point_geometry, check_point_distances, check_robot_held_points
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
-from yid_ocp.model.urdf import example_robot_urdf, read_urdf
+from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 
@@ -55,24 +55,26 @@ def test_inverse_dynamics_are_pinocchios():
     robot = read_urdf("package:baxter", joints=[f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")])
     system = System.build(robot, prescribed=robot.joint_names)
     arm = RecordedJointsModel.from_system(system, system.parameters.vector())
-    whole = pin.buildModelFromUrdf(str(example_robot_urdf("baxter")))
+    whole = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
     others = [whole.getJointId(name) for name in whole.names[1:] if name not in robot.joint_names]
     model = pin.buildReducedModel(whole, others, pin.neutral(whole))
     data = model.createData()
     q, v, a = np.random.default_rng(1).uniform(-1, 1, (3, 5, 7))
     expected = np.array([pin.rnea(model, data, *row) for row in zip(q, v, a, strict=True)])
-    assert np.max(np.abs(arm.inverse_dynamics(q, v, a) - expected)) < 1e-9
+    assert np.max(np.abs(arm._inverse_dynamics(q, v, a) - expected)) < 1e-9
 
 
 def test_slopes_of_places_are_their_derivatives(arms):
     arm, frames = arms[2], ("left_gripper", "right_gripper")
     q, step = np.random.default_rng(2).uniform(-1, 1, (3, 14)), 1e-6
-    _, slope = arm.frame_positions(frames, q)
+    _, slope = arm.frame_positions_and_jacobians(frames, q)
     for j in range(14):
         up, down = q.copy(), q.copy()
         up[:, j] += step
         down[:, j] -= step
-        difference = (arm.frame_positions(frames, up)[0] - arm.frame_positions(frames, down)[0]) / (2 * step)
+        difference = (
+            arm.frame_positions_and_jacobians(frames, up)[0] - arm.frame_positions_and_jacobians(frames, down)[0]
+        ) / (2 * step)
         assert np.max(np.abs(difference - slope[..., j])) < 1e-8
 
 
@@ -114,7 +116,7 @@ EFFORTS = {
 @pytest.mark.parametrize("case", EFFORTS)
 def test_efforts_beside_inverse_dynamics(arms, runs, case):
     count, change, expected = EFFORTS[case]
-    found = check_efforts(arms[count], with_joints(runs[count], effort=change))
+    found = check_efforts_by_inverse_dynamics(arms[count], with_joints(runs[count], effort=change))
     assert {doubt.cause for doubt in found} == expected
     if case == "one flipped":
         assert [doubt.channel for doubt in found] == ["effort.left_e1"]
@@ -136,16 +138,16 @@ def test_a_joint_of_which_nothing_is_asked_may_swing(repository, kind, least, ex
     v = np.stack([2 * np.cos(2 * t), 1.2 * np.cos(3 * t)], axis=1)
     a = np.stack([-4 * np.sin(2 * t), -3.6 * np.sin(3 * t)], axis=1)
     q, v, a = (values * least / 2.4 for values in (q, v, a))
-    needed = arm.inverse_dynamics(q, v, a)
+    needed = arm._inverse_dynamics(q, v, a)
     assert np.sqrt(np.mean(needed[:, 0] ** 2)) == pytest.approx(least, rel=0.3)
     effort = needed * [0.0, 1.0]
     recording = Recording(JointGroup(tuple(robot.joint_names), t, q, effort=effort, effort_kind=kind))
-    assert {doubt.cause for doubt in check_efforts(arm, recording)} == expected
+    assert {doubt.cause for doubt in check_efforts_by_inverse_dynamics(arm, recording)} == expected
 
 
 def test_a_counterbalance_that_the_urdf_does_not_have_is_no_wrong_zero(arms, runs):
     balanced = with_joints(runs[1], effort=lambda j: j.effort + 20.0 * (np.arange(7) == 1))
-    assert check_efforts(arms[1], balanced) == []
+    assert check_efforts_by_inverse_dynamics(arms[1], balanced) == []
 
 
 def test_motion_that_belongs_to_other_efforts_is_not_this_robots(arms, runs):
@@ -154,7 +156,7 @@ def test_motion_that_belongs_to_other_efforts_is_not_this_robots(arms, runs):
     system = System.build(robot, prescribed=robot.joint_names)
     free = RecordedJointsModel.from_system(system, system.parameters.vector())
     # nothing else can load an arm that holds nothing
-    assert "effort_unlike" in {doubt.cause for doubt in check_efforts(free, quick)}
+    assert "effort_unlike" in {doubt.cause for doubt in check_efforts_by_inverse_dynamics(free, quick)}
 
 
 def test_limits_of_joints(arms, runs):
@@ -187,7 +189,7 @@ HELD = {
 @pytest.mark.parametrize("case", HELD)
 def test_points_that_the_arm_holds(arms, runs, case):
     count, change, cause, words = HELD[case]
-    found = list(check_held_points(arms[count], with_points(runs[count], "points_arm", change), usual))
+    found = list(check_robot_held_points(arms[count], with_points(runs[count], "points_arm", change), usual))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     assert not found or words in found[0].what
 
@@ -196,7 +198,7 @@ def test_points_that_the_arm_holds(arms, runs, case):
 @pytest.mark.parametrize("offset", [0.05, -0.03])
 def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, offset):
     moved = with_joints(runs[1], position=lambda j: j.position + offset * (np.arange(7) == joint))
-    (doubt,) = check_held_points(arms[1], moved, usual)
+    (doubt,) = check_robot_held_points(arms[1], moved, usual)
     name = arms[1].joint_names[joint]
     assert (doubt.cause, name in doubt.setting) == ("encoder_offset", True)
     assert f"with {-offset:+.3g}"[:9] in doubt.what.replace("+0.0499", "+0.05").replace("-0.0499", "-0.05")
@@ -204,7 +206,7 @@ def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, 
 
 def test_points_on_a_late_clock(arms, runs):
     groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
-    (doubt,) = check_held_points(arms[2], replace(runs[2], points=tuple(groups)), usual)
+    (doubt,) = check_robot_held_points(arms[2], replace(runs[2], points=tuple(groups)), usual)
     assert doubt.cause == "clock_offset"
     assert "taken +0.4 s" in doubt.what
 
@@ -230,7 +232,7 @@ CLOCKS = {
 @pytest.mark.parametrize("case", CLOCKS)
 def test_a_clock_that_is_a_little_off(arms, runs, case):
     count, late, drift, cause = CLOCKS[case]
-    found = list(check_held_points(arms[count], stamped(runs[count], late, drift), usual))
+    found = list(check_robot_held_points(arms[count], stamped(runs[count], late, drift), usual))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         size, std = (float(number) for number in re.search(r"([-+\d.]+) ± ([\d.]+)", doubt.what).groups())
@@ -244,7 +246,7 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
 
 
 def test_clocks_that_run_far_apart(arms, runs):
-    (doubt,) = check_held_points(arms[1], stamped(runs[1], drift=0.05), usual)
+    (doubt,) = check_robot_held_points(arms[1], stamped(runs[1], drift=0.05), usual)
     assert doubt.cause == "clock_drift"
     assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
 
@@ -252,28 +254,28 @@ def test_clocks_that_run_far_apart(arms, runs):
 def test_a_camera_that_is_late_is_answered_by_its_latency(arms, runs):
     (group,) = stamped(runs[1], 0.03).points[:1]
     seen = replace(group, name="points_camera", sensor="camera")
-    (doubt,) = check_held_points(arms[1], replace(runs[1], points=(seen,)), usual)
+    (doubt,) = check_robot_held_points(arms[1], replace(runs[1], points=(seen,)), usual)
     assert re.search(r"kind: camera_latency, location: camera, values: {delay: 0.03\d*}", doubt.setting)
 
 
 def test_a_zero_that_is_a_little_off_is_no_clock(arms, runs):
     moved = with_joints(runs[1], position=lambda j: j.position + 0.005 * (np.arange(7) == 1))
-    assert list(check_held_points(arms[1], moved, usual)) == []
+    assert list(check_robot_held_points(arms[1], moved, usual)) == []
 
 
 def test_at_rest_nothing_tells_of_clocks(arms, runs):
     joints = runs[1].joints
     still = with_joints(runs[1], position=lambda j: np.repeat(j.position[:1], len(j.t), axis=0))
-    place = arms[1].frame_positions(("left_gripper",), joints.position[:1])[0]
+    place = arms[1].frame_positions_and_jacobians(("left_gripper",), joints.position[:1])[0]
     rng = np.random.default_rng(0)
     at_rest = with_points(still, "points_arm", lambda p: place + 1e-3 * rng.standard_normal(p.shape))
-    assert list(check_held_points(arms[1], stamped(at_rest, 0.5), usual)) == []
+    assert list(check_robot_held_points(arms[1], stamped(at_rest, 0.5), usual)) == []
 
 
 def test_what_no_change_explains_is_said_so(arms, runs):
     rng = np.random.default_rng(0)
     walk = np.cumsum(0.02 * rng.standard_normal((501, 1, 3)), axis=0)
-    (doubt,) = check_held_points(arms[1], with_points(runs[1], "points_arm", lambda p: p + walk), usual)
+    (doubt,) = check_robot_held_points(arms[1], with_points(runs[1], "points_arm", lambda p: p + walk), usual)
     assert doubt.cause == "point_unlike"
 
 
@@ -316,7 +318,7 @@ def hanging(seed: int = 0) -> Recording:
     ],
 )
 def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words):
-    found = list(check_cable_points(CABLE, with_points(hanging(), "points", change), GRAVITY))
+    found = list(check_cable_point_geometry(CABLE, with_points(hanging(), "points", change), GRAVITY))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     assert not found or words in found[0].what
 
@@ -324,5 +326,5 @@ def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words):
 def test_joints_of_another_name_leave_nothing_to_compare(arms, runs):
     joints = runs[1].joints
     other = JointGroup(tuple(name.replace("left", "right") for name in joints.names), joints.t, joints.position)
-    assert not arms[1].is_recorded_in(replace(runs[1], joints=other))
-    assert arms[1].is_recorded_in(runs[1])
+    assert not arms[1].has_all_angles_recorded(replace(runs[1], joints=other))
+    assert arms[1].has_all_angles_recorded(runs[1])

@@ -11,8 +11,13 @@ import numpy as np
 import pytest
 from made_models import Formula, estimate, solution
 
-from yid_ocp.analysis.profile import CHI2_QUANTILE_95, is_small_problem, profile_likelihood, with_profile_intervals
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
+from yid_ocp.analysis.profile import (
+    CHI2_QUANTILE_95,
+    compute_profile_likelihood_interval,
+    is_small_enough_for_profiles,
+    with_profile_intervals,
+)
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 
 OPEN = dict.fromkeys("ab", (-math.inf, math.inf))
 HALF = 1.959963984540054
@@ -23,10 +28,10 @@ def profiled(problem, name="a", std=None):
     x, index = problem.initial_unknowns, problem.unknown_names.index(name)
     best = problem.evaluate(x)
     if std is None:
-        _, jacobian = residual_without_weak_priors(problem, best)
+        _, jacobian = linearization_without_weak_priors(problem, best)
         std = float(np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian))[index]))
     problem.asked.clear()
-    found = profile_likelihood(problem, x, index, std, best)
+    found = compute_profile_likelihood_interval(problem, x, index, std, best)
     assert tuple(x) not in problem.asked
     return found
 
@@ -291,7 +296,7 @@ def test_intervals_are_worked_out_unasked_where_they_take_no_time(parameters, un
     names = tuple(f"k{i}" for i in range(parameters))
     starts = tuple(f"start.q.joint[{i}]" for i in range(unknowns - parameters))
     problem = SimpleNamespace(unknown_names=names + starts, shared_parameters=names, local_parameters=())
-    assert is_small_problem(problem) is expected
+    assert is_small_enough_for_profiles(problem) is expected
 
 
 # -- verdicts ---------------------------------------------------------------------------------------------------------

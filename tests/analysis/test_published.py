@@ -16,7 +16,7 @@ from yid_ocp.analysis.compare import (
     PAPER_ESTIMATES,
     _load_torque_ensemble,
     explain_paper_estimates,
-    is_within_ensemble,
+    is_within_ensemble_range,
 )
 
 
@@ -63,7 +63,7 @@ def test_the_ensemble_covers_every_published_value():
     ],
 )
 def test_a_published_value_is_explained_by_members_around_it(published, values, expected):
-    assert is_within_ensemble(published, values) is expected
+    assert is_within_ensemble_range(published, values) is expected
 
 
 # -- the decision -----------------------------------------------------------------------------------------------------

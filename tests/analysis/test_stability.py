@@ -14,9 +14,9 @@ from made_recordings import places
 from yid_ocp.analysis.discretisation import (
     _MAX_GROWTH_DECADES,
     _N_CHECKED_NODES,
-    StepErrorGrowth,
+    AlternatingErrorGrowth,
     _error_growth_along,
-    largest_error_growth,
+    largest_alternating_error_growth,
 )
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.rollout import simulate
@@ -28,7 +28,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
 from yid_ocp.workflow import solve as solve_command
-from yid_ocp.workflow.solve import with_stability_check
+from yid_ocp.workflow.solve import stability_checked_solution
 
 H = 0.01
 
@@ -37,7 +37,7 @@ def made(matrices, *, by_torque=None, fixed=(), finite=None):
     """A step whose A is given node by node, of two coordinates, and a rollout that stays where it is."""
     count = len(matrices)
     step = SimpleNamespace(
-        system=SimpleNamespace(n_coordinates=2, prescribed_indices=fixed),
+        system=SimpleNamespace(n_coordinates=2, prescribed_coordinate_indices=fixed),
         sizes={"nx": 4},
         time_step=H,
         jacobians=lambda q, p, u, theta, prescribed, z, names: (
@@ -118,7 +118,7 @@ def test_a_rollout_that_failed_counts_as_far_as_it_got():
     step, rollout = made([diagonal(-1.2, 0, 0, 0)] * 20, finite=8)
     assert growth(step, rollout).growth_decades == pytest.approx(7 * np.log10(1.2))
     step, rollout = made([diagonal(-1.2, 0, 0, 0)] * 20, finite=1)
-    assert growth(step, rollout) == StepErrorGrowth("motion", 0.0, 0.0, 0.0, H)
+    assert growth(step, rollout) == AlternatingErrorGrowth("motion", 0.0, 0.0, 0.0, H)
     broken = [diagonal(-1.2, 0, 0, 0)] * 5 + [np.full((4, 4), np.nan)] * 5
     assert growth(*made(broken)).growth_decades == pytest.approx(5 * np.log10(1.2))
 
@@ -127,7 +127,7 @@ def test_a_rollout_that_failed_counts_as_far_as_it_got():
     ("decades", "stable"), [(0.0, True), (_MAX_GROWTH_DECADES, True), (_MAX_GROWTH_DECADES + 0.1, False)]
 )
 def test_what_is_said(decades, stable):
-    said = StepErrorGrowth("run", decades, 1.29, 0.35, 0.005)
+    said = AlternatingErrorGrowth("run", decades, 1.29, 0.35, 0.005)
     assert said.is_stable is stable
     if stable:
         assert said.description == "run: the step of 0.005 s is stable along the motion"
@@ -140,8 +140,8 @@ def test_what_is_said(decades, stable):
 
 def test_a_recording_is_judged_by_its_name(pendulum):
     problem = pendulum()
-    assert largest_error_growth(problem, problem.initial_unknowns).is_stable
-    assert largest_error_growth(problem, problem.initial_unknowns).recording_name == "twin"
+    assert largest_alternating_error_growth(problem, problem.initial_unknowns).is_stable
+    assert largest_alternating_error_growth(problem, problem.initial_unknowns).recording_name == "twin"
 
 
 # -- a light cable between two hands ----------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     assert found.status == Status.CONVERGED
     entry = found.parameters["cable.bend"]
     assert (abs(entry.value - 0.5) > 100 * entry.std) == (status == Status.STALLED)
-    judged, said = with_stability_check(problem, found)
+    judged, said = stability_checked_solution(problem, found)
     assert judged.status == status
     assert set(said) == {"start", "estimate"}
     if status == Status.STALLED:
@@ -249,17 +249,20 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     ],
 )
 def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch, before, start, estimate, after):
-    grown = {0.0: StepErrorGrowth("run", start, 1.3, 0.1, H), 1.0: StepErrorGrowth("run", estimate, 1.3, 0.1, H)}
-    monkeypatch.setattr(solve_command, "largest_error_growth", lambda problem, x: grown[float(x[0])])
+    grown = {
+        0.0: AlternatingErrorGrowth("run", start, 1.3, 0.1, H),
+        1.0: AlternatingErrorGrowth("run", estimate, 1.3, 0.1, H),
+    }
+    monkeypatch.setattr(solve_command, "largest_alternating_error_growth", lambda problem, x: grown[float(x[0])])
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
-    judged, said = with_stability_check(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    judged, said = stability_checked_solution(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert judged.status == after
     assert (said["start"]["decades"], said["estimate"]["decades"]) == (start, estimate)
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
-    monkeypatch.setattr(solve_command, "largest_error_growth", lambda problem, x: None)
-    assert with_stability_check(SimpleNamespace(initial_unknowns=np.zeros(1)), found) == (
+    monkeypatch.setattr(solve_command, "largest_alternating_error_growth", lambda problem, x: None)
+    assert stability_checked_solution(SimpleNamespace(initial_unknowns=np.zeros(1)), found) == (
         found,
         {"start": None, "estimate": None},
     )

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.discretisation import min_grasp_gaps, natural_frequencies
-from yid_ocp.analysis.step_diagnostics import linearise_and_check, step_structure
+from yid_ocp.analysis.discretisation import min_grasp_closure_errors, step_map_natural_frequencies
+from yid_ocp.analysis.step_diagnostics import linearise_and_check, step_size_summary
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -39,7 +39,7 @@ def held(urdf_folder):
 
 
 def test_a_step_is_counted(swing):
-    found = step_structure(swing)
+    found = step_size_summary(swing)
     assert found["sizes"] == swing.sizes
     assert found["sizes"] | {"n": 2, "nu": 1, "nz": 0, "m": 0, "nc": 0, "nx": 4} == found["sizes"]
     assert (found["unknowns"], found["jacobian_nonzeros"]) == (2, 4)
@@ -50,7 +50,7 @@ def test_a_step_is_counted(swing):
 
 
 def test_unknowns_are_what_is_not_prescribed(held):
-    assert step_structure(held)["unknowns"] == held.sizes["n"] - 2 + held.sizes["nz"] + held.sizes["m"]
+    assert step_size_summary(held)["unknowns"] == held.sizes["n"] - 2 + held.sizes["nz"] + held.sizes["m"]
 
 
 # -- linearisation ----------------------------------------------------------------------------------------------------
@@ -61,7 +61,7 @@ def linearised(step, wrong=None):
     state = np.zeros(step.sizes["nx"])
     posture = np.array([0.3, -0.6])
     state[: step.sizes["n"]] = 0.01
-    state[list(step.system.prescribed_indices)] = posture
+    state[list(step.system.prescribed_coordinate_indices)] = posture
     if wrong is not None:
         inner, place = step.jacobians, ("A", "B_u", "B_theta").index(wrong)
 
@@ -118,7 +118,7 @@ def hanging(urdf_folder):
     def find(stiffness=3.0, damping=0.0, mode="driven", gravity=-9.81):
         more = {"gravity": (0, 0, gravity), "damping": damping, mode: ["shoulder"]}
         system = System.build(robot, springs={"elbow": RobotJointSpring(stiffness)}, point_frames=["tip"], **more)
-        return natural_frequencies(system, {"shoulder": 0.0}, system.parameters.vector(), H)
+        return step_map_natural_frequencies(system, {"shoulder": 0.0}, system.parameters.vector(), H)
 
     return find
 
@@ -138,7 +138,7 @@ def test_frequencies_of_several_joints_ascend(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     springs = {"shoulder": RobotJointSpring(30.0), "elbow": RobotJointSpring(3.0)}
     system = System.build(robot, springs=springs, damping=0.3, point_frames=["tip"])
-    found = natural_frequencies(system, {}, system.parameters.vector(), H)
+    found = step_map_natural_frequencies(system, {}, system.parameters.vector(), H)
     m1, m2, l1, c1, c2 = 1.0, 0.6, 0.5, 0.25, 0.2
     a = 0.0208 + m1 * c1**2 + m2 * (l1**2 + c2**2 + 2 * l1 * c2) + 0.008
     b, c = 0.008 + m2 * (c2**2 + l1 * c2), INERTIA
@@ -158,7 +158,7 @@ def test_what_leaves_its_posture_grows(hanging):
 def test_what_cannot_swing_says_so(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     system = System.build(robot, driven=["shoulder"], prescribed=["elbow"], point_frames=["tip"])
-    found = natural_frequencies(system, {}, system.parameters.vector(), H)
+    found = step_map_natural_frequencies(system, {}, system.parameters.vector(), H)
     assert (len(found.frequencies_hz), found.n_unstable_modes) == (0, 0)
     assert found.message == "every coordinate is prescribed, nothing can swing"
 
@@ -188,19 +188,19 @@ def reaching(urdf_folder):
 )
 def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
     system = reaching(x)
-    found = min_grasp_gaps(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
+    found = min_grasp_closure_errors(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
     assert set(found) == {"hand"}
     assert found["hand"] == pytest.approx(gap, abs=2e-3)
 
 
 def test_systems_without_grasps_have_no_gaps(reaching):
     system = reaching(grasps=0)
-    assert min_grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}
+    assert min_grasp_closure_errors(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}
 
 
 def test_each_grasp_has_its_gap(reaching):
     """Tip at 0.3 m and elbow at 0.7 m above the ground, of a rod of 0.6 m whose middle link ends at 0.4 m."""
     system = reaching(grasps=2)
-    found = min_grasp_gaps(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
+    found = min_grasp_closure_errors(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
     assert list(found) == ["hand", "other"]
     assert min(found.values()) > 0.05

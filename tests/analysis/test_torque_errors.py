@@ -10,12 +10,12 @@ import pytest
 
 from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis import torque_error_propagation as module
-from yid_ocp.analysis.experiment_design import BaseExperiment, CandidateExperimentBuilder
+from yid_ocp.analysis.experiment_design import CandidateExperimentBuilder, RecordedExperiment
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.what_if import what_if
 from yid_ocp.data.recording import PointGroup
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
-from yid_ocp.inference.whitening import whitened_at, without_input_errors
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.whitening import problem_whitened_at, problem_without_input_errors
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.workflow.build_problem import load_problem
 
@@ -34,9 +34,11 @@ def made(monkeypatch):
         for _ in range(STEPS)
     ]
     monkeypatch.setattr(module, "linearized_steps", lambda *_: steps)
-    monkeypatch.setattr(module, "torque_error_feedthrough", lambda gain, momentum: np.eye(NU))
+    monkeypatch.setattr(module, "applied_torque_error_feedthrough", lambda gain, momentum: np.eye(NU))
     monkeypatch.setattr(module, "_INITIAL_RANDOM_SAMPLES", 8)
-    functions = SimpleNamespace(step=None, momentum_shift=SimpleNamespace(momentum_by_torque=lambda theta: None))
+    functions = SimpleNamespace(
+        step=None, momentum_shift=SimpleNamespace(momentum_derivative_by_torque=lambda theta: None)
+    )
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(
         model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,
@@ -117,7 +119,7 @@ def ranking(noisy):
 
 
 def test_the_experiment_as_it_is_knows_the_noise_of_its_torques(noisy, ranking):
-    told, exact = relative(noisy), relative(without_input_errors(noisy))
+    told, exact = relative(noisy), relative(problem_without_input_errors(noisy))
     for name, std in told.items():
         assert ranking.unchanged_experiment.std_relative[name] == pytest.approx(std, rel=0.02)
         assert std > 1.2 * exact[name]
@@ -150,22 +152,22 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
     # what is there tells of errors of torques too: those that the real recording tells of
     effort, errors = (
         recording.joints.effort.copy(),
-        whitened_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors,
+        problem_whitened_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors,
     )
     effort[: len(errors.torque_noise)] -= errors.total_torque_error
     faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
     problem = EstimationProblem(
         noisy.step, [faster], noisy.free, noisy.options, noisy.named_values(noisy.initial_unknowns)
     )
-    weighted = whitened_at(problem, problem.initial_unknowns)
-    jacobian = residual_without_weak_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]
+    weighted = problem_whitened_at(problem, problem.initial_unknowns)
+    jacobian = linearization_without_weak_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]
     std = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))) / problem.initial_unknowns
     for name, value in zip(problem.unknown_names, std, strict=True):
         assert predicted.std_relative[name] == pytest.approx(value, rel=0.02)
 
 
 def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
-    builder = CandidateExperimentBuilder(BaseExperiment(noisy, noisy.initial_unknowns))
+    builder = CandidateExperimentBuilder(RecordedExperiment(noisy, noisy.initial_unknowns))
     made = builder.build_experiment(frozenset({"motion"}))
     assert not isinstance(made, str), made
     own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].input_errors

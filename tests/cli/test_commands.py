@@ -13,7 +13,7 @@ import sys
 import h5py
 import pytest
 
-from yid_ocp.analysis.pinocchio_comparison import PinocchioComparison
+from yid_ocp.analysis.pinocchio_comparison import _PinocchioComparison
 from yid_ocp.cli import COMMANDS
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
@@ -362,7 +362,7 @@ def test_a_wrong_entry_leaves_nothing_behind(cli, pendulum, tmp_path, entry, sai
 
 
 def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulum, monkeypatch):
-    otherwise = PinocchioComparison("double_pendulum.urdf as read", 0.03, 0.0, 0.0)
+    otherwise = _PinocchioComparison("double_pendulum.urdf as read", 0.03, 0.0, 0.0)
     monkeypatch.setattr("yid_ocp.workflow.check.compare_urdf_with_pinocchio", lambda *arguments, **more: otherwise)
     done = cli("check", pendulum, "--out", "c")
     assert done.code == 0, done.err

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from yid_ocp.config.reader import settable_keys
+from yid_ocp.config.reader import settable_keys_with_prefix
 
 pytest.importorskip("argcomplete")
 FILE = "model: {object: {kind: foam_y}}\nparameters:\n  T1.bend: {free: true}\n  T1.twist: {}\n"
@@ -52,14 +52,16 @@ def test_commands_options_files_and_settings_are_completed(tmp_path):
 def test_keys_that_may_be_set(tmp_path):
     file = tmp_path / "run.yaml"
     file.write_text(FILE)
-    assert settable_keys("problem.ti") == ["problem.time_step="]
-    assert settable_keys("mod") == ["model."]
-    assert settable_keys("parameters.", file) == ["parameters.T1.bend.", "parameters.T1.twist."]
-    assert "parameters.T1.bend.free=" in settable_keys("parameters.T1.bend.", file)
-    assert settable_keys("parameters.") == settable_keys("nothing.") == []
-    assert settable_keys("compare.methods.multi") == ["compare.methods.multiple_shooting."]
-    assert "model.object.links=" in settable_keys("model.object.l", file)
-    assert "compare.methods.multiple_shooting.condensing=" in settable_keys("compare.methods.multiple_shooting.")
+    assert settable_keys_with_prefix("problem.ti") == ["problem.time_step="]
+    assert settable_keys_with_prefix("mod") == ["model."]
+    assert settable_keys_with_prefix("parameters.", file) == ["parameters.T1.bend.", "parameters.T1.twist."]
+    assert "parameters.T1.bend.free=" in settable_keys_with_prefix("parameters.T1.bend.", file)
+    assert settable_keys_with_prefix("parameters.") == settable_keys_with_prefix("nothing.") == []
+    assert settable_keys_with_prefix("compare.methods.multi") == ["compare.methods.multiple_shooting."]
+    assert "model.object.links=" in settable_keys_with_prefix("model.object.l", file)
+    assert "compare.methods.multiple_shooting.condensing=" in settable_keys_with_prefix(
+        "compare.methods.multiple_shooting."
+    )
 
 
 def test_without_the_package_the_command_says_so_and_the_shell_gets_nothing(cli, monkeypatch):

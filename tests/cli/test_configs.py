@@ -7,7 +7,7 @@ import json
 import pytest
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.workflow.run_inputs import recording_path
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
 # settings that make each run quick: fewer links, a short horizon, interpreted where that is faster than compiling
@@ -74,7 +74,9 @@ def test_configuration_runs(cli, repository, tmp_path, name):
     file = configurations(repository)[name]
     run = load_config(file)
     missing = [
-        path for path in (*run.recordings.estimate, *run.recordings.held_out) if not recording_path(path).is_file()
+        path
+        for path in (*run.recordings.estimate, *run.recordings.held_out)
+        if not resolve_recording_path(path).is_file()
     ]
     if missing:
         pytest.skip(f"its recordings are not here: {missing[0]}")
@@ -109,7 +111,7 @@ WITHHELD = {
 @pytest.mark.parametrize("what", sorted(WITHHELD))
 def test_what_is_withheld_from_the_beams_model_is_named(cli, repository, tmp_path, what):
     file = configurations(repository)["panda_beam"]
-    missing = [path for path in load_config(file).recordings.estimate if not recording_path(path).is_file()]
+    missing = [path for path in load_config(file).recordings.estimate if not resolve_recording_path(path).is_file()]
     if missing:
         pytest.skip(f"its recordings are not here: {missing[0]}")
     settings, truth = WITHHELD[what]

@@ -11,7 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from yid_ocp.config.reader import DEFAULT_CONFIG, load_config
-from yid_ocp.config.schema import section_variants
+from yid_ocp.config.schema import section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
 from yid_ocp.options import (
@@ -19,8 +19,8 @@ from yid_ocp.options import (
     dataclass_options,
     describe_type,
     mapping_value_type,
-    sequence_entry_type,
     split_annotated,
+    tuple_entry_type,
     union_members,
 )
 from yid_ocp.solvers import GaussNewton, SteepestDescent
@@ -316,7 +316,7 @@ ANY_NUMBER = {
 
 def numbers(hint, wrap=lambda value: value, path=(), option=None):
     """Every number that a file may hold: its key, what the file around it looks like, its option's type, its bounds."""
-    sections = section_variants(hint)
+    sections = section_variants_from_annotation(hint)
     for word, kind in (sections.classes if sections is not None else {}).items():
         options = dataclass_options(kind)
         needed = {
@@ -328,14 +328,14 @@ def numbers(hint, wrap=lambda value: value, path=(), option=None):
     if sections is not None:
         return
     values = mapping_value_type(hint)
-    named = section_variants(values)
+    named = section_variants_from_annotation(values)
     if named is not None and named.selector_key == "name":
         for name in named.classes:
-            yield from numbers(named.for_name(name, "").classes[""], within(wrap, name), (*path, name))
+            yield from numbers(named.variants_for_mapping_key(name, "").classes[""], within(wrap, name), (*path, name))
     elif values is not None:
         yield from numbers(values, within(wrap, "NAME"), (*path, "NAME"), option)
     for member in union_members(hint):
-        entries, (bare, markers) = sequence_entry_type(member), split_annotated(member)
+        entries, (bare, markers) = tuple_entry_type(member), split_annotated(member)
         if entries is not None:
             yield from numbers(entries, lambda value: wrap([value]), path, option)
         if bare in (int, float):
@@ -350,7 +350,7 @@ def within(wrap, name, beside=None):
 
 def needed_value(hint):
     bare, _ = split_annotated(hint)
-    return 1.0 if bare is float else [*"abcde"] if sequence_entry_type(hint) is not None else "a"
+    return 1.0 if bare is float else [*"abcde"] if tuple_entry_type(hint) is not None else "a"
 
 
 NUMBERS = list(numbers(RunSettings))

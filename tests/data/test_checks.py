@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.channel_checks import quantization_step
-from yid_ocp.data.checks import _shared_sample_count, check_recording, duplicate_data_issue, split_at_gaps
-from yid_ocp.data.issues import ISSUE_CAUSES, Issue
+from yid_ocp.data.checks import _shared_sample_count, duplicate_data_issue, recording_quality_issues, split_at_gaps
+from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.problem.options import SensorOptions
 
@@ -54,7 +54,9 @@ def column(values, j, change):
 
 
 def causes(recording, driving=True, **sensors) -> set[str]:
-    found = check_recording(recording, lambda group: sensors.get(group.replace(".", "_"), SensorOptions()), driving)
+    found = recording_quality_issues(
+        recording, lambda group: sensors.get(group.replace(".", "_"), SensorOptions()), driving
+    )
     assert all(doubt.recording == recording.name and doubt.advice and doubt.evidence >= 1 for doubt in found)
     return {doubt.cause for doubt in found}
 
@@ -150,7 +152,7 @@ def test_noise_that_settings_state_counts_instead_of_the_recorded():
 
 def test_noise_stated_far_above_what_is_there():
     recording = changed(made(), effort_std=np.array([1.0, 0.05, 1.0]))
-    (doubt,) = check_recording(recording, lambda _: SensorOptions())
+    (doubt,) = recording_quality_issues(recording, lambda _: SensorOptions())
     assert (doubt.cause, doubt.weight, doubt.group) == ("noise_overstated", "warning", "joints")
     assert re.fullmatch(r"sensors.joints.effort.std: {a: 0.0[56]\d*, b: 0.05, c: 0.0[56]\d*}", doubt.setting)
     assert "1 is stated, and so for 2 of 3 channels" in doubt.what
@@ -231,7 +233,7 @@ def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():
     words = [Issue("gap", "", "warning", evidence, "", "r").certainty_word for evidence in (0.5, 1.6, 4.0)]
     assert words == ["perhaps", "likely", "certain"]
     assert Issue("gap", "", "warning", np.inf, "", "r", "joints", "t", 1.0, 2.0).where == "r/joints/t, 1 to 2 s"
-    assert len(set(ISSUE_CAUSES.values())) == len(ISSUE_CAUSES)
+    assert len(set(ISSUE_CAUSE_DESCRIPTIONS.values())) == len(ISSUE_CAUSE_DESCRIPTIONS)
 
 
 # -- gaps -------------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.data.channel_checks import _measured_positions, median_edge_lengths
+from yid_ocp.data.channel_checks import _measured_positions, median_point_pair_distances
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError
 
@@ -17,15 +17,15 @@ def stretched(lengths: list[float], name: str = "r") -> Recording:
 
 def test_lengths_are_means_over_frames_and_medians_over_recordings() -> None:
     recordings = [stretched([1.0, 2.0, np.nan]), stretched([5.0]), stretched([3.0, 3.0])]
-    assert median_edge_lengths([("a", "b")], recordings) == {("a", "b"): 3.0}
-    assert median_edge_lengths([("a", "b")], recordings[:1], frames=1) == {("a", "b"): 1.0}
+    assert median_point_pair_distances([("a", "b")], recordings) == {("a", "b"): 3.0}
+    assert median_point_pair_distances([("a", "b")], recordings[:1], frames=1) == {("a", "b"): 1.0}
 
 
 def test_a_recording_that_never_shows_an_edge_does_not_count() -> None:
     hidden, seen = stretched([np.nan]), stretched([2.0])
-    assert median_edge_lengths([("a", "b")], [hidden, seen]) == {("a", "b"): 2.0}
+    assert median_point_pair_distances([("a", "b")], [hidden, seen]) == {("a", "b"): 2.0}
     with pytest.raises(DataError, match="edge a to b is never seen"):
-        median_edge_lengths([("a", "b")], [hidden])
+        median_point_pair_distances([("a", "b")], [hidden])
 
 
 def test_measured_positions_are_those_of_the_group() -> None:

@@ -16,13 +16,13 @@ from made_series import seeing
 
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
 from yid_ocp.diagnosis.localise import GapLocation
-from yid_ocp.diagnosis.refit import HeldOutLoss, RefitModel
+from yid_ocp.diagnosis.refit import HeldOutLoss, RefittedModel
 from yid_ocp.diagnosis.screening import (
+    AllCandidatesLinearization,
     CandidateDetectability,
-    CandidateLinearization,
     CandidateScore,
     ConfusabilityMatrix,
-    EffectSignature,
+    _EffectSignature,
 )
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -30,7 +30,7 @@ from yid_ocp.diagnosis.verdict import TransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult
 from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
-from yid_ocp.inference.smoother_model import UnknownGroup
+from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
@@ -92,16 +92,16 @@ def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTe
 # -- screening --------------------------------------------------------------------------------------------------------
 
 
-def signature(of: EffectBase, columns, noise=None, **shapes: float) -> EffectSignature:
+def signature(of: EffectBase, columns, noise=None, **shapes: float) -> _EffectSignature:
     """A signature; its noise is white unless given."""
     columns = np.asarray(columns, float)
     columns = columns[:, None] if columns.ndim == 1 else columns
     noise = columns.T @ columns if noise is None else np.atleast_2d(np.asarray(noise, float))
-    return EffectSignature(of, {f"{of.label}.{name}": value for name, value in shapes.items()}, columns, noise)
+    return _EffectSignature(of, {f"{of.label}.{name}": value for name, value in shapes.items()}, columns, noise)
 
 
-def point(residual, *signatures: EffectSignature) -> CandidateLinearization:
-    return CandidateLinearization(np.asarray(residual, float), signatures)
+def point(residual, *signatures: _EffectSignature) -> AllCandidatesLinearization:
+    return AllCandidatesLinearization(np.asarray(residual, float), signatures)
 
 
 def score(
@@ -148,14 +148,14 @@ def fit(
     std=None,
     problem=None,
     held=None,
-) -> RefitModel:
+) -> RefittedModel:
     """A refitted model; values are neutral unless given. `held`: std of amplitudes with shapes held, if others."""
     neutral = {name: value for entry in effects for name, value in entry.neutral_values.items()}
     values = neutral | dict(values or {})
     std = dict.fromkeys(values, 0.01) | dict(std or {})
     lost = loss(1.0, 1.0) if lost is None else lost
     held = {name: std[name] for entry in effects for name in entry.amplitude_names} | dict(held or {})
-    return RefitModel(values, std, held, "made up", tuple(effects), problem, cost, evaluation([1.0]), lost)
+    return RefittedModel(values, std, held, "made up", tuple(effects), problem, cost, evaluation([1.0]), lost)
 
 
 def closed(value=0.9, low=0.8, high=0.95) -> GapClosure:
@@ -163,7 +163,10 @@ def closed(value=0.9, low=0.8, high=0.95) -> GapClosure:
 
 
 def added(
-    of: EffectBase, rivals: Sequence[EffectBase] = (), fitted: RefitModel | None = None, part: GapClosure | None = None
+    of: EffectBase,
+    rivals: Sequence[EffectBase] = (),
+    fitted: RefittedModel | None = None,
+    part: GapClosure | None = None,
 ):
     """An effect that was added; it is the first of its rivals."""
     return SelectedEffect(of, fitted or fit([of]), part or closed(), (of, *rivals))
@@ -176,15 +179,15 @@ def carried(label="friction@elbow", name="a", values=(0.5, 0.9), stds=(0.01, 0.0
 
 # -- smoother ---------------------------------------------------------------------------------------------------------
 
-FORCE, OTHER_FORCE = UnknownGroup("T1", "force"), UnknownGroup("T2", "force")
+FORCE, OTHER_FORCE = SmoothedUnknownGroup("T1", "force"), SmoothedUnknownGroup("T2", "force")
 READ_FORCE, BIAS, OFFSET = (
-    UnknownGroup("elbow", "force", True),
-    UnknownGroup("camera", "bias"),
-    UnknownGroup("left", "offset"),
+    SmoothedUnknownGroup("elbow", "force", True),
+    SmoothedUnknownGroup("camera", "bias"),
+    SmoothedUnknownGroup("left", "offset"),
 )
 
 
-def trace(sources: Sequence[UnknownGroup], mean, std, recording="run", interval=0.5) -> SmoothedUnknowns:
+def trace(sources: Sequence[SmoothedUnknownGroup], mean, std, recording="run", interval=0.5) -> SmoothedUnknowns:
     """Unknowns of a recording, one column each, over even intervals."""
     mean, std = np.asarray(mean, float), np.asarray(std, float)
     edges = interval * np.arange(len(mean) + 1)
@@ -193,11 +196,11 @@ def trace(sources: Sequence[UnknownGroup], mean, std, recording="run", interval=
 
 
 def smoothed(
-    weight: Mapping[UnknownGroup, float],
+    weight: Mapping[SmoothedUnknownGroup, float],
     *,
     evidence: Mapping[str, float] | None = None,
-    variance: Mapping[UnknownGroup, float] | None = None,
-    detectable: Mapping[UnknownGroup, float] | None = None,
+    variance: Mapping[SmoothedUnknownGroup, float] | None = None,
+    detectable: Mapping[SmoothedUnknownGroup, float] | None = None,
     traces: Sequence[SmoothedUnknowns] = (),
     chi2=(200.0, 100.0),
     degrees=(100.0, 90.0),

@@ -11,7 +11,7 @@ import pytest
 
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.diagnosis import diagnose, hypotheses
-from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, TruncatedRecording
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, TruncatedHeldOutRecording
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
@@ -98,9 +98,9 @@ class Problem:
 def followed(monkeypatch):
     monkeypatch.setattr(hypotheses, "truncate_episode", lambda episode, steps: replace(episode, steps=steps))
     monkeypatch.setattr(hypotheses, "_in_blocks", lambda problem: replace(problem, held_out=("blocks",)))
-    return lambda *held, margin=0.9: AllCandidatesProblem(Problem(held_out=held), (), False).truncate_held_out(
-        {}, margin
-    )
+    return lambda *held, margin=0.9: AllCandidatesProblem(
+        Problem(held_out=held), (), False
+    ).truncate_held_out_recordings({}, margin)
 
 
 def test_what_is_followed_to_its_end_stays(followed):
@@ -116,14 +116,14 @@ def test_what_is_lost_on_the_way_is_compared_until_shortly_before(followed):
     assert kept == whole
     # found to a sixty-fourth of 500 steps, less a tenth
     assert 0.9 * (300 - 8) - 1 <= cut_short.steps <= 0.9 * 300
-    assert cut == TruncatedRecording("b", cut_short.steps * 0.01, 5.0)
+    assert cut == TruncatedHeldOutRecording("b", cut_short.steps * 0.01, 5.0)
     assert not composed.is_split_in_blocks
 
 
 def test_too_short_a_beginning_is_left_out(followed):
     composed, cuts = followed(Held("a", 500), Held("b", 500, until=100))
     assert composed.problem.held_out == (Held("a", 500),)
-    assert cuts == (TruncatedRecording("b", 0.0, 5.0),)
+    assert cuts == (TruncatedHeldOutRecording("b", 0.0, 5.0),)
     barely, _ = followed(Held("a", 500), Held("b", 500, until=130))
     assert len(barely.problem.held_out) == 2
 
@@ -132,7 +132,7 @@ def test_where_nothing_is_left_the_other_recordings_are_split(followed):
     composed, cuts = followed(Held("b", 500, until=50))
     assert composed.is_split_in_blocks
     assert composed.problem.held_out == ("blocks",)
-    assert cuts == (TruncatedRecording("b", 0.0, 5.0),)
+    assert cuts == (TruncatedHeldOutRecording("b", 0.0, 5.0),)
 
 
 def test_with_no_margin_nothing_of_it_is_kept(followed):

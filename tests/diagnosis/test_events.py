@@ -11,10 +11,16 @@ import pytest
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import diagnose
-from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, Overspeed, find_events, problem_without_events
-from yid_ocp.diagnosis.pulse_detection import DetectedPulse
+from yid_ocp.diagnosis.events import (
+    DisturbanceEvent,
+    EventSet,
+    _Overspeed,
+    find_disturbance_events,
+    problem_corrected_for_events,
+)
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.inference.null_test import sample_times
+from yid_ocp.inference.null_test import times_since_recording_start
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
@@ -54,7 +60,7 @@ class SnagSpring:
 
 
 class DisturbanceTerms:
-    """Disturbances as `SimulatorTerms`; times are since the motion's beginning."""
+    """Disturbances as `InjectedSimulatorTerms`; times are since the motion's beginning."""
 
     def __init__(self, pushes: Sequence[ForcePulse] = (), snags: Sequence[SnagSpring] = ()) -> None:
         self.pushes, self.snags, self.start, self.caught = tuple(pushes), tuple(snags), 0.0, {}
@@ -113,7 +119,7 @@ class Twin:
     def events(self, *recordings: Recording) -> EventSet:
         problem = self.problem(*recordings)
         x = solve(problem, GaussNewton()).x
-        return find_events(problem, x, problem.evaluate(x), None)
+        return find_disturbance_events(problem, x, problem.evaluate(x), None)
 
 
 @pytest.fixture(scope="module")
@@ -207,12 +213,14 @@ def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_ever
         -0.01,
         0.001,
         "N m",
-        DetectedPulse(1.0, 1.2, -0.1, False, 0.01, 1e-9),
+        DetectedForcePulse(1.0, 1.2, -0.1, False, 0.01, 1e-9),
     )
     odd = replace(
         claimed, kind="sample", channel="points_arm.tip.x", start_time=2.0, end_time=2.01, unit="m", detected_pulse=None
     )
-    monkeypatch.setattr(sys.modules["yid_ocp.diagnosis.diagnose"], "find_events", lambda *_: EventSet((claimed, odd)))
+    monkeypatch.setattr(
+        sys.modules["yid_ocp.diagnosis.diagnose"], "find_disturbance_events", lambda *_: EventSet((claimed, odd))
+    )
     rubbing = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, seed) for seed in (1, 2)]
     for share, expected in ((0.1, (odd,)), (0.0, (claimed, odd))):
         limits = Thresholds(min_event_chi2_fraction=share)
@@ -224,30 +232,32 @@ def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_ever
 def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
     problem = twin.problem(pushed)
     event = DisturbanceEvent("run_0", "elbow", "elbow", "force", 3.0, 3.4, -0.8, -0.16, 0.01, "N m")
-    cleaned = problem_without_events(problem, EventSet((event,)))
+    cleaned = problem_corrected_for_events(problem, EventSet((event,)))
     (before,), (after,) = problem.episodes[0].measurements, cleaned.episodes[0].measurements
-    t = sample_times(problem.episodes[0], before)
-    hidden = before.is_used & ~after.is_used
+    t = times_since_recording_start(problem.episodes[0], before)
+    hidden = before.used_output_mask & ~after.used_output_mask
     smear = 1 / problem.options.path_cutoff
     assert not hidden[:, 0].any()
-    assert np.array_equal(hidden[:, 1], before.is_used[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
+    assert np.array_equal(hidden[:, 1], before.used_output_mask[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
     assert (
-        problem_without_events(problem, EventSet((replace(event, recording="another"),))).episodes[0].measurements[0]
+        problem_corrected_for_events(problem, EventSet((replace(event, recording="another"),)))
+        .episodes[0]
+        .measurements[0]
         is before
     )
 
 
 def test_after_a_fall_nothing_counts(twin, pushed):
-    events = find_events(*fitted(twin.problem(pushed)), None, Thresholds(max_joint_speed=1.0))
+    events = find_disturbance_events(*fitted(twin.problem(pushed)), None, Thresholds(max_joint_speed=1.0))
     (fall,) = events.overspeeds
     assert fall.recording == "run_0"
     assert fall.joint in JOINTS
     assert all(event.end_time < fall.start_time for event in events.disturbances)
-    cleaned = problem_without_events(twin.problem(pushed), EventSet((), (Overspeed("run_0", "elbow", 3.0),)))
+    cleaned = problem_corrected_for_events(twin.problem(pushed), EventSet((), (_Overspeed("run_0", "elbow", 3.0),)))
     (samples,) = cleaned.episodes[0].measurements
-    t = sample_times(cleaned.episodes[0], samples)
-    assert not samples.is_used[t > 3.0].any()
-    assert samples.is_used[(t > 1.0) & (t < 2.0)].all()
+    t = times_since_recording_start(cleaned.episodes[0], samples)
+    assert not samples.used_output_mask[t > 3.0].any()
+    assert samples.used_output_mask[(t > 1.0) & (t < 2.0)].all()
 
 
 def fitted(problem: EstimationProblem):

@@ -11,7 +11,7 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.urdf import example_robot_urdf, read_urdf
+from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
 pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pip install pin")
@@ -34,7 +34,7 @@ CANDIDATES = (
 def robot(side: str):
     names = tuple(f"{side}_{joint}" for joint in JOINTS)
     system = System.build(read_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
-    model = pin.buildModelFromUrdf(str(example_robot_urdf("baxter")))
+    model = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
     locked = [j for j in range(1, model.njoints) if model.names[j] not in names]
     return names, compile_step(system, TIME_STEP), pin.buildReducedModel(model, locked, pin.neutral(model))
 

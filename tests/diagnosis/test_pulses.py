@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.diagnosis.pulse_detection import DetectedPulse, ForceEstimate, detect_pulses
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate, detect_force_pulses
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import benjamini_hochberg_mask
 from yid_ocp.problem.signal_filters import LowPassFilter
@@ -31,8 +31,8 @@ def bell(begin: float, end: float, size: float) -> np.ndarray:
     return size * np.sin(np.pi * part) ** 2
 
 
-def sure(of: ForceEstimate, limits: Thresholds | None = None) -> list[DetectedPulse]:
-    found, tries = detect_pulses(of, limits or Thresholds())
+def sure(of: ForceEstimate, limits: Thresholds | None = None) -> list[DetectedForcePulse]:
+    found, tries = detect_force_pulses(of, limits or Thresholds())
     real = benjamini_hochberg_mask([pulse.p_value for pulse in found], tries, 0.01)
     return sorted((p for p, r in zip(found, real, strict=True) if r), key=lambda p: p.start_time)
 
@@ -52,7 +52,7 @@ def test_pulses_are_found_with_their_windows_and_impulses_beside_a_slow_rest(see
         assert pulse.end_time == pytest.approx(end, abs=0.1)
         impulse = size * (end - begin) / 2
         assert pulse.impulse == pytest.approx(impulse, rel=0.25)
-        assert abs(pulse.impulse - impulse) < 3 * pulse.peak_std * pulse.unit_impulse
+        assert abs(pulse.impulse - impulse) < 3 * pulse.peak_std * pulse.impulse_per_unit_peak
 
 
 def test_a_pulse_that_stays_at_its_size_is_flat():
@@ -106,7 +106,7 @@ def test_a_filter_widens_what_is_seen_and_not_what_is_told():
     (pulse,) = sure(history(seen, noise=0.005, filter_cutoff=cutoff, model_error_std=0.01 + 0 * T))
     assert pulse.end_time - pulse.start_time < 0.5
     assert pulse.impulse == pytest.approx(0.8 * 0.15, rel=0.15)
-    assert pulse.evaluate_at(T, cutoff) == pytest.approx(seen, abs=0.06)
+    assert pulse.filtered_force_at(T, cutoff) == pytest.approx(seen, abs=0.06)
 
 
 def test_a_few_windows_among_many_are_chance():

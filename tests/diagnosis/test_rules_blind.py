@@ -13,12 +13,12 @@ from factories import amplitude, cases, effect, shape, signature
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.blind import (
-    CaseGenerator,
-    CaseLabel,
-    PlannedCase,
-    RecordingConditions,
-    finer_chain_parameters,
-    plan_cases,
+    BlindCaseGenerator,
+    CaseGroundTruth,
+    PlannedBlindCase,
+    SyntheticRecordingConditions,
+    plan_blind_cases,
+    scale_parameters_to_more_links,
 )
 from yid_ocp.diagnosis.blind import ensemble as module
 from yid_ocp.diagnosis.blind.ensemble import _OUT_OF_LIBRARY_SIZES, MAX_CASE_DRAWS
@@ -88,17 +88,17 @@ def drawn(monkeypatch):
     def build(seed=3, candidates=(DAMPER, FRICTION, TILT, SOLID), finer=None, failures=0, conditions=None, **given):
         build.failures = failures
         monkeypatch.setattr(module, "make_candidate_effects", lambda *_: list(candidates))
-        ensemble = CaseGenerator(problem(**given), seed, finer, conditions=conditions)
+        ensemble = BlindCaseGenerator(problem(**given), seed, finer, conditions=conditions)
         columns = {"kelvin_voigt": [[100.0]], "joint_coulomb": [[0.5]], "gravity_tilt": [[30.0, 40.0]]}
         signatures = [
-            signature(of, columns.get(of.kind, [[50.0]]), **({"s": 0.25} if of.shape_names else {}))
+            signature(of, columns.get(of.kind, [[50.0]]), **({"s": 0.25} if of.shape_parameter_names else {}))
             for of in candidates
         ]
         ensemble._detectable = tuple((s.effect, s.shape_values, s.projected_sensitivity) for s in signatures)
         return ensemble
 
-    monkeypatch.setattr(module, "run_injected_experiment", experiment)
-    monkeypatch.setattr(module, "random_multisine", multisine)
+    monkeypatch.setattr(module, "run_experiment_with_effects", experiment)
+    monkeypatch.setattr(module, "random_multisine_motion", multisine)
     build.made = made
     return build
 
@@ -160,13 +160,13 @@ def test_a_recording_says_nothing_of_what_is_in_it(drawn):
 
 
 def of_category(ensemble, category, multiple=None):
-    return ensemble.draw_case(PlannedCase(7, "one", category, multiple))
+    return ensemble.draw_planned_case(PlannedBlindCase(7, "one", category, multiple))
 
 
 @pytest.mark.parametrize("category", ["null", "finer_chain"])
 def test_clean_cases_have_nothing_injected(drawn, monkeypatch, category):
     ensemble = drawn(finer=lambda times: SimpleNamespace(fine=times))
-    monkeypatch.setattr(module, "finer_chain_parameters", lambda *_: {})
+    monkeypatch.setattr(module, "scale_parameters_to_more_links", lambda *_: {})
     case, told = of_category(ensemble, category)
     assert (told.injected, told.multiple, told.category) == ((), None, category)
     assert (case.name, told.case) == ("case_007", "case_007")
@@ -203,7 +203,9 @@ def test_a_pair_is_two_effects_of_the_largest_size(drawn, monkeypatch):
         _, told = of_category(ensemble, "pair")
         labels = [e.label for e in told.injected]
         assert len(set(labels)) == len(labels) <= 2
-    same, size = drawn(candidates=(DAMPER,))._injected(PlannedCase(0, "one", "pair", 10.0), np.random.default_rng(1))
+    same, size = drawn(candidates=(DAMPER,))._injected(
+        PlannedBlindCase(0, "one", "pair", 10.0), np.random.default_rng(1)
+    )
     assert (len(same), size) == (1, pytest.approx(0.2 * 100 / 3.858))
 
 
@@ -222,22 +224,25 @@ def test_a_motion_that_cannot_be_simulated_is_drawn_anew(drawn, monkeypatch):
 
 def test_a_case_is_the_same_whatever_was_drawn_before(drawn):
     ensemble = drawn()
-    wanted = [PlannedCase(i, "one", "single", 3.0) for i in range(4)]
-    first = [ensemble.draw_case(entry)[1] for entry in wanted]
-    assert drawn().draw_case(wanted[3])[1] == first[3]
-    assert CaseLabel.from_dict(json.loads(json.dumps(first[3].to_dict()))) == first[3]
+    wanted = [PlannedBlindCase(i, "one", "single", 3.0) for i in range(4)]
+    first = [ensemble.draw_planned_case(entry)[1] for entry in wanted]
+    assert drawn().draw_planned_case(wanted[3])[1] == first[3]
+    assert CaseGroundTruth.from_dict(json.loads(json.dumps(first[3].to_dict()))) == first[3]
     assert first[3].experiment == "one"
     assert len({json.dumps(entry.truth) for entry in first}) == 4
-    assert drawn(seed=9).draw_case(wanted[3])[1].truth != first[3].truth
+    assert drawn(seed=9).draw_planned_case(wanted[3])[1].truth != first[3].truth
     # an ensemble to calibrate by shares no case with the one that is reported
-    assert drawn(conditions=RecordingConditions(purpose="calibration")).draw_case(wanted[3])[1].truth != first[3].truth
+    assert (
+        drawn(conditions=SyntheticRecordingConditions(purpose="calibration")).draw_planned_case(wanted[3])[1].truth
+        != first[3].truth
+    )
 
 
 def test_what_is_detectable_survives_as_plain_data(drawn):
-    told = json.loads(json.dumps(drawn().detectable_effects_to_json()))
+    told = json.loads(json.dumps(drawn().detectable_effect_sizes_to_json()))
     other = drawn(seed=5)
-    other.load_detectable_effects(told)
-    assert other.detectable_effects_to_json() == told
+    other.load_detectable_effect_sizes(told)
+    assert other.detectable_effect_sizes_to_json() == told
     assert told[0] == {"effect": "kelvin_voigt@T1", "shape": {}, "columns": [[100.0]]}
     assert other._inside(np.random.default_rng(1), 3.0) == drawn()._inside(np.random.default_rng(1), 3.0)
 
@@ -256,7 +261,7 @@ def counted(plan, key):
 
 
 def test_every_sort_and_size_is_planned_and_spread_over_the_experiments():
-    plan = plan_cases(300, 3, WEIGHTS, WHOLE)
+    plan = plan_blind_cases(300, 3, WEIGHTS, WHOLE)
     assert [entry.number for entry in plan] == list(range(300))
     assert counted(plan, lambda e: e.category) == {
         "null": 60, "single": 144, "pair": 30, "outside": 30, "left_out": 18, "finer_chain": 18
@@ -271,19 +276,19 @@ def test_every_sort_and_size_is_planned_and_spread_over_the_experiments():
         assert all(abs(own[name] / total - part / 0.7) < 0.1 for name, part in WEIGHTS.items())
     assert {entry.experiment for entry in plan if entry.category == "finer_chain"} == WHOLE
     assert [entry.category for entry in plan] != sorted(entry.category for entry in plan)
-    assert plan == plan_cases(300, 3, WEIGHTS, WHOLE)
-    assert plan != plan_cases(300, 4, WEIGHTS, WHOLE)
-    assert plan != plan_cases(300, 3, WEIGHTS, WHOLE, "calibration")
+    assert plan == plan_blind_cases(300, 3, WEIGHTS, WHOLE)
+    assert plan != plan_blind_cases(300, 4, WEIGHTS, WHOLE)
+    assert plan != plan_blind_cases(300, 3, WEIGHTS, WHOLE, "calibration")
 
 
 def test_an_object_without_links_has_single_effects_instead_of_finer_chains():
-    found = counted(plan_cases(100, 1, {"bare": 1.0}), lambda e: e.category)
+    found = counted(plan_blind_cases(100, 1, {"bare": 1.0}), lambda e: e.category)
     assert found == {"null": 20, "single": 54, "pair": 10, "outside": 10, "left_out": 6}
 
 
 def test_no_case_is_no_ensemble():
     with pytest.raises(ConfigError, match="0 cases"):
-        plan_cases(0, 1, WEIGHTS)
+        plan_blind_cases(0, 1, WEIGHTS)
 
 
 # -- sizes ------------------------------------------------------------------------------------------------------------
@@ -396,7 +401,7 @@ def test_a_finer_chain_has_springs_and_dampers_as_many_times_as_strong():
         T2_damping=1.0,
     )
     finer = chain({"T1": 8, "T2": 3}, T1_bend=20.0, T1_twist=5.0, T2_bend=6.0)
-    found = finer_chain_parameters(
+    found = scale_parameters_to_more_links(
         nominal, finer, {"T1.bend": 12.0, "T1.twist": 3.0, "T2.bend": 7.0, "T2.damping": 2.0}
     )
     assert found == {

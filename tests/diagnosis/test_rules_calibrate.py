@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.diagnosis import Thresholds
-from yid_ocp.diagnosis.blind import CaseLabel, calibrate_thresholds, permissive_thresholds, score_case
+from yid_ocp.diagnosis.blind import CaseGroundTruth, calibrate_thresholds, permissive_thresholds, score_blind_case
 from yid_ocp.diagnosis.blind.score import (
     _CALIBRATION_FORMAT,
     _CALIBRATION_RULES,
@@ -61,7 +61,7 @@ STATISTICS = {
 
 
 def case(category: str, verdict: str, *effects: InjectedEffect, multiple: float | None = None, **said: Any) -> Any:
-    label = CaseLabel("case_000", category, effects, multiple, {})
+    label = CaseGroundTruth("case_000", category, effects, multiple, {})
     named = [{"kind": effect.kind, "location": effect.location} for effect in effects] if verdict == "effect" else []
     result = {
         "verdict": verdict,
@@ -72,7 +72,7 @@ def case(category: str, verdict: str, *effects: InjectedEffect, multiple: float 
         "gap": {"closure": None},
         "statistics": STATISTICS | said.pop("statistics", {}),
     }
-    return label, score_case(label, result), {"result": result, **said}
+    return label, score_blind_case(label, result), {"result": result, **said}
 
 
 def calibrated(*cases: Any) -> dict[str, Any]:

@@ -11,14 +11,14 @@ from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, cases, place, smoothed, 
 
 from yid_ocp.diagnosis.localise import (
     attribute_gap_to_effects,
-    informed_z_scores,
     localise_gap,
-    merge_intervals,
-    unknown_units,
+    merge_time_intervals,
+    smoothed_unknown_units,
+    smoothed_unknown_z_scores,
 )
-from yid_ocp.inference.smoother_model import UnknownGroup
+from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 
-TWIST = UnknownGroup("T1", "bias")
+TWIST = SmoothedUnknownGroup("T1", "bias")
 
 
 def described(places):
@@ -80,7 +80,7 @@ def test_a_gap_is_there_when_an_unknown_is_surely_not_zero():
     },
 )
 def test_touching_spans_are_one_stretch(spans, expected):
-    assert merge_intervals(spans) == expected
+    assert merge_time_intervals(spans) == expected
 
 
 # -- what effects close -----------------------------------------------------------------------------------------------
@@ -154,7 +154,7 @@ def test_places_keep_their_windows_and_those_without_unknowns_take_the_residuals
 )
 def test_only_informed_values_are_on_the_map(variance, std, mean, mapped, expected):
     found = smoothed({FORCE: 1.0}, variance={FORCE: variance}, traces=[trace([FORCE], [[mean]], [[std]])])
-    edges, names, values = informed_z_scores(found, informed_fraction=mapped)
+    edges, names, values = smoothed_unknown_z_scores(found, informed_fraction=mapped)
     np.testing.assert_allclose(values, [[expected]])
     assert (list(edges), names) == ([0.0, 0.5], ("T1.0",))
 
@@ -165,4 +165,4 @@ def test_units_of_unknowns_are_those_of_their_joints_or_metres():
     made = SimpleNamespace(
         unknown_names=("hinge", "slide", "left.x", "tip.z"), unknown_groups=(FORCE, FORCE, OFFSET, BIAS)
     )
-    assert unknown_units(system, made) == ("N m", "N", "m", "m")
+    assert smoothed_unknown_units(system, made) == ("N m", "N", "m", "m")

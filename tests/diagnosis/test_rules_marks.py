@@ -14,16 +14,16 @@ from factories import amplitude, cases, effect, fit, loss
 from yid_ocp.cli import main
 from yid_ocp.diagnosis.blind import (
     BlindCase,
-    CaseLabel,
+    CaseGroundTruth,
+    ensemble_success_rates,
     open_sealed_labels,
-    score_case,
-    score_ensemble,
-    seal_labels,
+    score_blind_case,
+    seal_labels_with_hash,
 )
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
 
-# the package's own name `score_ensemble` is the function
+# the package's own name `ensemble_success_rates` is the function
 scoring = importlib.import_module("yid_ocp.diagnosis.blind.score")
 ensemble_module = importlib.import_module("yid_ocp.diagnosis.blind.ensemble")
 KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
@@ -33,7 +33,7 @@ GUST = InjectedEffect("gusts", "T3", {"size": 0.1})
 
 
 def label(category, *injected, multiple=None):
-    return CaseLabel("case_000", category, injected, multiple, {"T1.bend": 12.0})
+    return CaseGroundTruth("case_000", category, injected, multiple, {"T1.bend": 12.0})
 
 
 def pair(text):
@@ -104,7 +104,7 @@ RIGHT, WRONG = "kelvin_voigt@T1", "density@T2"
     ],
 )
 def test_what_is_right_depends_on_the_case(case, answer, right):
-    assert score_case(case, answer).right is right
+    assert score_blind_case(case, answer).right is right
 
 
 @pytest.mark.parametrize(
@@ -117,21 +117,21 @@ def test_what_is_right_depends_on_the_case(case, answer, right):
     ],
 )
 def test_a_mark_says_what_comes_first(listed, where, first, second, located):
-    found = score_case(label("single", KV), said("unknown", [], which=listed, where=where))
+    found = score_blind_case(label("single", KV), said("unknown", [], which=listed, where=where))
     assert (found.kind_first, found.kind_second, found.location_first) == (first, second, located)
 
 
 def test_a_clean_case_has_no_truth_to_be_first():
-    found = score_case(label("null"), said("effect", [WRONG], where=["T2"]))
+    found = score_blind_case(label("null"), said("effect", [WRONG], where=["T2"]))
     assert (found.kind_first, found.kind_second, found.location_first) == (False, False, False)
     assert (found.truth, found.answer, found.confusable) == ("-", WRONG, ())
-    assert score_case(label("null"), said("no_gap")).answer == "-"
+    assert score_blind_case(label("null"), said("no_gap")).answer == "-"
     assert math.isnan(found.multiple)
 
 
 def test_a_mark_keeps_case_answer_and_figures():
     group = [WRONG, RIGHT]
-    found = score_case(
+    found = score_blind_case(
         label("pair", KV, DRY, multiple=3.0),
         said("confusable", [WRONG, "a@b"], confusable=[["a@b", "c@d"], group], closure=0.5),
         best=0.8,
@@ -141,7 +141,7 @@ def test_a_mark_keeps_case_answer_and_figures():
     assert (found.truth, found.answer) == ("kelvin_voigt@T1 + joint_coulomb@elbow", f"{WRONG} + a@b")
     assert (found.multiple, found.closure, found.best, found.seconds) == (3.0, 0.5, 0.8, 7.0)
     assert found.confusable == tuple(group)
-    assert math.isnan(score_case(label("null"), said("no_gap")).closure)
+    assert math.isnan(score_blind_case(label("null"), said("no_gap")).closure)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_a_mark_keeps_case_answer_and_figures():
 )
 def test_a_parameter_is_within_95_percent_or_not(value, std, error, inside):
     values = {RIGHT: {"tau": {"value": value, "std": std, "unit": "s"}}}
-    found = score_case(label("single", KV), said("effect", [WRONG, RIGHT], which=[WRONG, RIGHT], values=values))
+    found = score_blind_case(label("single", KV), said("effect", [WRONG, RIGHT], which=[WRONG, RIGHT], values=values))
     assert found.errors == {f"{RIGHT}.tau": (pytest.approx(error), inside)}
 
 
@@ -176,7 +176,7 @@ def test_a_parameter_is_within_95_percent_or_not(value, std, error, inside):
     },
 )
 def test_parameters_that_cannot_be_compared_are_left_out(injected, effects, values):
-    found = score_case(label("single", injected), said("effect", effects, values=dict.fromkeys(effects, values)))
+    found = score_blind_case(label("single", injected), said("effect", effects, values=dict.fromkeys(effects, values)))
     assert found.errors == {}
 
 
@@ -200,11 +200,11 @@ def marked(category, **changed):
         "closure": 0.9,
         "best": 1.0,
     }
-    return scoring.CaseScore(**(usual | changed))
+    return scoring.BlindCaseScore(**(usual | changed))
 
 
 def test_rates_are_over_the_cases_that_they_speak_of():
-    found = score_ensemble(
+    found = ensemble_success_rates(
         [
             marked("null", gap=True),
             marked("null", gap=False),
@@ -249,7 +249,7 @@ def test_rates_are_over_the_cases_that_they_speak_of():
 
 
 def test_no_cases_of_a_sort_have_no_rate():
-    found = score_ensemble([])
+    found = ensemble_success_rates([])
     assert found["cases"] == 0
     whole = ("format", "cases", "detection", "detection_intervals", "marks", "intervals", "experiments")
     assert {found[key] for key in found if key not in (*whole, "confusion", "calibration")} == {None}
@@ -270,12 +270,12 @@ def test_rates_have_binomial_intervals(count, total, low, high):
 
 def test_what_was_said_of_what_is_counted():
     marks = [
-        score_case(label("single", KV), said("effect", [RIGHT])),
-        score_case(label("single", KV), said("effect", ["density@T1"])),
-        score_case(label("single", KV), said("no_gap")),
-        score_case(label("null"), said("no_gap")),
-        score_case(label("null"), said("unknown")),
-        score_case(label("null"), said("no_gap")),
+        score_blind_case(label("single", KV), said("effect", [RIGHT])),
+        score_blind_case(label("single", KV), said("effect", ["density@T1"])),
+        score_blind_case(label("single", KV), said("no_gap")),
+        score_blind_case(label("null"), said("no_gap")),
+        score_blind_case(label("null"), said("unknown")),
+        score_blind_case(label("null"), said("no_gap")),
     ]
     found = scoring._confusion_matrix(marks)
     assert (found["true"], found["said"]) == (
@@ -288,11 +288,11 @@ def test_what_was_said_of_what_is_counted():
 def test_intervals_and_p_values_are_held_against_what_they_promise():
     def single(miss):
         values = {"kelvin_voigt@T1": {"tau": {"value": 0.05 + 0.01 * miss, "std": 0.01, "unit": "s"}}}
-        return score_case(label("single", KV), said("effect", [RIGHT], values=values))
+        return score_blind_case(label("single", KV), said("effect", [RIGHT], values=values))
 
     def null(p):
         told = said("no_gap")
-        return score_case(label("null"), {**told, "gap": {**told["gap"], "before": {"p_value": p}}})
+        return score_blind_case(label("null"), {**told, "gap": {**told["gap"], "before": {"p_value": p}}})
 
     found = scoring._calibration_rates([single(0.5), single(-1.5), single(2.1), null(0.03), null(0.4), null(0.9)])
     held = {entry["level"]: entry["count"] for entry in found["intervals"]}
@@ -305,7 +305,7 @@ def test_intervals_and_p_values_are_held_against_what_they_promise():
 
 
 def test_a_sealed_text_is_sorted_and_holds_all():
-    text, digest = seal_labels([label("single", KV, multiple=3.0)])
+    text, digest = seal_labels_with_hash([label("single", KV, multiple=3.0)])
     assert json.loads(text) == [
         {
             "case": "case_000",
@@ -319,12 +319,12 @@ def test_a_sealed_text_is_sorted_and_holds_all():
     assert text.index('"case"') < text.index('"injected"') < text.index('"truth"')
     assert len(digest) == 64
     with pytest.raises(ValueError, match="not JSON compliant"):
-        seal_labels([label("single", multiple=math.nan)])
+        seal_labels_with_hash([label("single", multiple=math.nan)])
 
 
 def test_sealed_labels_open_only_as_they_were():
     labels = [label("single", KV, multiple=3.0), label("null")]
-    text, digest = seal_labels(labels)
+    text, digest = seal_labels_with_hash(labels)
     again = open_sealed_labels(text, digest)
     assert again[0].injected == (KV,)
     assert [entry.category for entry in again] == ["single", "null"]
@@ -373,7 +373,9 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
 
     monkeypatch.setattr(ensemble_module, "refit_with_effects", refit)
     ensemble = SimpleNamespace(_nominal_problem=lambda recording: SimpleNamespace(system="system"))
-    found = ensemble_module.best_possible_closure(ensemble, case(), CaseLabel("c", "single", injected, 1.0, {}))
+    found = ensemble_module.true_effects_gap_closure(
+        ensemble, case(), CaseGroundTruth("c", "single", injected, 1.0, {})
+    )
     assert found == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
     assert asked == [(["held out"], "settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]

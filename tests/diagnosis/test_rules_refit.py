@@ -20,7 +20,7 @@ from yid_ocp.diagnosis.refit import (
     _held_out_loss,
     _mark_uninformative_std,
     load_stored_refit,
-    refit_each,
+    refit_with_each_effect,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
@@ -38,7 +38,7 @@ class Problem:
     """A problem of one nominal parameter, an initial state and an effect, whose cost is a function of named values."""
 
     def __init__(self, cost, rows=10, names=("k", "k[run]", "start.q.k[run]", A, S)):
-        self.cost, self.rows, self.unknown_names, self.nominal_parameters = cost, rows, names, ("k",)
+        self.cost, self.rows, self.unknown_names, self.nominal_free_parameters = cost, rows, names, ("k",)
         self.asked, self.warmed, self.at, self.foreseen = [], [], [], []
         self.freed, self.whitening_filters = None, ()
 
@@ -54,7 +54,7 @@ class Problem:
         self.at.append(self.named_values(self.vector(at)))
         return self.with_free_effects(effects)
 
-    def held_out_relinearized(self, own, effects, at):
+    def with_held_out_relinearized(self, own, effects, at):
         assert own is self
         self.foreseen.append(dict(at))
         return self
@@ -126,7 +126,7 @@ def test_held_out_recordings_are_seen_about_the_torques_where_the_best_of_all_ru
 
 @pytest.mark.parametrize(("apart", "runs"), [(0.9, 1), (1.0, 2)])
 def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monkeypatch, apart, runs):
-    monkeypatch.setattr(module, "torque_bias_distance", lambda before, after: apart)
+    monkeypatch.setattr(module, "max_normalized_torque_bias_difference", lambda before, after: apart)
     monkeypatch.setattr(module, "_relinearizing", lambda problem: problem.evaluate)
     refit_with_effects(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
     assert len(solved.runs) == runs
@@ -313,7 +313,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     monkeypatch.setattr(module, "refit_with_effects", one)
     search = RefitContext("problem", LIMITS, heard, "store")
     tried = [((FRICTION,), {A: 0.7}), ((other,), {"k": 3.0}), ((third,), {})]
-    found = refit_each(search, (effect("base@x"),), tried, {"k": 2.0})
+    found = refit_with_each_effect(search, (effect("base@x"),), tried, {"k": 2.0})
     assert [f.effects[-1].kind for f in found] == ["friction", "offset"]
     by_kind = {kinds[-1]: (problem, kinds, *rest) for problem, kinds, *rest in asked}
     assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", "", LIMITS)
@@ -326,7 +326,7 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
         "resumed the refit with offset@elbow: held-out chi2/n 1.234",
     ]
     # from elsewhere they have names of their own in the store
-    refit_each(search, (effect("base@x"),), tried, {}, "from there")
+    refit_with_each_effect(search, (effect("base@x"),), tried, {}, "from there")
     assert sorted(name for *_, name, _ in asked[3:]) == [
         f"base@x and {label} from there" for label in ("friction@elbow", "offset@elbow", "third@x")
     ]
@@ -382,7 +382,7 @@ def predicting(monkeypatch):
         SimpleNamespace(
             held_out=[e for e, _ in pairs],
             predict_held_out=lambda x: list(pairs),
-            held_out_residual=rows,
+            whitened_held_out_residual=rows,
             has_process_noise=False,
             options=ProblemOptions(),
             shared_parameters=(),

@@ -27,8 +27,8 @@ from factories import (
 
 from yid_ocp.diagnosis.diagnosis_messages import _UNKNOWN_REASON_TEXTS
 from yid_ocp.diagnosis.diagnosis_result import _ranked_candidates
-from yid_ocp.diagnosis.hypotheses import TruncatedRecording
-from yid_ocp.diagnosis.verdict import UnknownReason
+from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
+from yid_ocp.diagnosis.verdict import UnknownVerdictReason
 
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 
@@ -99,7 +99,7 @@ def test_the_result_holds_what_was_found():
     assert result["steps"][0]["rmse"] == {"points.tip": 0.01}
     assert (result["side"], result["explainable"], result["evidence"]["plant"]) == (
         "plant",
-        spoken.explainable_fraction,
+        spoken.explainable_gap_fraction,
         9.0,
     )
     assert result["unseen"] == ["offset@wrist"]
@@ -159,11 +159,11 @@ def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
 
 def test_places_and_recordings_that_are_cut_are_in_the_result():
     at = replace(place("T3"), indistinguishable_from=("T1", "T2"))
-    made = finding(gap_locations=(at,), truncated_recordings=(TruncatedRecording("other", 1.8, 5.0),)).to_dict()
+    made = finding(gap_locations=(at,), truncated_recordings=(TruncatedHeldOutRecording("other", 1.8, 5.0),)).to_dict()
     assert made["where"][0]["indistinguishable_from"] == ["T1", "T2"]
     assert made["gap"]["cut"] == [{"recording": "other", "kept": 1.8, "whole": 5.0}]
 
 
-@pytest.mark.parametrize("reason", get_args(UnknownReason))
+@pytest.mark.parametrize("reason", get_args(UnknownVerdictReason))
 def test_every_reason_has_a_sentence(reason):
     assert reason == "" or reason in _UNKNOWN_REASON_TEXTS

@@ -13,7 +13,7 @@ from heard import Heard
 
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext
-from yid_ocp.diagnosis.screening import CandidatePair, ScreeningResult, score_jointly
+from yid_ocp.diagnosis.screening import CandidatePairScore, ScreeningResult, score_candidates_jointly
 from yid_ocp.diagnosis.select import (
     _is_amplitude_outside_prior,
     _is_rmse_reduced,
@@ -23,7 +23,7 @@ from yid_ocp.diagnosis.select import (
     _near_best_models,
     _pairs_to_refit,
     _refit_shortlist,
-    gap_closure,
+    held_out_gap_closure,
     held_out_improvement,
     penalized_chi2_difference,
     select_effects,
@@ -64,7 +64,7 @@ def test_a_loss_is_a_mean_over_samples_and_a_gap_what_exceeds_one(squares, count
     },
 )
 def test_a_closure_is_the_part_of_the_gap_that_went(before, after, closed):
-    found = gap_closure(loss(*before), loss(*after))
+    found = held_out_gap_closure(loss(*before), loss(*after))
     assert (found.fraction, found.ci_low, found.ci_high) == pytest.approx((closed, closed, closed))
 
 
@@ -72,7 +72,7 @@ def test_a_closure_is_the_part_of_the_gap_that_went(before, after, closed):
     ("before", "after"), [((0.9, 1.0), (0.5, 0.5)), ((1.0, 1.0), (1.0, 1.0)), ((2.0, 3.0), (math.inf, 1.0))]
 )
 def test_there_is_no_closure_without_a_gap_or_a_prediction(before, after):
-    found = gap_closure(loss(*before), loss(*after))
+    found = held_out_gap_closure(loss(*before), loss(*after))
     assert all(math.isnan(value) for value in (found.fraction, found.ci_low, found.ci_high))
 
 
@@ -102,7 +102,7 @@ def noisy():
 
 
 def test_the_interval_of_a_closure_is_that_of_95_percent_over_paired_blocks(noisy):
-    found = gap_closure(*noisy)
+    found = held_out_gap_closure(*noisy)
     np.testing.assert_allclose([found.ci_low, found.ci_high], bootstrapped(*noisy), rtol=1e-12)
     half = bootstrapped(*noisy, tails=(0.25, 0.75))
     assert found.ci_low < half[0] < half[1] < found.ci_high
@@ -113,7 +113,7 @@ def test_the_interval_of_a_closure_is_that_of_95_percent_over_paired_blocks(nois
 
 def test_resampled_blocks_without_a_gap_do_not_count():
     before, after = loss(0.1, 4.0, 0.2), loss(0.1, 1.5, 0.2)
-    found = gap_closure(before, after)
+    found = held_out_gap_closure(before, after)
     np.testing.assert_allclose([found.ci_low, found.ci_high], bootstrapped(before, after), rtol=1e-12)
     assert found.ci_high <= 1.0
 
@@ -278,7 +278,7 @@ def test_an_amplitude_may_leave_its_range_by_its_width(value, odd):
 # -- the shortlist ----------------------------------------------------------------------------------------------------
 
 
-FEW = score_jointly(point([0.0]))
+FEW = score_candidates_jointly(point([0.0]))
 
 
 def ranked(**decreases):
@@ -349,7 +349,7 @@ class Rounds:
         self.absent, self.before, self.ranked_pairs, self.left = absent, before, pairs, left
         kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
         self.scores = tuple(kinds)
-        monkeypatch.setattr(select, "refit_each", self.refit_all)
+        monkeypatch.setattr(select, "refit_with_each_effect", self.refit_all)
         monkeypatch.setattr(select, "refit_with_effects", self.refit)
         monkeypatch.setattr(select, "screen_candidates", self.screen)
 
@@ -369,7 +369,7 @@ class Rounds:
     def promised(self, among):
         kinds = {of.kind: of for of in (A, B, C) if of.label in among}
         return [
-            CandidatePair((kinds[one], kinds[other]), {}, 7.0)
+            CandidatePairScore((kinds[one], kinds[other]), {}, 7.0)
             for one, other in self.ranked_pairs
             if {one, other} <= set(kinds)
         ]
@@ -534,7 +534,7 @@ def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best,
 )
 def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(before, after, sure):
     assert _lr_decisive(loss(*before), loss(*after)) is sure
-    assert gap_closure(loss(*before), loss(*after)).is_decisive is sure
+    assert held_out_gap_closure(loss(*before), loss(*after)).is_decisive is sure
     assert not _lr_decisive(loss(*before), loss(*after), Thresholds(min_log_bayes_factor=20.0))
 
 
@@ -665,7 +665,7 @@ def test_both_of_a_pair_have_to_be_there(monkeypatch, absent):
 
 def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     kinds = {name: effect(f"{name}@x", amplitude()) for name in "abcdef"}
-    promised = [CandidatePair((kinds[one], kinds[other]), {}, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
+    promised = [CandidatePairScore((kinds[one], kinds[other]), {}, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
     table = np.eye(6)
     table[3, 1] = 0.9  # d's signature is b's, not the other way round
     found = ScreeningResult(
@@ -736,7 +736,7 @@ def test_what_contradicts_a_baseline_counts_whatever_blocks_are_drawn():
     before, after = HeldOutLoss(2 * counts, counts, {}, 800.0), HeldOutLoss(3 * counts, counts, {}, 0.0)
     assert (before.chi2_per_sample, after.chi2_per_sample) == (12.0, 3.0)
     assert held_out_improvement(before, after) == (pytest.approx(9.0), 0.0)
-    found = gap_closure(before, after)
+    found = held_out_gap_closure(before, after)
     assert (found.fraction, found.ci_low, found.ci_high) == pytest.approx((9 / 11, 9 / 11, 9 / 11))
 
 

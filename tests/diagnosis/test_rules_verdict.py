@@ -29,11 +29,11 @@ from yid_ocp.diagnosis.refit import RefitContext
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
     _compare,
-    check_transfer,
-    compute_explained_fraction,
+    check_parameter_transfer,
+    compute_explained_chi2_fraction,
     decide_verdict,
-    find_unknown_reason,
-    has_gap,
+    find_unknown_verdict_reason,
+    has_significant_gap,
     inflate_std_by_disagreement,
     is_chance_excess,
 )
@@ -69,7 +69,7 @@ def scored(*p_values):
 )
 def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
     tests = [outcome(p=p, chi2=chi2, channels={"a": 1.0}) for p, chi2 in (before, held_out)]
-    assert has_gap(*tests, LIMITS) is gap
+    assert has_significant_gap(*tests, LIMITS) is gap
 
 
 @cases(
@@ -90,7 +90,9 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
     tests = [outcome(channels=channels) for channels in (before, held_out)]
     assert (
-        has_gap(*tests, Thresholds(min_channel_excess_chi2=0.03, candidate_significance_level=0.01), scored(*p_values))
+        has_significant_gap(
+            *tests, Thresholds(min_channel_excess_chi2=0.03, candidate_significance_level=0.01), scored(*p_values)
+        )
         is gap
     )
 
@@ -106,17 +108,19 @@ def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, h
 )
 def test_an_offset_beyond_what_was_stated_needs_no_channel_above_noise(label, p, stated, gap):
     ranked = (score(effect(label), p=p), score(effect("friction@wrist"), p=0.9))
-    assert has_gap(outcome(), outcome(), LIMITS, ranked, stated) is gap
+    assert has_significant_gap(outcome(), outcome(), LIMITS, ranked, stated) is gap
 
 
 def test_the_level_and_the_smallest_gap_are_thresholds():
     tests = (outcome(p=0.02, chi2=1.2), outcome())
-    assert has_gap(*tests, Thresholds(significance_level=0.05))
-    assert not has_gap(*tests, Thresholds(significance_level=0.05, min_excess_chi2=0.3))
+    assert has_significant_gap(*tests, Thresholds(significance_level=0.05))
+    assert not has_significant_gap(*tests, Thresholds(significance_level=0.05, min_excess_chi2=0.3))
     by_one = Thresholds(candidate_significance_level=0.05)
-    assert has_gap(outcome(), outcome(chi2=1.2), by_one, scored(0.03))
-    assert not has_gap(outcome(), outcome(chi2=1.2), replace(by_one, min_channel_excess_chi2=0.3), scored(0.03))
-    assert not has_gap(outcome(), outcome(chi2=1.2), Thresholds(significance_level=0.05), scored(0.03))
+    assert has_significant_gap(outcome(), outcome(chi2=1.2), by_one, scored(0.03))
+    assert not has_significant_gap(
+        outcome(), outcome(chi2=1.2), replace(by_one, min_channel_excess_chi2=0.3), scored(0.03)
+    )
+    assert not has_significant_gap(outcome(), outcome(chi2=1.2), Thresholds(significance_level=0.05), scored(0.03))
 
 
 # -- is it chance -----------------------------------------------------------------------------------------------------
@@ -224,7 +228,7 @@ CERTAIN = closed(0.45, 0.4, 0.49)
 def test_the_verdict(changed, verdict):
     usual = {"gap": True, "visible": SEEN, "added": (added(ONE),), "total": CERTAIN, "enough": True, "explained": 1.0}
     said = usual | {"carried": True} | changed
-    reason = find_unknown_reason(said["added"], said["total"], LIMITS, said["explained"], said["carried"])
+    reason = find_unknown_verdict_reason(said["added"], said["total"], LIMITS, said["explained"], said["carried"])
     assert decide_verdict(said["gap"], said["enough"], said["visible"], reason, said["added"]) == verdict
 
 
@@ -240,12 +244,14 @@ def test_the_verdict(changed, verdict):
 )
 def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
     said = {"added": (added(ONE),), "total": CERTAIN, "explained": 1.0, "carried": True} | changed
-    assert find_unknown_reason(said["added"], said["total"], LIMITS, said["explained"], said["carried"]) == reason
+    assert (
+        find_unknown_verdict_reason(said["added"], said["total"], LIMITS, said["explained"], said["carried"]) == reason
+    )
 
 
 def test_without_a_smoother_the_explained_part_is_whole():
-    assert compute_explained_fraction(fit(), (added(ONE),), None) == 1.0
-    assert compute_explained_fraction(fit(), (), SPEAKING) == 1.0
+    assert compute_explained_chi2_fraction(fit(), (added(ONE),), None) == 1.0
+    assert compute_explained_chi2_fraction(fit(), (), SPEAKING) == 1.0
 
 
 @cases(
@@ -264,7 +270,7 @@ def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, par
     nominal, last = fit(cost=costs[0]), added(ONE, fitted=fit([ONE], cost=costs[1]))
     first = added(OTHER, fitted=fit([OTHER], cost=1e3))
     found = smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees)
-    assert compute_explained_fraction(nominal, (first, last), found) == pytest.approx(part)
+    assert compute_explained_chi2_fraction(nominal, (first, last), found) == pytest.approx(part)
 
 
 # -- on which side ----------------------------------------------------------------------------------------------------
@@ -311,7 +317,7 @@ def test_the_side_of_a_gap_by_evidence(weight, evidence, side):
     },
 )
 def test_the_part_of_a_gap_that_can_be_explained_at_all(chi2, degrees, part):
-    assert smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees).explainable_fraction == pytest.approx(part)
+    assert smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees).explainable_gap_fraction == pytest.approx(part)
 
 
 # -- whether effects come out the same on other recordings -------------------------------------------------------------
@@ -408,7 +414,7 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
 
     monkeypatch.setattr(module, "refit_with_effects", refitted)
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS, "store")
-    [entry] = check_transfer(search, first)
+    [entry] = check_parameter_transfer(search, first)
     assert (entry.estimation_value, entry.held_out_value, entry.is_consistent) == (2.0, 7.0, False)
     [(episodes, held_out, effects, start, store, name, limits)] = asked
     assert (episodes, held_out, effects, store, limits) == (("other",), ("own",), (SPRING,), "store", Thresholds())
@@ -420,10 +426,10 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
 def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, blocks, effects):
     monkeypatch.setattr(module, "refit_with_effects", lambda *_: pytest.fail("not asked for"))
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
-    assert check_transfer(search, fit(effects)) == ()
+    assert check_parameter_transfer(search, fit(effects)) == ()
 
 
 def test_a_model_that_cannot_be_fitted_there_is_no_evidence(monkeypatch):
     monkeypatch.setattr(module, "refit_with_effects", lambda *_: None)
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS)
-    assert check_transfer(search, fit([SPRING])) == ()
+    assert check_parameter_transfer(search, fit([SPRING])) == ()

@@ -36,10 +36,10 @@ from yid_ocp.diagnosis.diagnosis_messages import (
     _separating_experiment,
     diagnosis_summary_text,
     insufficient_data_message,
-    next_experiment_text,
+    recommended_experiment_text,
 )
-from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, Overspeed
-from yid_ocp.diagnosis.hypotheses import TruncatedRecording
+from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, _Overspeed
+from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.thresholds import Thresholds
 
 FILE = Path(__file__).with_name("sentences.json")
@@ -133,8 +133,8 @@ def unknown():
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}
     yield "the best attempt", finding("unknown", **best)
     for kept in (1.8, 0.0):
-        yield f"followed for {kept} s", finding(truncated_recordings=(TruncatedRecording("other", kept, 5.0),))
-    lost = (TruncatedRecording("other", 0.0, 5.0),)
+        yield f"followed for {kept} s", finding(truncated_recordings=(TruncatedHeldOutRecording("other", kept, 5.0),))
+    lost = (TruncatedHeldOutRecording("other", 0.0, 5.0),)
     yield "none can be followed", finding(truncated_recordings=lost, is_split_in_blocks=True)
 
 
@@ -151,7 +151,9 @@ def said() -> dict[str, str]:
         ("no_gap", (), ("a@b",)), ("no_gap", (), tuple(f"{kind}@x" for kind in "abcde")), ("effect", (), ()),
     ]:  # fmt: skip
         case = f"next experiment: {verdict} {[p.location for p in where]} {len(unseen)} unseen"
-        found[case] = next_experiment_text(verdict, (), where, [visible(effect(label), seen=False) for label in unseen])
+        found[case] = recommended_experiment_text(
+            verdict, (), where, [visible(effect(label), seen=False) for label in unseen]
+        )
     for rivals in [
         {"joint_viscous@elbow": SPEED, "joint_coulomb@elbow": SPEED}, {"a@elbow": SPEED, "b@shoulder": SPEED},
         {"tilt@world": GRAVITY, "mass@elbow": ACCELERATION, "a@elbow": SPEED}, {"odd@T1": ""},
@@ -166,7 +168,7 @@ def said() -> dict[str, str]:
     force = DisturbanceEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
     odd = DisturbanceEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
     for events in ((force,), (force, odd), (force,) * 10):
-        found[f"events: {len(events)}"] = _event_sentences(EventSet(events, (Overspeed("run_0", "elbow", 3.0),)))
+        found[f"events: {len(events)}"] = _event_sentences(EventSet(events, (_Overspeed("run_0", "elbow", 3.0),)))
     return found
 
 

@@ -57,5 +57,5 @@ def test_the_load_is_named_and_taking_it_away_predicts_the_bare_run(repository, 
         # of a swing of 9 mm; without a diagnosis it is as little or 11 mm, by where the nominal fit ends
         [(_, without)] = finding.counterfactual.effects_removed.rmse_by_unit.values()
         assert without < 2e-3
-        assert finding.counterfactual.effects_removed.is_improved
-        assert finding.counterfactual.effects_added.is_improved
+        assert finding.counterfactual.effects_removed.is_improved_by_counterfactual
+        assert finding.counterfactual.effects_added.is_improved_by_counterfactual

@@ -13,24 +13,24 @@ from yid_ocp.diagnosis import (
     linearize_candidates,
     refit_with_effects,
     score_candidates,
-    score_jointly,
+    score_candidates_jointly,
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
-from yid_ocp.diagnosis.screening import CandidateLinearization, EffectSignature
+from yid_ocp.diagnosis.screening import AllCandidatesLinearization, _EffectSignature
 from yid_ocp.diagnosis.select import (
     _near_best_models,
 )
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.null_test import (
-    ResidualChannel,
-    residual_channels,
+    ResidualChannelSamples,
+    residual_channel_samples,
 )
 from yid_ocp.problem import EstimationProblem
 
 
 def white(rows, colour=None):
     t = 0.01 * np.arange(len(rows))
-    return ResidualChannel("run", "points.tip", "points", "m", t, rows, np.ones(1) if colour is None else colour)
+    return ResidualChannelSamples("run", "points.tip", "points", "m", t, rows, np.ones(1) if colour is None else colour)
 
 
 @pytest.fixture(scope="module")
@@ -62,12 +62,12 @@ def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
     x = some.vector(nominal.values) + 0.01
     assert some.unknown_names == alone.unknown_names
     assert some.evaluate(x).jacobian == pytest.approx(alone.evaluate(x).jacobian, rel=1e-9, abs=1e-9)
-    assert composed.problem.free == composed.nominal_parameters == ("shoulder.damping", "elbow.damping")
+    assert composed.problem.free == composed.nominal_free_parameters == ("shoulder.damping", "elbow.damping")
 
 
 def test_screening_finds_the_withheld_effect_first(screened):
     _, nominal, point = screened
-    series = residual_channels(nominal.problem)
+    series = residual_channel_samples(nominal.problem)
     ranked = score_candidates(point, series, candidate_detectability(point))
     assert ranked[0].effect.label == "joint_coulomb@elbow"
     assert ranked[0].predicted_values["joint_coulomb@elbow.tau_c"] == pytest.approx(0.1, rel=0.1)
@@ -77,7 +77,7 @@ def test_screening_finds_the_withheld_effect_first(screened):
 
 def test_the_promised_decrease_is_that_of_a_refit_where_the_model_is_linear(screened):
     composed, nominal, point = screened
-    series = residual_channels(nominal.problem)
+    series = residual_channel_samples(nominal.problem)
     ranked = {s.effect.label: s for s in score_candidates(point, series, candidate_detectability(point))}
     for label in ("joint_coulomb@elbow", "rotor_inertia@elbow", "effort_offset@shoulder"):
         if label not in ranked:
@@ -99,7 +99,7 @@ def test_what_the_fit_has_explained_is_projected_off(screened):
 
 def test_a_candidate_explains_itself_and_nothing_explains_more(screened):
     _, _, point = screened
-    table = confusability_matrix(score_jointly(point))
+    table = confusability_matrix(score_candidates_jointly(point))
     assert np.diag(table.overlap_fractions) == pytest.approx(1.0)
     assert np.all((table.overlap_fractions >= 0) & (table.overlap_fractions <= 1))
     assert "joint_stribeck@elbow" in table.labels
@@ -125,8 +125,8 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     # the more it leans towards the residual, the more of it the second one explains
     columns = (column, column - lean * residual)
     grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
-    signatures = tuple(EffectSignature(effect, values, x, x.T @ x) for values, x in zip(grid, columns, strict=True))
-    point = CandidateLinearization(residual[:, 0], signatures)
+    signatures = tuple(_EffectSignature(effect, values, x, x.T @ x) for values, x in zip(grid, columns, strict=True))
+    point = AllCandidatesLinearization(residual[:, 0], signatures)
     best = score_candidates(point, [white(np.arange(200))], candidate_detectability(point))[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
 

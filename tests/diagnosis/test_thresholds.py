@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.localise import informed_z_scores, localise_gap
+from yid_ocp.diagnosis.localise import localise_gap, smoothed_unknown_z_scores
 from yid_ocp.options import OptionInfo
 
 KIND = "joint_coulomb@elbow"
@@ -79,5 +79,7 @@ def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):
 def test_a_gap_is_there_by_so_many_standard_deviations(usual):
     loose, strict = (localise_gap(usual.smoother_result, sure)[0].time_windows for sure in (0.5, 20.0))
     assert sum(b - a for a, b in loose) > sum(b - a for a, b in strict)
-    informed = [np.isfinite(informed_z_scores(usual.smoother_result, 0, mapped)[2]).sum() for mapped in (0.1, 0.999)]
+    informed = [
+        np.isfinite(smoothed_unknown_z_scores(usual.smoother_result, 0, mapped)[2]).sum() for mapped in (0.1, 0.999)
+    ]
     assert informed[0] > informed[1]

@@ -16,15 +16,15 @@ from yid_ocp.diagnosis.diagnose import _held_out_null_test, fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import linearize_candidates
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, linear_residual_models
-from yid_ocp.inference.uncertainty import noise_covariance_factor
+from yid_ocp.inference.uncertainty import unknowns_covariance_factor
 from yid_ocp.inference.whitening import (
-    held_out_relinearized_at_torque_bias,
-    relinearized_at_torque_bias,
-    whitened_at,
-    whitened_by_sensor_noise,
-    without_input_errors,
+    problem_relinearized_at_torque_bias,
+    problem_whitened_at,
+    problem_whitened_by_sensor_noise,
+    problem_with_relinearized_held_out,
+    problem_without_input_errors,
 )
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import Step, compile_step
@@ -105,7 +105,9 @@ def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     assert all(x is y is not None for x, y in held)
     assert made.problem.whitening_filters == made.problem.held_out_whitening_filters == (None,)
     there = own.evaluate(own.vector({"elbow.stiffness": 2.5}), False)
-    again = whitened_at(own, own.vector({"elbow.stiffness": 2.5})).evaluate(own.vector({"elbow.stiffness": 2.5}), False)
+    again = problem_whitened_at(own, own.vector({"elbow.stiffness": 2.5})).evaluate(
+        own.vector({"elbow.stiffness": 2.5}), False
+    )
     assert there.cost == pytest.approx(again.cost, rel=0.02)
 
 
@@ -116,7 +118,7 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     wide = made.with_free_effects(made.candidate_effects)
     at = {"elbow.stiffness": 2.5}
     x, frozen = (wide.vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
-    moved = held_out_relinearized_at_torque_bias(relinearized_at_torque_bias(wide, x, frozen), x, frozen)
+    moved = problem_with_relinearized_held_out(problem_relinearized_at_torque_bias(wide, x, frozen), x, frozen)
     for before, after in (
         (wide.whitening_filters, moved.whitening_filters),
         (wide.held_out_whitening_filters, moved.held_out_whitening_filters),
@@ -125,15 +127,18 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
         np.testing.assert_allclose(
             after[0].input_errors.torque_bias, before[0].input_errors.torque_bias - 0.3, atol=1e-12
         )
-    there, then = whitened_by_sensor_noise(moved).evaluate(x), whitened_by_sensor_noise(wide).evaluate(frozen)
+    there, then = (
+        problem_whitened_by_sensor_noise(moved).evaluate(x),
+        problem_whitened_by_sensor_noise(wide).evaluate(frozen),
+    )
     np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
     own, nominal = (
-        problem.held_out_residual(0, *problem.predict_held_out(point)[0]).residual
+        problem.whitened_held_out_residual(0, *problem.predict_held_out(point)[0]).residual
         for problem, point in ((moved, x), (wide, frozen))
     )
     assert np.max(np.abs(own - nominal)) > 1e-3  # its prior is no longer about zero
     # and to first order the rows are those of a filter that is worked out there
-    again = whitened_at(moved, x)
+    again = problem_whitened_at(moved, x)
     np.testing.assert_allclose(again.evaluate(x).residual, moved.evaluate(x).residual, atol=0.1)
 
 
@@ -141,7 +146,7 @@ def test_noise_that_drives_the_motion_is_no_gap(step):
     """With weights by the sensors' noise alone the same fit leaves several times what noise would."""
     made = composed(step, True)
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
-    bare = without_input_errors(made.problem)
+    bare = problem_without_input_errors(made.problem)
     plain = bare.evaluate(bare.vector(fit.values), False)
     assert 2 * plain.cost > 2 * len(plain.residual)
     test = _held_out_null_test(fit)
@@ -153,7 +158,7 @@ def test_what_parameters_are_unsure_of_is_no_gap(step):
     """A fit to recordings that tell a fiftieth as much may be fifty times as far off."""
     made = composed(step, True)
     fit = fit_nominal_model(problem_of(step, [recorded(step, 1)]), made)
-    spread = noise_covariance_factor(fit.problem, fit.evaluation)
+    spread = unknowns_covariance_factor(fit.problem, fit.evaluation)
     off = fit.problem.vector(fit.values) + 50 * spread @ np.ones(spread.shape[1]) / math.sqrt(spread.shape[1])
     moved = replace(fit, values=fit.problem.named_values(off))
     assert _held_out_null_test(moved).p_value < 1e-12
@@ -225,7 +230,7 @@ def weighted_at_truth(geared: Step, recording: Recording, feedback: str) -> Esti
     free = (*FREE, *(name for effect in geared.system.effects for name in effect.parameters.names))
     options = ProblemOptions(initial_state="equilibrium", feedback=feedback, proportional_gains=(9.0,))
     problem = EstimationProblem(geared, [recording], free, options, {"elbow.stiffness": 3.0, "elbow.damping": 0.05})
-    return whitened_at(problem, problem.initial_unknowns, rounds=3)
+    return problem_whitened_at(problem, problem.initial_unknowns, rounds=3)
 
 
 @pytest.mark.parametrize("effect", ["rotor_inertia@shoulder", "effort_gain@shoulder", "effort_lag@shoulder"])
@@ -235,7 +240,7 @@ def test_noise_of_torques_is_not_mistaken_for_what_they_multiply(step, monkeypat
     absent, z = with_absent(step, effect), []
     for seed in range(20, 32):
         problem = weighted_at_truth(absent, recorded(step, seed), "proportional")
-        residual, jacobian = residual_without_weak_priors(problem, problem.evaluate(problem.initial_unknowns))
+        residual, jacobian = linearization_without_weak_priors(problem, problem.evaluate(problem.initial_unknowns))
         covariance = np.linalg.inv(jacobian.T @ jacobian)
         z.append(-covariance @ jacobian.T @ residual / np.sqrt(np.diag(covariance)))
     assert np.all(np.abs(np.mean(z, axis=0)) < 3 / np.sqrt(len(z)))
@@ -248,7 +253,7 @@ def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
     gained = with_absent(step, "effort_gain@shoulder")
     problem = EstimationProblem(gained, [recorded(step, 7)], ("effort_gain@shoulder.inverse",))
     at, near = (np.array([value]) for value in (inverse, inverse + 0.01))
-    episode = whitened_at(problem, at, rounds=3).episodes[0]
+    episode = problem_whitened_at(problem, at, rounds=3).episodes[0]
     errors, [theta, later] = episode.input_errors, [problem.split(x, 0)[0] for x in (at, near)]
     assert np.max(np.abs(errors.torque_noise)) > WHITE
     acting, more = (problem.predictor.corrected_inputs(episode, own, ()).torque for own in (theta, later))
@@ -282,7 +287,9 @@ def test_squares_of_innovations_are_the_least_over_all_errors(geared, step, feed
     assert least == pytest.approx(innovations @ innovations, rel=5e-3)
     # and nobody mistakes it for a prediction
     recorded_torque = (
-        whitened_by_sensor_noise(problem).evaluate(problem.initial_unknowns).residual[problem.residual_rows.data]
+        problem_whitened_by_sensor_noise(problem)
+        .evaluate(problem.initial_unknowns)
+        .residual[problem.residual_rows.data]
     )
     assert recorded_torque @ recorded_torque > 2 * along @ along
 
@@ -296,7 +303,7 @@ def test_a_refit_is_as_sure_as_a_solution(step, friction):
     fit = fit_nominal_model(problem, AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)]), found)
     std = found.parameters["elbow.stiffness"].std
     assert fit.std["elbow.stiffness"] == pytest.approx(std, rel=0.1)
-    _, jacobian = residual_without_weak_priors(fit.problem, fit.evaluation)
+    _, jacobian = linearization_without_weak_priors(fit.problem, fit.evaluation)
     noise = np.sqrt(np.linalg.inv(jacobian.T @ jacobian)[0, 0])
     assert (std > 1.5 * noise) == (friction > 0)
 
@@ -331,7 +338,7 @@ def test_an_effect_is_found_beside_the_noise_of_torques(step):
 
 def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     problem = problem_of(step, [recorded(step, 1)])
-    weighted = whitened_by_sensor_noise(problem)
+    weighted = problem_whitened_by_sensor_noise(problem)
     x = problem.initial_unknowns
     model = linear_residual_models(weighted, x, weighted.evaluate(x))[0]
     decay = math.exp(-_MIN_INTERVAL / _CORRELATION_TIME)
@@ -345,5 +352,5 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     )
     assert lasting == pytest.approx(WHITE**2 * TIME_STEP, rel=0.02)
     assert np.count_nonzero(model.torque_noise_variance) == 1
-    calm = without_input_errors(problem)
+    calm = problem_without_input_errors(problem)
     assert not linear_residual_models(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()

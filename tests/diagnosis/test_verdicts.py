@@ -15,7 +15,7 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.verdict import is_chance_excess
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import YidError
-from yid_ocp.inference.smoother import run_smoother
+from yid_ocp.inference.smoother import select_and_smooth_unknowns
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
 NUMBER, TEXT = {"type": "number"}, {"type": "string"}
@@ -271,7 +271,7 @@ def test_the_papers_weighting_cannot_be_diagnosed(bench):
 def test_a_barely_significant_excess_without_shape_is_chance(bench):
     finding = diagnose(bench.problem([bench.recording({}, 1)]), FRICTION, [bench.recording({}, 2)])
     nominal = finding.nominal_model
-    smoothed = run_smoother(nominal.problem, nominal.problem.vector(nominal.values), nominal.evaluation)
+    smoothed = select_and_smooth_unknowns(nominal.problem, nominal.problem.vector(nominal.values), nominal.evaluation)
     limits = Thresholds()
 
     def tested(p):

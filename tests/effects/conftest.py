@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.data.channel_checks import median_edge_lengths
+from yid_ocp.data.channel_checks import median_point_pair_distances
 from yid_ocp.data.recording import PointGroup, Recording
-from yid_ocp.effects import SENSOR_KINDS, EffectBase, candidate_effects, make_effect
+from yid_ocp.effects import _SENSOR_KINDS, EffectBase, candidate_kinds_and_locations, make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step
@@ -22,7 +22,7 @@ from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import CableOptions, cable_system
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
-from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_function
+from yid_ocp.sensors import EffortSensor, PointSensor, Sensor, sensor_reading_function
 
 POSTURE = np.array([0.3, 0.8, 0.9])
 H = 0.01
@@ -151,10 +151,10 @@ class Bench:
     def reading(self, run: Run, sensor: Sensor) -> np.ndarray:
         """What a sensor reads at every node but the last."""
         n, rollout, system = run.step.sizes["n"], run.rollout, run.step.system
-        function = sensor_function(system, sensor, ())
+        function = sensor_reading_function(system, sensor, ())
         effort = np.zeros((len(rollout.state) - 1, n))
-        effort[:, list(system.prescribed_indices)] = rollout.effort
-        effort[:, list(system.driven_indices)] = rollout.torque
+        effort[:, list(system.prescribed_coordinate_indices)] = rollout.effort
+        effort[:, list(system.driven_coordinate_indices)] = rollout.torque
         rows = zip(rollout.state[:-1], effort, strict=True)
         still, lam = np.zeros(n), np.zeros(system.n_constraints)
         return np.array([np.array(function(x[:n], still, x[2 * n :], e, lam, run.theta)[0]).ravel() for x, e in rows])
@@ -197,13 +197,19 @@ def benches(driven, prescribed) -> dict[str, Bench]:
 @pytest.fixture(scope="session")
 def cable() -> tuple[CableTopology, Recording, System]:
     layout, recording = made_cable()
-    return layout, recording, cable_system(median_edge_lengths(layout.edges, [recording]), layout, CableOptions())
+    return (
+        layout,
+        recording,
+        cable_system(median_point_pair_distances(layout.edges, [recording]), layout, CableOptions()),
+    )
 
 
 @pytest.fixture(scope="session")
 def all_effects() -> Callable[[System], list[EffectBase]]:
     def every(system: System) -> list[EffectBase]:
-        return [make_effect(kind, place, system) for kind, place in candidate_effects(system, SENSOR_KINDS)]
+        return [
+            make_effect(kind, place, system) for kind, place in candidate_kinds_and_locations(system, _SENSOR_KINDS)
+        ]
 
     return every
 

@@ -12,7 +12,7 @@ import pytest
 from yid_ocp.integrator.compiler import _compiler_path
 from yid_ocp.integrator.rollout import adjoint_gradient
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.sensors import sensor_function
+from yid_ocp.sensors import sensor_reading_function
 
 STEPS = 4
 
@@ -79,7 +79,7 @@ def test_readings_have_exact_slopes(which, prescribed, all_effects, sensors) -> 
     effects = all_effects(prescribed.system)
     system = prescribed.system.with_effects(effects)
     names = tuple(name for effect in effects for name in effect.parameters.names)
-    function = sensor_function(system, getattr(sensors, which), names)
+    function = sensor_reading_function(system, getattr(sensors, which), names)
     values = {}
     for effect in effects:
         values |= somewhere(effect)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.effects import SENSOR_KINDS, candidate_effects, make_effect
+from yid_ocp.effects import _SENSOR_KINDS, candidate_kinds_and_locations, make_effect
 
 
 def largest(difference, reference) -> float:
@@ -35,7 +35,7 @@ STRUCTURAL += ("length_scale", "mount_compliance", "payload", "standard_linear_s
 @pytest.mark.parametrize("kind", STRUCTURAL)
 def test_alone_it_changes_nothing_and_has_a_slope(kind, benches) -> None:
     bench = benches["driven"]
-    places = [place for k, place in candidate_effects(bench.system, SENSOR_KINDS) if k == kind]
+    places = [place for k, place in candidate_kinds_and_locations(bench.system, _SENSOR_KINDS) if k == kind]
     effect = make_effect(kind, places[-1], bench.system)
     assert effect.neutral_values == {entry.name: entry.value for entry in effect.parameters}
     step = bench.step(effect)

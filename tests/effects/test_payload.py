@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
-from yid_ocp.effects.base import link_end_frames, link_frames, relative_effort_limit
+from yid_ocp.effects.base import arm_link_end_frame_names, arm_link_frame_names, effort_limit_over_baxter
 from yid_ocp.effects.inertia import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
 from yid_ocp.model import Mechanism, System
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merge_bodies
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.urdf import read_urdf
@@ -40,7 +40,7 @@ def arm() -> System:
 def mechanics(system: System):
     """Mass matrix, dL/dq and dL/dv of a system at (q, v) as functions of its parameters."""
     q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
-    rigid = rigid_body_derivatives(forward_kinematics(system.mechanism, q), v, system.gravity)
+    rigid = rigid_body_lagrangian_derivatives(forward_kinematics(system.mechanism, q), v, system.gravity)
     outputs = [mass_matrix(rigid, system.mechanism), rigid.lagrangian_by_q, rigid.lagrangian_by_v]
     return ca.Function("mechanics", [q, v, system.parameters.symbols], [ca.densify(x) for x in outputs])
 
@@ -184,10 +184,10 @@ def test_two_frames_of_one_link_say_the_same() -> None:
 
 def test_places_for_a_mass() -> None:
     one = baxter_foam_y_system(1)
-    frames = link_frames(one)
+    frames = arm_link_frame_names(one)
     assert len(frames) == 7
     assert frames[-1] == "left_gripper"
-    ends = link_end_frames(one)
+    ends = arm_link_end_frame_names(one)
     # what the hand holds is where the branch ends, and the first link's frame turns about its own origin
     assert "left_gripper" not in ends
     assert "left_upper_shoulder" not in ends
@@ -196,15 +196,16 @@ def test_places_for_a_mass() -> None:
     names = [f"panda_joint{i}" for i in range(1, 8)]
     robot = read_urdf("package:panda", joints=names, exclude_links=["panda_hand"])
     bare = System.build(robot, prescribed=names)
-    assert link_frames(bare)[-1] == "panda_link8"
+    assert arm_link_frame_names(bare)[-1] == "panda_link8"
     # joints 1 and 2 meet where nothing moves, 5 and 6 in one place
-    assert sorted(link_end_frames(bare)) == [f"panda_link{i}" for i in (3, 4, 5, 7, 8)]
+    assert sorted(arm_link_end_frame_names(bare)) == [f"panda_link{i}" for i in (3, 4, 5, 7, 8)]
     whole = read_urdf("package:panda")
     fingers = [j.name for j in whole.joints if j.kind == "prismatic"]
     held = System.build(whole, prescribed=whole.joint_names)
     assert fingers
     assert not any(
-        held.mechanism.frame(f).joint_index == held.mechanism.joint_index(fingers[0]) for f in link_frames(held)
+        held.mechanism.frame(f).joint_index == held.mechanism.joint_index(fingers[0])
+        for f in arm_link_frame_names(held)
     )
 
 
@@ -215,7 +216,7 @@ def test_ranges_of_strong_joints_follow_their_limits() -> None:
         for joint, limit in zip(system.mechanism.joints, (300.0, 20.0, 1e9), strict=True)
     )
     strong = replace(system, mechanism=replace(system.mechanism, joints=joints))
-    assert [relative_effort_limit(strong, name) for name in ("j0", "j1", "j2")] == [6.0, 1.0, 1.0]
+    assert [effort_limit_over_baxter(strong, name) for name in ("j0", "j1", "j2")] == [6.0, 1.0, 1.0]
     for kind in ("joint_coulomb", "joint_presliding"):
         tau_c = make_effect(kind, "j0", strong).definitions[0]
         assert tau_c.upper == pytest.approx(0.2 * 300.0)

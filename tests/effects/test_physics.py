@@ -17,7 +17,7 @@ from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, fo
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors import EffortSensor, PointSensor, sensor_function
+from yid_ocp.sensors import EffortSensor, PointSensor, sensor_reading_function
 
 LENGTH, MASS, RADIUS, KAPPA = 0.5, 0.2, 0.02, 3.0
 INERTIA = MASS * (LENGTH**2 / 3 + RADIUS**2 / 4)
@@ -255,7 +255,7 @@ def hanging(kind: str, time_step: float = H, **values: float):
     robot = Mechanism("arm", (joint,), {"left_gripper": Frame(0, Placement.identity())})
     item = flexible_object([Segment("T1", LENGTH, MASS, RADIUS, 1, bend=KAPPA, damping=0.5)])
     slide = Joint("foot", "prismatic", -1, Placement.identity(), (0.0, 0.0, 1.0))
-    tree = robot.with_mechanism(Mechanism("rail", (slide,), {"rail": Frame(0, Placement.identity())}))
+    tree = robot.with_attached_mechanism(Mechanism("rail", (slide,), {"rail": Frame(0, Placement.identity())}))
     grasp = Grasp("left", "left_gripper", "w_T1")
     system = System.build(
         tree, objects=[(item, "rail", None)], grasps=[grasp], prescribed=["left_a"], gravity=(0, 0, -G), damping=0.0
@@ -320,7 +320,7 @@ def test_friction_works_against_the_motion(kind, values, extra, rate) -> None:
 
 def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
     whole = system.with_effects(effects)
-    function = sensor_function(whole, sensor, ())
+    function = sensor_reading_function(whole, sensor, ())
     n = whole.n_coordinates
     at = (
         np.zeros(n) if q is None else q,
@@ -402,7 +402,9 @@ def test_latency_belongs_to_cameras_and_late_torque_to_arms() -> None:
 
     def seconds(effect, channel: str, camera: bool = False) -> float:
         values = ca.DM([p.value for p in effect.parameters])
-        return float(ca.Function("d", [effect.parameters.symbols], [effect.added_delay(channel, camera)])(values))
+        return float(
+            ca.Function("d", [effect.parameters.symbols], [effect.added_channel_delay(channel, camera)])(values)
+        )
 
     assert seconds(late, "torque.left_a") == 0.03
     assert seconds(late, "joints.effort.left_a") == -0.03

@@ -15,7 +15,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.problem import ProblemOptions
-from yid_ocp.problem.unknown_vector import estimated_initial_state_names, initial_state_limits
+from yid_ocp.problem.unknown_vector import estimated_initial_state_names, initial_state_offset_limits
 
 H, TAU = 0.01, 0.8
 BODY = Inertia.from_values(0.5, [0.0, 0.0, 0.2], np.diag([1e-2, 1e-2, 1e-3]))
@@ -145,6 +145,6 @@ def test_where_it_begins_is_estimated_with_every_recording() -> None:
     assert estimated_initial_state_names(whole, options, (), theta) == ()
     [name] = estimated_initial_state_names(whole, options, ("joint_presliding@hinge.tau_c",), theta)
     assert name == "z.joint_presliding@hinge.s"
-    assert initial_state_limits(whole, [name]).tolist() == [1.0]
+    assert initial_state_offset_limits(whole, [name]).tolist() == [1.0]
     known = whole.parameters.vector({"joint_presliding@hinge.tau_c": 0.1})
     assert estimated_initial_state_names(whole, options, (), known) == (name,)

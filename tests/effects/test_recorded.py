@@ -12,8 +12,8 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.recorded_inputs import recorded_sensors
-from yid_ocp.sensors import recorded_camera_pose, sensor_function
+from yid_ocp.problem.recorded_inputs import recorded_sensor_kinds
+from yid_ocp.sensors import recorded_camera_pose, sensor_reading_function
 from yid_ocp.solvers import MultipleShooting
 
 H, STEPS = 0.01, 24
@@ -99,15 +99,15 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     assert other.residual == pytest.approx(one.residual, rel=1e-9, abs=1e-9)
     assert not active(plain)
     assert active(full)
-    assert plain.has_uncorrected_inputs
-    assert full.with_free_parameters(["T1.bend", "kelvin_voigt@T3.tau"]).has_uncorrected_inputs
+    assert plain.uses_inputs_as_recorded
+    assert full.with_free_parameters(["T1.bend", "kelvin_voigt@T3.tau"]).uses_inputs_as_recorded
     # the momentum that an LQR filter follows depends on how fast the clock runs
-    assert full.with_free_parameters(["T1.bend", "clock_scale@clock.scale"]).has_uncorrected_inputs is (
+    assert full.with_free_parameters(["T1.bend", "clock_scale@clock.scale"]).uses_inputs_as_recorded is (
         feedback != "lqr"
     )
-    assert not full.with_free_parameters(["effort_delay@left.delay"]).has_uncorrected_inputs
-    assert not full.with_free_parameters(["effort_lag@left_c.time_constant"]).has_uncorrected_inputs
-    assert not full.with_free_parameters(["camera_latency@camera.delay"]).has_uncorrected_inputs
+    assert not full.with_free_parameters(["effort_delay@left.delay"]).uses_inputs_as_recorded
+    assert not full.with_free_parameters(["effort_lag@left_c.time_constant"]).uses_inputs_as_recorded
+    assert not full.with_free_parameters(["camera_latency@camera.delay"]).uses_inputs_as_recorded
     with pytest.raises(SolverError, match="gauss_newton"):
         MultipleShooting(condensing=True).minimize_cost(full, full.initial_unknowns, None)
 
@@ -179,7 +179,7 @@ def test_a_late_camera_sees_the_past(driven, sensors) -> None:
     assert late.predicted_outputs[1 - at] == pytest.approx(now.predicted_outputs[1 - at], abs=1e-9)
     position = np.maximum(moved.node + moved.fraction - 3.0, 0.0)
     n = driven.system.n_coordinates
-    function = sensor_function(task.system, sensors.camera, ())
+    function = sensor_reading_function(task.system, sensors.camera, ())
     still, lam = np.zeros(n), np.zeros(task.system.n_constraints)
     states = now.rollout.state
     nodes = np.array([np.array(function(s[:n], still, [], still, lam, task.theta)[0]).ravel() for s in states])
@@ -206,14 +206,14 @@ def test_a_gear_needs_recorded_effort(prescribed) -> None:
 
 def test_what_a_recording_holds(driven) -> None:
     full = recording(driven)
-    assert recorded_sensors([full]) == {"joints.position", "joints.effort", "camera"}
-    assert recorded_sensors([recording(driven, effort=False, camera=False)]) == {"joints.position"}
+    assert recorded_sensor_kinds([full]) == {"joints.position", "joints.effort", "camera"}
+    assert recorded_sensor_kinds([recording(driven, effort=False, camera=False)]) == {"joints.position"}
     arm, camera = full.points
     assert recorded_camera_pose(arm) is None
     assert recorded_camera_pose(camera) is not None
     unposed = PointGroup("points_camera", ("p",), [0.0], np.zeros((1, 1, 3)), clock="nominal")
     assert recorded_camera_pose(unposed) == tuple(map(tuple, np.eye(4)))
-    assert "nominal_clock" in recorded_sensors([Recording(points=(unposed,))])
+    assert "nominal_clock" in recorded_sensor_kinds([Recording(points=(unposed,))])
 
 
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
@@ -254,4 +254,4 @@ def test_the_filter_follows_the_momentum_of_the_effects(driven, kind) -> None:
 
 
 def test_an_arms_own_damping_leaves_the_recording_as_it_is(driven) -> None:
-    assert problem(driven, (), feedback="lqr", free=("left_a.damping",)).has_uncorrected_inputs
+    assert problem(driven, (), feedback="lqr", free=("left_a.damping",)).uses_inputs_as_recorded

@@ -7,9 +7,9 @@ import re
 
 import pytest
 
-from yid_ocp.effects import EFFECTS, SENSOR_KINDS, candidate_effects, make_effect
+from yid_ocp.effects import _SENSOR_KINDS, EFFECTS, candidate_kinds_and_locations, make_effect
 from yid_ocp.effects import base as places
-from yid_ocp.effects.base import EXCITATIONS
+from yid_ocp.effects.base import EXCITATION_DESCRIPTIONS
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import Effect, Segment, System, flexible_object
 from yid_ocp.model.servos_and_springs import PositionServoOptions
@@ -51,8 +51,8 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     described = {kind.strip() for name in table for kind in name.split(",")}
     assert set(EFFECTS) <= described  # the vocabulary is ahead: kinds of later work stand there as well
     servos, system = with_servos(), baxter_foam_y_system(1)
-    places = {kind: (servos, place) for kind, place in candidate_effects(servos, SENSOR_KINDS)}
-    places |= {kind: (system, place) for kind, place in candidate_effects(system, SENSOR_KINDS)}
+    places = {kind: (servos, place) for kind, place in candidate_kinds_and_locations(servos, _SENSOR_KINDS)}
+    places |= {kind: (system, place) for kind, place in candidate_kinds_and_locations(system, _SENSOR_KINDS)}
     for kind in EFFECTS:
         row = next(cells for name, cells in table.items() if kind in map(str.strip, name.split(",")))
         system, place = places[kind]
@@ -67,8 +67,8 @@ def test_every_kind_describes_itself(one_arm) -> None:
     for kind in EFFECTS:
         assert EFFECTS[kind].equation
         assert EFFECTS[kind].__doc__
-        assert EFFECTS[kind].required_excitation in EXCITATIONS
-    for kind, place in candidate_effects(one_arm, SENSOR_KINDS):
+        assert EFFECTS[kind].required_excitation in EXCITATION_DESCRIPTIONS
+    for kind, place in candidate_kinds_and_locations(one_arm, _SENSOR_KINDS):
         effect = make_effect(kind, place, one_arm)
         assert isinstance(effect, Effect)
         assert isinstance(effect, RecordingErrorEffect)
@@ -83,46 +83,48 @@ def test_every_kind_describes_itself(one_arm) -> None:
 
 
 def test_candidates_of_the_papers_system(one_arm) -> None:
-    found = candidate_effects(one_arm, SENSOR_KINDS)
+    found = candidate_kinds_and_locations(one_arm, _SENSOR_KINDS)
     assert {kind for kind, _ in found} == set(EFFECTS) - OF_SERVOS
     assert len(found) == len(set(found))
-    blind = candidate_effects(one_arm, ["joints.position"])
+    blind = candidate_kinds_and_locations(one_arm, ["joints.position"])
     assert not {kind for kind, _ in blind} & {"camera_scale", "effort_gain", "clock_scale"}
     assert ("kelvin_voigt", "T3") in blind
     assert ("junction_compliance", "w_T1") in blind
     assert ("grasp_slip", "left") in blind
     with pytest.raises(ModelError, match="camera"):
-        candidate_effects(one_arm, ["kamera"])
+        candidate_kinds_and_locations(one_arm, ["kamera"])
 
 
 def test_places_of_two_arms() -> None:
     two = baxter_foam_y_system(2)
-    assert {name: len(joints) for name, joints in places.joints_by_arm(two).items()} == {"left": 7, "right": 7}
-    found = candidate_effects(two, SENSOR_KINDS)
+    assert {name: len(joints) for name, joints in places.joint_names_by_arm(two).items()} == {"left": 7, "right": 7}
+    found = candidate_kinds_and_locations(two, _SENSOR_KINDS)
     assert {("effort_delay", "left"), ("effort_delay", "right"), ("grasp_offset", "right")} <= set(found)
 
 
 def test_places_of_a_beam_on_a_gripper(beam) -> None:
-    found = candidate_effects(beam, ["joints.position", "joints.effort"])
+    found = candidate_kinds_and_locations(beam, ["joints.position", "joints.effort"])
     assert ("mount_compliance", "base") in found
     assert ("effort_delay", "gripper") in found
     assert ("gravity_scale", "object") in found
     assert not [place for kind, place in found if kind.startswith(("grasp", "junction", "camera"))]
     # without efforts nothing shows what is wrong with a prescribed joint
-    assert not [place for _, place in candidate_effects(beam, ["joints.position"]) if place.startswith("panda_joint4")][
-        1:
-    ]
+    assert not [
+        place
+        for _, place in candidate_kinds_and_locations(beam, ["joints.position"])
+        if place.startswith("panda_joint4")
+    ][1:]
     bare = System.build(beam.mechanism, prescribed=beam.prescribed)
-    assert [p for k, p in candidate_effects(bare, SENSOR_KINDS) if k == "point_mass"]
+    assert [p for k, p in candidate_kinds_and_locations(bare, _SENSOR_KINDS) if k == "point_mass"]
 
 
 def test_places_of_a_branched_cable(cable) -> None:
     _, _, cable = cable
-    found = candidate_effects(cable, ["nominal_clock"])
+    found = candidate_kinds_and_locations(cable, ["nominal_clock"])
     assert {("mount_compliance", "clamp_start"), ("junction_compliance", "junction_a")} <= set(found)
     assert {("grasp_compliance", "clamp_end"), ("grasp_slip", "clamp_end")} <= set(found)
     assert {("kelvin_voigt", "parent"), ("kelvin_voigt", "a"), ("point_mass", "junction_a")} <= set(found)
-    assert not places.robot_joints(cable)
+    assert not places.arm_joint_names(cable)
     changed = cable.with_effects([make_effect(kind, place, cable) for kind, place in found])
     assert changed.n_coordinates == cable.n_coordinates + 4
     assert changed.prescribed == cable.prescribed
@@ -177,7 +179,7 @@ def test_a_compliance_is_given_and_reported_as_stiffness(one_arm) -> None:
     assert math.isnan(rigid.std)
     with pytest.raises(ConfigError, match="positive"):
         make_effect("grasp_compliance", "left", one_arm, {"stiffness": 0.0})
-    assert effect.shape_names == ("grasp_compliance@left.damping",)
+    assert effect.shape_parameter_names == ("grasp_compliance@left.damping",)
 
 
 def test_names_and_places_survive_added_joints(one_arm) -> None:
@@ -191,13 +193,13 @@ def test_names_and_places_survive_added_joints(one_arm) -> None:
     parent = changed.mechanism.joints[names.index("T3_0_x")].parent_index
     assert names[parent] == "junction_compliance@w_T1_y"
     assert names[changed.mechanism.joints[names.index("T2_0_x")].parent_index] == names[parent]
-    assert places.robot_joints(changed) == places.robot_joints(one_arm)
+    assert places.arm_joint_names(changed) == places.arm_joint_names(one_arm)
     assert changed.mechanism.frame("w_T1").joint_index == names.index("T1_3_z")
 
 
 def test_how_much_stiffening_to_expect_depends_on_how_far_joints_turn() -> None:
     effect = make_effect("cubic_stiffness", "T1", baxter_foam_y_system(1))
     low, high = effect.prior_ranges["cubic_stiffness@T1.k3"]
-    told = effect.with_expected_ranges({"T1": 0.25, "T2": 1.0})
+    told = effect.with_prior_ranges_for_angles({"T1": 0.25, "T2": 1.0})
     assert told.prior_ranges["cubic_stiffness@T1.k3"] == pytest.approx((4 * low, 4 * high))
-    assert effect.with_expected_ranges({"T2": 0.1}) is effect
+    assert effect.with_prior_ranges_for_angles({"T2": 0.1}) is effect

@@ -18,7 +18,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_any, read_csv
 from yid_ocp.errors import OutputError
-from yid_ocp.export.signals import TopicSignal, export_csv, export_mcap, signals_from_recording
+from yid_ocp.export.signals import RosTopicTimeSeries, export_csv, export_mcap, ros_signals_from_recording
 
 
 def read(path) -> dict[str, list]:
@@ -61,7 +61,7 @@ def recording() -> Recording:
 
 def test_a_recording_comes_back_number_by_number(recording, tmp_path):
     file = tmp_path / "one.mcap"
-    assert export_mcap(signals_from_recording(recording), file) == 0
+    assert export_mcap(ros_signals_from_recording(recording), file) == 0
     found = read(file)
     assert set(found) == {"/joint_states", "/joint_commands", "/points/camera/tip", "/points/camera/mid"}
     states = found["/joint_states"]
@@ -83,7 +83,7 @@ def test_a_recording_comes_back_number_by_number(recording, tmp_path):
 
 def test_it_can_be_imported_again(recording, tmp_path):
     file = tmp_path / "one.mcap"
-    export_mcap(signals_from_recording(recording), file)
+    export_mcap(ros_signals_from_recording(recording), file)
     topics = {"/points/camera/tip": "tip", "/points/camera/mid": "mid"}
     again = read_any(file, joint_topics=("/joint_states",), points=topics)
     np.testing.assert_array_equal(again.joints.position, recording.joints.position)
@@ -92,7 +92,7 @@ def test_it_can_be_imported_again(recording, tmp_path):
 
 def test_times_before_zero_are_moved_by_whole_seconds(tmp_path):
     t = np.array([-1.25, 0.0, 0.5])
-    signals = [TopicSignal("/f", "wrench", t, {"xyz": np.arange(9.0).reshape(3, 3)})]
+    signals = [RosTopicTimeSeries("/f", "wrench", t, {"xyz": np.arange(9.0).reshape(3, 3)})]
     assert export_mcap(signals, tmp_path / "f.mcap") == 2.0
     found = read(tmp_path / "f.mcap")["/f"]
     assert [stamp for stamp, *_ in found] == [0.75, 2.0, 2.5]
@@ -104,7 +104,9 @@ def test_nothing_is_refused_and_nothing_is_left_behind(tmp_path):
         export_mcap([], tmp_path / "none.mcap")
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot be written"):
-        export_mcap([TopicSignal("/f", "vector", np.zeros(1), {"xyz": np.zeros((1, 3))})], tmp_path / "file" / "a.mcap")
+        export_mcap(
+            [RosTopicTimeSeries("/f", "vector", np.zeros(1), {"xyz": np.zeros((1, 3))})], tmp_path / "file" / "a.mcap"
+        )
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 

@@ -10,7 +10,11 @@ import pytest
 from small_problems import H, correlated, pendulum_step, taken
 
 from yid_ocp.errors import ConfigError
-from yid_ocp.inference.whitening import estimate_torque_bias, estimate_torque_biases, whitened_at
+from yid_ocp.inference.whitening import (
+    estimate_episode_torque_bias,
+    estimate_recording_torque_biases,
+    problem_whitened_at,
+)
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
@@ -99,7 +103,7 @@ def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, 
     if together:
         problem = problem.with_episodes([correlated(episode) for episode in problem.episodes], ())
     x = problem.initial_unknowns * 1.1
-    plain, weighted = problem.evaluate(x), whitened_at(problem, x).evaluate(x)
+    plain, weighted = problem.evaluate(x), problem_whitened_at(problem, x).evaluate(x)
     rows = problem.residual_rows.data
     covariance = dense_covariance(problem, x, how.get("angle", ANGLE))
     solved = np.linalg.solve(covariance, np.column_stack([plain.residual[rows], plain.jacobian[rows]]))
@@ -116,7 +120,7 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
     for g in (9.0, gain):
         feedback = {"feedback": "proportional", "proportional_gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
-        weighted = whitened_at(problem, problem.initial_unknowns)
+        weighted = problem_whitened_at(problem, problem.initial_unknowns)
         rows = problem.residual_rows.data
         found = weighted.evaluate(problem.initial_unknowns)
         r, jacobian = found.residual[rows], found.jacobian[rows]
@@ -155,7 +159,7 @@ def test_without_errors_of_inputs_nothing_changes(urdf_folder):
     made = replace(made, joints=replace(made.joints, effort_std=0.0))
     problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
     assert not problem.has_process_noise
-    assert whitened_at(problem, problem.initial_unknowns) is problem
+    assert problem_whitened_at(problem, problem.initial_unknowns) is problem
     paper = problem_of(urdf_folder, encoders=False, weighting="paper")
     assert not paper.has_process_noise
     assert {s.sensor.group_name for s in paper.episodes[0].measurements} == {"points_arm", "points_camera"}
@@ -165,15 +169,15 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
     episode = problem.episodes[0]
     problem = problem.with_episodes([replace(episode, torque=episode.torque + 0.35)], [])
-    weighted = whitened_at(problem, problem.initial_unknowns)
-    ((value, std),) = estimate_torque_biases(weighted, problem.initial_unknowns)
+    weighted = problem_whitened_at(problem, problem.initial_unknowns)
+    ((value, std),) = estimate_recording_torque_biases(weighted, problem.initial_unknowns)
     assert std[0] < BIAS
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
-    again = whitened_at(weighted, problem.initial_unknowns)
+    again = problem_whitened_at(weighted, problem.initial_unknowns)
     np.testing.assert_allclose(again.episodes[0].input_errors.torque_bias, value)
-    ((settled, _),) = estimate_torque_biases(again, problem.initial_unknowns)
+    ((settled, _),) = estimate_recording_torque_biases(again, problem.initial_unknowns)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
-    assert estimate_torque_biases(problem, problem.initial_unknowns) == [None]
+    assert estimate_recording_torque_biases(problem, problem.initial_unknowns) == [None]
 
 
 @pytest.mark.parametrize("feedback", [TRACKED, {"feedback": "lqr"}], ids=["angles", "angles_and_momenta"])
@@ -181,7 +185,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     """The momentum of the measured motion is worked out from recorded torques; weights know what their error does."""
     problem = problem_of(urdf_folder, encoders=False, feedback=feedback)
     x, error = problem.initial_unknowns, 1e-3
-    weighted = whitened_at(problem, x)
+    weighted = problem_whitened_at(problem, x)
     [episode], [whitening] = weighted.episodes, weighted.whitening_filters
     group = episode.recording.joints
     wrong = replace(episode.recording, joints=replace(group, effort=group.effort + error))
@@ -190,7 +194,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     found = []
     for each in (episode, other):
         result = weighted.predictor.predict_episode(each, *problem.split(x, 0), False)
-        found.append(estimate_torque_bias(each, result, whitening)[0])
+        found.append(estimate_episode_torque_bias(each, result, whitening)[0])
     seen = 1 - (whitening.torque_bias_std[0] / BIAS) ** 2
     assert seen > 0.05
     assert (found[1] - found[0]) / error == pytest.approx(seen, rel=0.01)
@@ -198,15 +202,15 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
 
 def test_what_cannot_be_rolled_out_has_no_constant_error(point, monkeypatch):
     problem, x = point
-    weighted = whitened_at(problem, x)
-    assert len(estimate_torque_biases(weighted, x)[0]) == 2
+    weighted = problem_whitened_at(problem, x)
+    assert len(estimate_recording_torque_biases(weighted, x)[0]) == 2
     monkeypatch.setattr(type(weighted.predictor), "predict_episode", lambda *_: "it snaps")
-    assert estimate_torque_biases(weighted, x) == [None]
+    assert estimate_recording_torque_biases(weighted, x) == [None]
 
 
 def test_weights_are_frozen_until_they_are_asked_for_again(point):
     problem, x = point
-    weighted = whitened_at(problem, x)
+    weighted = problem_whitened_at(problem, x)
     there, back = weighted.evaluate(1.2 * x), weighted.evaluate(x)
     assert weighted.whitening_filters[0] is weighted.with_free_subset(problem.free[:1]).whitening_filters[0]
     np.testing.assert_array_equal(back.residual, weighted.evaluate(x).residual)
@@ -216,7 +220,7 @@ def test_weights_are_frozen_until_they_are_asked_for_again(point):
 
 def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
     problem = small_gap(problem_of(urdf_folder, encoders=True))
-    weighted = whitened_at(problem, problem.initial_unknowns)
+    weighted = problem_whitened_at(problem, problem.initial_unknowns)
     x = problem.initial_unknowns * 1.05
     found = weighted.evaluate(x)
     for i in range(len(x)):

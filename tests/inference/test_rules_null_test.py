@@ -12,10 +12,10 @@ import scipy.stats
 from made_series import samples, series
 
 from yid_ocp.inference.null_test import (
-    GapCriteria,
+    ExcessResidualCriteria,
     NullTestResult,
     channel_noise_levels,
-    exceeds_noise,
+    residuals_exceed_noise,
     run_null_test,
     whiten_with_extra_errors,
 )
@@ -72,13 +72,13 @@ def test_several_series_add_and_rows_of_no_series_do_not_count():
 )
 def test_more_than_noise_is_sure_among_all_tests_and_worth_a_word(tests, said):
     made = [NullTestResult(ratio, 10.0, p, {}, {}, ()) for ratio, p in tests]
-    assert exceeds_noise(made) is said
+    assert residuals_exceed_noise(made) is said
 
 
 def test_the_limits_of_the_gap_are_those_given():
     found = [NullTestResult(1.5, 10.0, 0.02, {}, {}, ())]
-    assert exceeds_noise(found, GapCriteria(significance_level=0.05))
-    assert not exceeds_noise(found, GapCriteria(significance_level=0.05, min_excess_chi2=0.5))
+    assert residuals_exceed_noise(found, ExcessResidualCriteria(significance_level=0.05))
+    assert not residuals_exceed_noise(found, ExcessResidualCriteria(significance_level=0.05, min_excess_chi2=0.5))
 
 
 # -- beside what else has moved it ------------------------------------------------------------------------------------

@@ -13,9 +13,13 @@ import threadpoolctl
 from yid_ocp.diagnosis.localise import localise_gap
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother, smoother_model
-from yid_ocp.inference.smoother_model import LinearResidualModel, UnknownGroup, _IntervalModel
+from yid_ocp.inference.smoother_model import LinearResidualModel, SmoothedUnknownGroup, _IntervalModel
 
-FORCE, OTHER_FORCE, BIAS = UnknownGroup("T1", "force"), UnknownGroup("T2", "force"), UnknownGroup("camera", "bias")
+FORCE, OTHER_FORCE, BIAS = (
+    SmoothedUnknownGroup("T1", "force"),
+    SmoothedUnknownGroup("T2", "force"),
+    SmoothedUnknownGroup("camera", "bias"),
+)
 SOURCES = (FORCE, OTHER_FORCE, BIAS)
 STATES, COUNT, ROWS, DECAY = 2, 8, 6, 0.7
 
@@ -146,7 +150,7 @@ def smoothed(monkeypatch, models, **limits):
 
     monkeypatch.setattr(smoother, "linear_residual_models", linear_model)
     chosen = Thresholds(**limits)
-    found = smoother.run_smoother(SimpleNamespace(), np.zeros(0), None, chosen)
+    found = smoother.select_and_smooth_unknowns(SimpleNamespace(), np.zeros(0), None, chosen)
     assert told["limits"] == chosen
     return found
 
@@ -331,7 +335,7 @@ def test_what_is_said_of_one_unknowns_history_is_that_of_dense_algebra(unknown):
         rows.append(interval.state_jacobian @ state + np.outer(interval.unknown_jacobian[:, unknown], now))
         state = interval.state_transition @ state + np.outer(interval.unknown_input_matrix[:, unknown], now)
     response = np.vstack([*rows, np.zeros((len(reference.y) - COUNT * ROWS, COUNT))])
-    score, information = smoother.force_likelihood_terms(model, variance, unknown)
+    score, information = smoother.force_log_likelihood_coefficients(model, variance, unknown)
     assert score == pytest.approx(response.T @ reference.inverse @ reference.y, rel=1e-7, abs=1e-9)
     assert information == pytest.approx(response.T @ reference.inverse @ response, rel=1e-7, abs=1e-9)
 
@@ -356,7 +360,11 @@ def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_f
     np.testing.assert_array_equal(smoother_model._torque_noise(course, unknowns, span, decay), np.zeros(4))
 
 
-HERE, LIKE, OTHER = UnknownGroup("here", "force"), UnknownGroup("there", "push"), UnknownGroup("elsewhere", "force")
+HERE, LIKE, OTHER = (
+    SmoothedUnknownGroup("here", "force"),
+    SmoothedUnknownGroup("there", "push"),
+    SmoothedUnknownGroup("elsewhere", "force"),
+)
 
 
 def test_a_place_that_does_as_well_is_told():
@@ -381,7 +389,7 @@ def test_a_place_that_does_as_well_is_told():
 
 
 def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():
-    same = UnknownGroup("here", "push")
+    same = SmoothedUnknownGroup("here", "push")
     seen = SimpleNamespace(
         log_evidence_drop={HERE: 9.0, LIKE: 0.0, same: 0.0},
         detectable_std=dict.fromkeys((HERE, LIKE, same), 0.5),

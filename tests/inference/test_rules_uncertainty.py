@@ -11,7 +11,7 @@ import pytest
 from made_problems import MadeUp, linear
 from small_problems import PENDULUM, pendulum_step, taken
 
-from yid_ocp.inference.null_test import GapCriteria, residual_channels
+from yid_ocp.inference.null_test import ExcessResidualCriteria, residual_channel_samples
 from yid_ocp.inference.uncertainty import (
     _MAX_CHECKED_PARAMETERS,
     _MIN_CLUSTER_CHANNELS,
@@ -20,12 +20,12 @@ from yid_ocp.inference.uncertainty import (
     _cost_checked_std,
     _misfit_sandwich_covariance,
     assess_goodness_of_fit,
-    covariance_and_chi2,
     is_std_sufficient,
     parameter_estimates,
     parameter_unknown_names,
     parameter_verdict,
-    typical_parameter_sizes,
+    typical_parameter_magnitudes,
+    unknowns_covariance_and_reduced_chi2,
     with_profile_interval,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -83,7 +83,7 @@ def test_small_and_weak_values_do_not_stand_by_themselves(value, std, said, expe
 
 def judged(problem, at=None):
     x = np.zeros(len(problem.initial_unknowns)) if at is None else np.array(at)
-    return covariance_and_chi2(problem, problem.evaluate(x))
+    return unknowns_covariance_and_reduced_chi2(problem, problem.evaluate(x))
 
 
 def test_the_covariance_is_the_inverse_of_the_information():
@@ -152,7 +152,7 @@ def test_a_direction_between_two_unknowns_is_known_though_neither_is():
 @pytest.mark.parametrize("ok", [True, False])
 def test_without_a_jacobian_nothing_is_known(ok):
     problem = MadeUp(linear(np.eye(2)) if ok else lambda x, duration: None, (1.0, 1.0), count=2)
-    covariance, chi2 = covariance_and_chi2(problem, problem.evaluate(np.zeros(2), derivatives=False))
+    covariance, chi2 = unknowns_covariance_and_reduced_chi2(problem, problem.evaluate(np.zeros(2), derivatives=False))
     assert covariance.shape == (2, 2)
     assert np.all(np.isnan(covariance))
     assert math.isnan(chi2)
@@ -221,9 +221,9 @@ def test_a_fit_explains_what_is_not_surely_and_relevantly_more_than_noise(square
 def test_a_fit_is_judged_by_the_limits_of_a_diagnosis():
     problem = of_size(1.2)
     found = problem.evaluate([1.0])
-    assert assess_goodness_of_fit(problem, found, GapCriteria(significance_level=1e-6)).explains
-    assert assess_goodness_of_fit(problem, found, GapCriteria(min_excess_chi2=0.5)).explains
-    half = assess_goodness_of_fit(problem, found, GapCriteria(noise_fraction=0.5))
+    assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(significance_level=1e-6)).explains
+    assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(min_excess_chi2=0.5)).explains
+    half = assess_goodness_of_fit(problem, found, ExcessResidualCriteria(noise_fraction=0.5))
     assert half.chi2_per_dof == pytest.approx(4 * assess_goodness_of_fit(problem, found).chi2_per_dof)
 
 
@@ -248,7 +248,7 @@ def constant(residual):
 
 def widened(problem):
     found = problem.evaluate([0.0])
-    covariance, _ = covariance_and_chi2(problem, found)
+    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, found)
     return math.sqrt(_misfit_sandwich_covariance(problem, found, covariance)[0, 0] / covariance[0, 0])
 
 
@@ -266,7 +266,7 @@ def test_a_misfit_of_one_block_or_of_none_widens_nothing():
         MadeUp(linear(np.zeros((3, 0))), ()),
     ):
         found = problem.evaluate(np.zeros(len(problem.initial_unknowns)))
-        covariance, _ = covariance_and_chi2(problem, found)
+        covariance, _ = unknowns_covariance_and_reduced_chi2(problem, found)
         np.testing.assert_array_equal(_misfit_sandwich_covariance(problem, found, covariance), covariance)
 
 
@@ -281,7 +281,7 @@ def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(ur
     options = ProblemOptions(path_cutoff=np.inf, weak_prior_factor=0.0)
     recordings = [taken(step, seed, camera=False, steps=200) for seed in range(3)]
     problem = EstimationProblem(step, recordings, ("elbow.mass",), options)
-    found, series = problem.evaluate(problem.initial_unknowns), residual_channels(problem)
+    found, series = problem.evaluate(problem.initial_unknowns), residual_channel_samples(problem)
     offset = np.random.default_rng(2).choice([-3.0, 3.0], len(series))
     moved = np.zeros(len(found.residual))
     for own, size in zip(series, offset, strict=True):
@@ -291,7 +291,7 @@ def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(ur
     scores = np.array([size * slope[own.residual_indices].sum() for own, size in zip(series, offset, strict=True)])
     scores -= scores.mean()
     expected = scores @ scores * len(series) / (len(series) - 1) / (slope @ slope) ** 2
-    plain, _ = covariance_and_chi2(problem, found)
+    plain, _ = unknowns_covariance_and_reduced_chi2(problem, found)
     assert len(series) >= _MIN_CLUSTER_CHANNELS
     assert expected > 3 * plain[0, 0]
     assert _misfit_sandwich_covariance(problem, found, plain)[0, 0] == pytest.approx(expected)
@@ -310,7 +310,7 @@ def test_a_standard_deviation_that_the_cost_does_not_bear_out_grows(top, kept):
     problem = MadeUp(saturating(top), lower=-np.inf, scales=(1.0,))
     x = np.zeros(1)
     found = problem.evaluate(x)
-    std = _cost_checked_std(problem, x, found, covariance_and_chi2(problem, found)[0])[0]
+    std = _cost_checked_std(problem, x, found, unknowns_covariance_and_reduced_chi2(problem, found)[0])[0]
     # at 1.96 standard deviations the cost is that of a saturated prediction: 0.5^2 in place of 3.84
     assert std == pytest.approx(1.0 if kept else 1.96 / 0.5, rel=0.01)
 
@@ -319,7 +319,7 @@ def test_a_well_known_parameter_is_not_asked_again():
     problem = MadeUp(linear([[100.0]]), (1.0,))
     found = problem.evaluate([1.0])
     before = len(problem.asked)
-    _cost_checked_std(problem, np.ones(1), found, covariance_and_chi2(problem, found)[0] * 1e-8)
+    _cost_checked_std(problem, np.ones(1), found, unknowns_covariance_and_reduced_chi2(problem, found)[0] * 1e-8)
     assert len(problem.asked) == before
 
 
@@ -399,10 +399,10 @@ def test_a_stiffness_well_known_to_be_near_zero_is_found():
 
 def test_the_size_that_a_parameter_might_have():
     for how, size in (({}, 3.0), ({"upper": 8.0}, 4.0), ({"upper": 8.0, "priors": {"k0": 0.5}}, 0.5)):
-        assert typical_parameter_sizes(MadeUp(linear(np.eye(1)), (3.0,), **how), np.ones(1))["k0"] == size
+        assert typical_parameter_magnitudes(MadeUp(linear(np.eye(1)), (3.0,), **how), np.ones(1))["k0"] == size
     three = MadeUp(linear(np.eye(2)), (3.0, 5.0), fixed=(9.0,))
-    assert typical_parameter_sizes(three, np.array([1.0, 5.0]))["k0"] == 7.0
-    assert typical_parameter_sizes(three, np.array([1.0, 0.0]))["k0"] == 9.0
+    assert typical_parameter_magnitudes(three, np.array([1.0, 5.0]))["k0"] == 7.0
+    assert typical_parameter_magnitudes(three, np.array([1.0, 0.0]))["k0"] == 9.0
 
 
 @pytest.mark.parametrize(("scale", "expected"), [(1e-7, "not_identifiable"), (1.0, "identifiable")])

@@ -36,23 +36,27 @@ def test_an_interval_may_have_open_ends(interval, expected):
     ],
 )
 def test_a_value_is_told_with_what_is_known_of_it(std, interval, expected):
-    assert uncertainty.parameter_text(22.1234, std, interval) == expected
+    assert uncertainty.parameter_value_text(22.1234, std, interval) == expected
 
 
 @pytest.mark.parametrize("chi2", [None, math.nan])
 @pytest.mark.parametrize("explains", [True, False])
 def test_a_fit_without_a_misfit_is_not_judged(chi2, explains):
-    assert uncertainty.fit_message(chi2, explains) == "whether the model explains the recordings is not known"
+    assert (
+        uncertainty.goodness_of_fit_message(chi2, explains) == "whether the model explains the recordings is not known"
+    )
 
 
 def test_a_fit_is_told_with_its_misfit_and_what_follows():
-    assert uncertainty.fit_message(1.0449, True).endswith("to within their noise (chi2 per degree of freedom is 1.04)")
-    bad = uncertainty.fit_message(9.0, False)
+    assert uncertainty.goodness_of_fit_message(1.0449, True).endswith(
+        "to within their noise (chi2 per degree of freedom is 1.04)"
+    )
+    bad = uncertainty.goodness_of_fit_message(9.0, False)
     assert "does not explain the recordings (chi2 per degree of freedom is 9," in bad
     assert bad.endswith("run `yid-ocp diagnose`")
 
 
 def test_tables_say_the_same_as_sentences():
-    assert uncertainty.VERDICT_WORDS["weak"] == "weakly determined"
-    assert uncertainty.VERDICT_WORDS["not_identifiable"] == "cannot be found"
-    assert set(uncertainty.VERDICT_WORDS) == set(uncertainty.VERDICT_PREDICATES)
+    assert uncertainty.VERDICT_TABLE_TEXTS["weak"] == "weakly determined"
+    assert uncertainty.VERDICT_TABLE_TEXTS["not_identifiable"] == "cannot be found"
+    assert set(uncertainty.VERDICT_TABLE_TEXTS) == set(uncertainty.VERDICT_PREDICATES)

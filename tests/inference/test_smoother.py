@@ -13,12 +13,12 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.localise import (
     GapLocation,
     attribute_gap_to_effects,
-    informed_z_scores,
     localise_gap,
-    merge_intervals,
+    merge_time_intervals,
+    smoothed_unknown_z_scores,
 )
 from yid_ocp.inference import smoother_model
-from yid_ocp.inference.smoother import run_smoother
+from yid_ocp.inference.smoother import select_and_smooth_unknowns
 from yid_ocp.inference.smoother_model import (
     _FORCE_POINT,
     _generalized_forces_per_newton,
@@ -131,7 +131,7 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, f
 def test_clean_data_have_no_place(driven):
     problem = problem_of(driven, recorded(driven, {}, 2))
     solution = solve(problem, GaussNewton())
-    found = run_smoother(problem, np.array(solution.x), solution.evaluation)
+    found = select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
     assert found.log_evidence["both"] == 0
     assert found.gap_origin == "none"
     assert all(place.gap_share == 0 for place in localise_gap(found))
@@ -142,7 +142,7 @@ def test_clean_data_have_no_place(driven):
 def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
     problem = problem_of(driven, recorded(driven, {joint: (push, 0.8, 1.3)}, 3))
     solution = solve(problem, GaussNewton())
-    found = run_smoother(problem, np.array(solution.x), solution.evaluation)
+    found = select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
     places = localise_gap(found)
     assert places[0].location == name
     assert places[0].gap_share > 0.5
@@ -153,7 +153,7 @@ def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
     middle = (trace.interval_edges[:-1] >= 0.9) & (trace.interval_edges[1:] <= 1.25)
     size = trace.reference_std[column] * trace.posterior_mean[middle, column]
     assert np.abs(size).mean() == pytest.approx(push, rel=0.35)
-    edges, names, values = informed_z_scores(found)
+    edges, names, values = smoothed_unknown_z_scores(found)
     assert values.shape == (len(edges) - 1, len(names))
     assert np.isfinite(values[:, names.index(name)]).any()
 
@@ -166,7 +166,7 @@ def test_a_sensor_that_reads_wrong_is_told_from_a_push(driven):
     wrong = replace(recording, points=(replace(group, position=moved),))
     problem = problem_of(driven, wrong)
     solution = solve(problem, GaussNewton())
-    found = run_smoother(problem, np.array(solution.x), solution.evaluation)
+    found = select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
     assert found.gap_origin == "sensor"
     assert localise_gap(found)[0].location == "points"
 
@@ -175,11 +175,11 @@ def test_efforts_of_prescribed_joints_say_which(bench):
     recording = bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, 1, duration=2.0)
     problem = bench.problem([recording])
     solution = solve(problem, GaussNewton())
-    found = run_smoother(problem, np.array(solution.x), solution.evaluation)
+    found = select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
     places = localise_gap(found)
     assert places[0].location == "elbow"
     assert places[0].gap_share > 0.8
-    assert found.explainable_fraction > 0.5
+    assert found.explainable_gap_fraction > 0.5
     assert found.gap_origin == "either", "a force at a measured joint and its sensor's bias are the same"
 
 
@@ -191,7 +191,7 @@ def test_effects_take_the_share_that_they_close():
 
 
 def test_touching_spans_are_one():
-    assert merge_intervals([(1.0, 1.5), (0.0, 0.5), (0.5, 1.0), (3.0, 4.0)]) == ((0.0, 1.5), (3.0, 4.0))
+    assert merge_time_intervals([(1.0, 1.5), (0.0, 0.5), (0.5, 1.0), (3.0, 4.0)]) == ((0.0, 1.5), (3.0, 4.0))
 
 
 # -- pushes on segments ------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.errors import ResourceError
+from yid_ocp.errors import InsufficientMemoryError
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.integrator.step_model import RolloutInputs, TrackingFeedback
 from yid_ocp.model import (
@@ -160,7 +160,7 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
     def add(effect, state):
         c, b, v = effect.parameters.symbols[0], effect.parameters.symbols[1], state.v
         tree, kinematics = state.system.mechanism, state.kinematics
-        chain, screws = tree.ancestor_joints(tree.joint_index(joint)), kinematics.joint_screws
+        chain, screws = tree.ancestor_joint_indices(tree.joint_index(joint)), kinematics.joint_screws
         along = {-1: ca.SX(ca.DM.zeros(6))}
         for j in chain:
             along[j] = along[tree.joints[j].parent_index] + screws[j] * v[j]
@@ -249,7 +249,7 @@ def make_case(
     torque = strength * rng.normal(size=(steps, sizes["nu"]))
     time = np.arange(steps + 1)[:, None] * time_step
     speed = 0.1 * rng.normal(size=sizes["nc"])
-    path = q[list(system.prescribed_indices)] + speed * time + 4.0 * rng.normal(size=sizes["nc"]) * time**2
+    path = q[list(system.prescribed_coordinate_indices)] + speed * time + 4.0 * rng.normal(size=sizes["nc"]) * time**2
     index = rng.choice(sizes["nx"], size=5, replace=False).astype(np.int32)
     gain = strength * rng.normal(size=(steps, sizes["nu"], 5))
     feedback = TrackingFeedback(index, gain, start[index] + 0.01 * rng.normal(size=(steps, 5)))
@@ -349,7 +349,7 @@ class Poor:
             self.grants.value = grants
             try:
                 action()
-            except ResourceError as error:
+            except InsufficientMemoryError as error:
                 messages.append(str(error))
             else:
                 assert all("not enough memory for" in m and " MB" in m and "fewer parameters" in m for m in messages)

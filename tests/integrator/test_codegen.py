@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator import codegen, compiled, compiler
-from yid_ocp.integrator.codegen import simd_c_source
+from yid_ocp.integrator.codegen import _simd_c_source
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections, TrackingFeedback
 
 pytestmark = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
@@ -128,9 +128,11 @@ def test_a_member_that_fails_fails_as_alone_and_companions_do_not_notice(parts, 
 def test_without_vectors_members_are_done_one_by_one(parts, urdf_folder, monkeypatch):
     case = parts.builders["closed_loop"](urdf_folder)
     members = members_of(case)
-    original = compiler.compile_library
+    original = compiler.compiled_shared_library
     monkeypatch.setattr(
-        compiler, "compile_library", lambda text, *make: None if "define BATCHED" in text else original(text, *make)
+        compiler,
+        "compiled_shared_library",
+        lambda text, *make: None if "define BATCHED" in text else original(text, *make),
     )
     for one, member in zip(case.step.kernel.rollout_batch(members), members, strict=True):
         assert_same(one, alone(case, member))
@@ -173,7 +175,7 @@ MACHINES = {"this": compiler._NATIVE_FLAGS, "avx2": ("-mavx2", "-mfma"), "any": 
 
 def arithmetic_source(function, batched=True):
     """C source of a function of two numbers, for members that march together or for one, with what tries it."""
-    body = simd_c_source([function])
+    body = _simd_c_source([function])
     assert body is not None
     arithmetic = resources.files("yid_ocp.integrator").joinpath("simd.c").read_text(encoding="utf-8")
     sizes = f"#define OUTPUTS {function.numel_out(0)}\n#define PLACES {function.sz_w()}"
@@ -204,7 +206,7 @@ def test_arithmetic_of_a_batch_is_that_of_one(monkeypatch, machine, program):
     monkeypatch.setattr(compiler, "_compiler_path", lambda: path)
     monkeypatch.setattr(compiler, "_NATIVE_FLAGS", MACHINES[machine])
     function = everything()
-    library = compiler.compile_library(arithmetic_source(function))
+    library = compiler.compiled_shared_library(arithmetic_source(function))
     assert library.yid_simd_width() == (8 if machine == "this" and "avx512f" in compiler._machine() else 4)
     points = tried_points()
     found = np.zeros((len(points), function.numel_out(0)))
@@ -220,7 +222,7 @@ def test_a_long_function_in_parts_is_the_same(monkeypatch, batched, size):
     monkeypatch.setattr(codegen, "_PART_INSTRUCTION_COUNT", size)
     source = arithmetic_source(function, batched)
     assert source.count("noinline") == math.ceil(function.n_instructions() / size)
-    library = compiler.compile_library(source)
+    library = compiler.compiled_shared_library(source)
     if batched and not library.yid_simd_width():
         pytest.skip("this machine has no vectors")
     found = np.zeros((len(points), function.numel_out(0)))
@@ -235,17 +237,17 @@ def test_a_step_of_long_functions_is_the_same(parts, urdf_folder, monkeypatch, n
     monkeypatch.setattr(codegen, "_LONG_INSTRUCTION_COUNT", 100)
     monkeypatch.setattr(codegen, "_PART_INSTRUCTION_COUNT", 30)
     model = case.step.model
-    text = codegen.kernel_source(model.functions, model.index_tables)
+    text = codegen.kernel_c_source(model.functions, model.index_tables)
     assert "linear_3(" in text
     assert "casadi_f0" in text, "short ones are as CasADi writes them"
-    kernel = compiled.CompiledKernel(model, compiler.compile_library(text))
+    kernel = compiled.CompiledKernel(model, compiler.compiled_shared_library(text))
     for member, found in zip(members, kernel.rollout_batch(members), strict=True):
         assert_same(found, alone(case, member), TOLERANCE)
 
 
 def test_an_operation_without_a_form_is_refused():
     x = ca.SX.sym("x")
-    assert simd_c_source([ca.Function("odd", [x], [ca.erfinv(x)])]) is None
+    assert _simd_c_source([ca.Function("odd", [x], [ca.erfinv(x)])]) is None
 
 
 def test_elimination_fills_no_more_than_the_tree(single_step):
@@ -258,6 +260,6 @@ def test_elimination_fills_no_more_than_the_tree(single_step):
     assert ordered[-3:] == ["lam0", "lam1", "lam2"]
     tip = [ordered[i] for i in tables.fill_in[0]]
     tree = system.mechanism
-    chain = [tree.joint_names[i] for i in tree.ancestor_joints(tree.joint_index("T3_3_z"))]
+    chain = [tree.joint_names[i] for i in tree.ancestor_joint_indices(tree.joint_index("T3_3_z"))]
     assert tip == chain[-2::-1]
     assert sum(len(entries) for entries in tables.fill_in) < 0.75 * size * (size - 1) / 2

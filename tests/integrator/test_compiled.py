@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.errors import ModelError, ResourceError
+from yid_ocp.errors import InsufficientMemoryError, ModelError
 from yid_ocp.integrator import codegen, compiled, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
 from yid_ocp.integrator.rollout import simulate
@@ -29,7 +29,9 @@ def step(parts, urdf_folder):
 def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     case = parts.make_case(*parts.closed_loop(urdf_folder))
     model = case.step.model
-    library = compiler.compile_library(poor.source + codegen.kernel_source(model.functions, model.index_tables))
+    library = compiler.compiled_shared_library(
+        poor.source + codegen.kernel_c_source(model.functions, model.index_tables)
+    )
     poor.watch(library)
     kernel = CompiledKernel(model, library)
     names = ("spin.mass", "hinge.damping")
@@ -51,12 +53,15 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     )
     trajectory = (case.theta, plain.state, plain.multipliers, plain.torque, names, True)
     assert poor.grants_needed(lambda: kernel.linearize(*trajectory)) == 1
-    given = np.concatenate([case.start[list(case.step.system.driven_indices)], case.path[0]])
+    given = np.concatenate([case.start[list(case.step.system.driven_coordinate_indices)], case.path[0]])
     loads = np.ones((sum(model.sizes[key] for key in ("n", "nz", "m")), 1)), np.ones((model.sizes["n"], 1))
-    assert poor.grants_needed(lambda: kernel.step_jacobians(*trajectory[:4], *loads)) == 1
+    assert poor.grants_needed(lambda: kernel.state_transition_jacobians(*trajectory[:4], *loads)) == 1
     unknowns = np.zeros(sum(model.sizes[key] for key in ("n", "nz", "m")) - model.sizes["nc"])
     assert (
-        poor.grants_needed(lambda: kernel.find_equilibrium(case.theta, unknowns, given, case.torque[0], 1e3, 1e-9)) == 1
+        poor.grants_needed(
+            lambda: kernel.find_static_equilibrium(case.theta, unknowns, given, case.torque[0], 1e3, 1e-9)
+        )
+        == 1
     )
 
     poor.grants.value = 100
@@ -74,8 +79,8 @@ def test_structs_are_laid_out_as_in_the_kernel(step):
     sizes = [f"sizeof({kind.__name__})" for kind in structs]
     places = [f"offsetof({kind.__name__}, {field})" for kind, field in fields]
     text = f"#include <stddef.h>\nconst long long yid_layout[] = {{{', '.join(sizes + places)}}};\n"
-    source = codegen.kernel_source(step.model.functions, step.model.index_tables)
-    library = compiler.compile_library(source + text)
+    source = codegen.kernel_c_source(step.model.functions, step.model.index_tables)
+    library = compiler.compiled_shared_library(source + text)
     layout = list((ctypes.c_longlong * (len(sizes) + len(places))).in_dll(library, "yid_layout"))
     expected = [ctypes.sizeof(kind) for kind in structs] + [getattr(kind, field).offset for kind, field in fields]
     assert layout == expected
@@ -86,12 +91,14 @@ def test_a_rollout_beyond_all_memory(urdf_folder, use_compiler):
     system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"))
     step = compile_step(system, 0.01, use_compiler=use_compiler)
     theta, start, nothing = system.parameters.vector(), np.zeros(4), np.zeros((3, 0))
-    with pytest.raises(ResourceError) as caught:
+    with pytest.raises(InsufficientMemoryError) as caught:
         simulate(step, theta, start, 10**14)
     for word in ("a rollout of 100000000000000 steps with 0 derivatives", "3.2e+06 GB", "fewer parameters"):
         assert word in str(caught.value)
     wide = SensitivityDirections((), np.broadcast_to(0.0, (4, 10**15)))
-    with pytest.raises(ResourceError, match=r"3 steps with 1000000000000000 derivatives: it takes 1\.28e\+08 GB"):
+    with pytest.raises(
+        InsufficientMemoryError, match=r"3 steps with 1000000000000000 derivatives: it takes 1\.28e\+08 GB"
+    ):
         step.kernel.rollout(RolloutInputs(theta, start, nothing, np.zeros((4, 0)), None, wide))
 
 

@@ -53,16 +53,16 @@ def runs(monkeypatch):
 
 @needs_compiler
 def test_the_second_compilation_reads_the_cache(cache, runs):
-    first = compiler.compile_library(SOURCE % 42)
+    first = compiler.compiled_shared_library(SOURCE % 42)
     assert first.yid_answer() == 42
     compilations = [command for command in runs if "-shared" in command]
     assert len(compilations) == 1
     assert [path.suffix for path in cache.iterdir()] == [".so"]
     assert stat.S_IMODE(cache.stat().st_mode) == 0o700
     del runs[:]
-    assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
     assert runs == []
-    assert compiler.compile_library(SOURCE % 43).yid_answer() == 43
+    assert compiler.compiled_shared_library(SOURCE % 43).yid_answer() == 43
     assert len(list(cache.iterdir())) == 2
 
 
@@ -70,7 +70,7 @@ def test_the_second_compilation_reads_the_cache(cache, runs):
 @pytest.mark.parametrize("change", ["compiler", "processor", "flags", "level", "casadi"])
 def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkeypatch, change):
     """A cache that moves to another machine, or meets another compiler, is not trusted."""
-    compiler.compile_library(SOURCE % 42)
+    compiler.compiled_shared_library(SOURCE % 42)
     if change == "compiler":
         other = tmp_path / "other_cc"
         other.write_text(
@@ -89,7 +89,7 @@ def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkey
     elif change == "casadi":
         monkeypatch.setattr(compiler.ca.CasadiMeta, "version", lambda: "another")
     compiler._machine.cache_clear()
-    assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
     assert len(list(cache.iterdir())) == 2
 
 
@@ -131,7 +131,7 @@ def test_without_a_compiler_everything_works_after_one_notice(cache, monkeypatch
 @pytest.mark.parametrize("damage", ["truncated", "flipped", "unreadable"])
 def test_a_damaged_library_is_made_again(cache, caplog, damage):
     """Loading one would end the process with a signal."""
-    assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
     (path,) = cache.iterdir()
     whole = path.read_bytes()
     path.unlink()  # a new file: the old one stays loaded
@@ -139,7 +139,7 @@ def test_a_damaged_library_is_made_again(cache, caplog, damage):
         path.symlink_to(cache.parent / "nowhere")
     else:
         path.write_bytes(whole[:900] if damage == "truncated" else whole[:700] + bytes([whole[700] ^ 8]) + whole[701:])
-    assert compiler.compile_library(SOURCE % 42).yid_answer() == 42
+    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
     assert "damaged" in caplog.text
 
 
@@ -196,14 +196,14 @@ def polynomial(scale=2.0):
 @needs_compiler
 def test_a_function_is_compiled_once_and_keeps_its_sparsity(cache, runs):
     plain = polynomial()
-    made = [compiler.compiled_function(plain) for _ in range(2)]
+    made = [compiler.compiled_casadi_function(plain) for _ in range(2)]
     assert len([command for command in runs if "-shared" in command]) == 1
     for function in made:
         assert not function.is_a("SXFunction")
         assert function.sparsity_out(1) == plain.sparsity_out(1)
         for actual, expected in zip(function([1.0, 2.0, 3.0]), plain([1.0, 2.0, 3.0]), strict=True):
             np.testing.assert_allclose(np.array(actual), np.array(expected), rtol=1e-15)
-    other = compiler.compiled_function(polynomial(5.0))
+    other = compiler.compiled_casadi_function(polynomial(5.0))
     assert float(other([1.0, 2.0, 3.0])[0][2]) == 45.0
     assert float(made[0]([1.0, 2.0, 3.0])[0][2]) == 18.0
 
@@ -213,11 +213,11 @@ def test_a_function_that_cannot_be_compiled_is_as_it_was(cache, monkeypatch, cap
     plain = polynomial()
     with monkeypatch.context() as change:
         change.setattr(compiler.os, "replace", lambda source, target: target.write_bytes(b"not a library"))
-        assert compiler.compiled_function(plain).is_a("SXFunction")
+        assert compiler.compiled_casadi_function(plain).is_a("SXFunction")
     assert "cannot be loaded" in caplog.text
     monkeypatch.setenv("CC", "none")
     compiler._compiler_path.cache_clear()
-    assert compiler.compiled_function(polynomial(3.0)).is_a("SXFunction")
+    assert compiler.compiled_casadi_function(polynomial(3.0)).is_a("SXFunction")
 
 
 # -- functions at many points at once ----------------------------------------------------------------------------------
@@ -243,13 +243,13 @@ def test_values_at_every_point(use_compiler):
 
 @needs_compiler
 def test_no_memory_for_a_mapped_function(poor, monkeypatch):
-    libraries, original = [], compiler.compile_library
+    libraries, original = [], compiler.compiled_shared_library
 
     def poor_library(source):
         libraries.append(original(poor.source + source))
         return libraries[-1]
 
-    monkeypatch.setattr(compiler, "compile_library", poor_library)
+    monkeypatch.setattr(compiler, "compiled_shared_library", poor_library)
     x = ca.SX.sym("x", 2)
     double = MappedFunction(ca.Function("double_it", [x], [2 * x]))
     poor.watch(libraries[0])

@@ -57,7 +57,7 @@ class Hard:
         n, nz = self.system.n_coordinates, len(self.system.internal_coordinates)
         start = np.concatenate([self.q, np.broadcast_to(self.p, n), np.zeros(nz)])
         torque = np.full((self.steps, len(self.system.driven)), self.torque)
-        path = np.tile(self.q[list(self.system.prescribed_indices)], (self.steps + 1, 1))
+        path = np.tile(self.q[list(self.system.prescribed_coordinate_indices)], (self.steps + 1, 1))
         path[1:] += self.moved
         return self.system.parameters.vector(), start, torque, path
 
@@ -94,7 +94,9 @@ def out_of_reach(folder):
     turn = read_urdf(folder / "turntable.urdf", joints=["turn"])
     carrier = replace(turn, frames={"disc": turn.frames["disc"]})
     far = Grasp("far", "ceiling", "tip", holder_offset=ca.SX(ca.DM([0.0, 3.0, 0.0])))
-    return System.build(carrier.with_mechanism(read_urdf(folder / "double_pendulum.urdf"), "disc"), grasps=[far])
+    return System.build(
+        carrier.with_attached_mechanism(read_urdf(folder / "double_pendulum.urdf"), "disc"), grasps=[far]
+    )
 
 
 def redundant(folder):
@@ -159,7 +161,7 @@ def first_correction(hard: Hard) -> float:
     """Newton's first correction of the coordinates, from the state before as the guess."""
     step, (theta, start, torque, path) = hard.step(use_compiler=False), hard.inputs()
     after = start.copy()
-    after[list(hard.system.prescribed_indices)] = path[1]
+    after[list(hard.system.prescribed_coordinate_indices)] = path[1]
     sizes, unknown = step.sizes, step.model.index_tables.unknown_rows
     pair = np.stack([start, after])
     found = step.kernel.linearize(theta, pair, np.zeros((1, sizes["m"])), torque[:1], (), True)
@@ -180,7 +182,7 @@ def test_both_kernels_agree(hard):
     theta, start, torque, path = hard.inputs()
     names = tuple(hard.system.parameters.names)
     directions = SensitivityDirections(names, np.random.default_rng(1).normal(size=(len(start), len(names))))
-    directions.initial_state_tangents[list(hard.system.prescribed_indices)] = 0.0
+    directions.initial_state_tangents[list(hard.system.prescribed_coordinate_indices)] = 0.0
     inputs = RolloutInputs(theta, start, torque, path, None, directions)
     one, two = (step.kernel.rollout(inputs) for step in steps)
     assert (one.status.code, two.status.code) == (hard.code, hard.code)

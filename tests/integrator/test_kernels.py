@@ -36,7 +36,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     assert s["nu"] == 2
     feedback = case.feedback if fed_back else None
     names = case.step.system.parameters.names
-    fixed = list(case.step.system.prescribed_indices)
+    fixed = list(case.step.system.prescribed_coordinate_indices)
     weights = random_cost(case)
     rng = np.random.default_rng(12)
 
@@ -103,7 +103,7 @@ def test_interpreter_equals_compiled(case):
     torque = rng.normal(size=(*case.torque.shape, d))
     path = rng.normal(size=(*case.path.shape, d))
     directions = SensitivityDirections(names, rng.normal(size=(nx, d)), torque, path)
-    directions.initial_state_tangents[list(case.step.system.prescribed_indices)] = path[0]
+    directions.initial_state_tangents[list(case.step.system.prescribed_coordinate_indices)] = path[0]
     one = case.rollout(feedback=feedback, directions=directions)
     two = case.rollout(feedback=feedback, directions=directions, step=plain)
     weights = random_cost(case)
@@ -151,7 +151,7 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
         rollout.multipliers
     )
     np.testing.assert_allclose(exact.p1, rollout.state[1:, n : 2 * n], rtol=0, atol=1e-9)
-    fixed = list(step.system.prescribed_indices)
+    fixed = list(step.system.prescribed_coordinate_indices)
     np.testing.assert_allclose(
         -exact.residual[:, fixed] / h, rollout.effort, rtol=0, atol=1e-7 * scale_of(rollout.effort)
     )
@@ -199,7 +199,7 @@ def test_single_steps_are_differentiated_alike_by_both_kernels(case):
     rows = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2))
     momentum = rng.normal(size=(sizes["n"], 2))
     along = (case.theta, rollout.state, rollout.multipliers, rollout.torque, rows, momentum)
-    made, expected = (step.kernel.step_jacobians(*along) for step in (case.step, slow))
+    made, expected = (step.kernel.state_transition_jacobians(*along) for step in (case.step, slow))
     assert made[0].shape == (len(case.torque), sizes["nx"], sizes["nx"] + sizes["nu"] + 2)
     for one, other in zip(made, expected, strict=True):
         # large terms cancel in efforts
@@ -208,6 +208,6 @@ def test_single_steps_are_differentiated_alike_by_both_kernels(case):
     n, q0 = sizes["n"], rollout.state[0]
     prescribed = (case.path[0], case.path[1]) if sizes["nc"] else None
     A, B_u, _ = case.step.jacobians(q0[:n], q0[n : 2 * n], case.torque[0], case.theta, prescribed, q0[2 * n :], ())
-    free = np.delete(np.arange(sizes["nx"]), list(case.step.system.prescribed_indices))
+    free = np.delete(np.arange(sizes["nx"]), list(case.step.system.prescribed_coordinate_indices))
     np.testing.assert_allclose(made[0][0][free, : sizes["nx"]], A[free], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(made[0][0][free, sizes["nx"] : -2], B_u[free], rtol=1e-9, atol=1e-9)

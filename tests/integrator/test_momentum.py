@@ -8,7 +8,7 @@ import pytest
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.tracking_feedback import DrivenJointMotion, MomentumShift, lqr_feedback
+from yid_ocp.integrator.tracking_feedback import DrivenJointMotion, EffectMomentumShift, lqr_feedback
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 
@@ -60,11 +60,13 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     step = compiled(plain, names)
     theta = step.system.parameters.vector()
     state, torque, internal = moved(step, theta)
-    shift = MomentumShift(step)
+    shift = EffectMomentumShift(step)
     read = torque + misread
     loop = lqr_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
     true = DrivenJointMotion(state[:, ANGLES], torque, internal)
-    value, _ = shift.shift_and_derivatives(DrivenJointMotion(state[:, ANGLES], read, internal), true, theta, ())
+    value, _ = shift.momentum_shift_and_derivatives(
+        DrivenJointMotion(state[:, ANGLES], read, internal), true, theta, ()
+    )
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     if names or misread:
         assert np.max(np.abs(value)) > 1e-3
@@ -75,16 +77,16 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
     step = compiled(plain, ())
     theta = step.system.parameters.vector()
     state, torque, none = moved(step, theta)
-    shift = MomentumShift(step)
+    shift = EffectMomentumShift(step)
     assert shift.parameter_names == ()
     by_torque = np.stack([torque, 0 * torque], axis=2)
     recorded = DrivenJointMotion(state[:, ANGLES], torque, none)
     true = DrivenJointMotion(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
-    value, slope = shift.shift_and_derivatives(recorded, true, theta, ("gain", "other"))
+    value, slope = shift.momentum_shift_and_derivatives(recorded, true, theta, ("gain", "other"))
     np.testing.assert_allclose(value[1:], 0.5 * TIME_STEP / 2 * torque[:-1], atol=1e-12)
     np.testing.assert_allclose(slope[:, :, 0] * 0.5, value, atol=1e-12)
     np.testing.assert_array_equal(slope[:, :, 1], 0.0)
-    np.testing.assert_allclose(shift.momentum_by_torque(theta), TIME_STEP / 2 * np.eye(2), atol=1e-15)
+    np.testing.assert_allclose(shift.momentum_derivative_by_torque(theta), TIME_STEP / 2 * np.eye(2), atol=1e-15)
 
 
 @pytest.mark.parametrize("names", [EFFECTS["two that hold"], EFFECTS["friction"]], ids=["holds", "slides"])
@@ -93,7 +95,7 @@ def test_derivatives_are_those_of_differences(plain, names):
     step = compiled(plain, names)
     theta = step.system.parameters.vector()
     state, torque, internal = moved(step, theta)
-    shift = MomentumShift(step)
+    shift = EffectMomentumShift(step)
     wanted = shift.parameter_names
     d, rng = len(wanted) + 2, np.random.default_rng(1)
     by_angles, by_torque = (0.01 * rng.normal(size=(*x.shape, d)) for x in (state[:, ANGLES], torque))
@@ -105,7 +107,7 @@ def test_derivatives_are_those_of_differences(plain, names):
         own = theta.copy()
         own[[step.system.parameters.index(name) for name in wanted]] += move[: len(wanted)]
         parts = (state[:, ANGLES] + by_angles @ move, torque + by_torque @ move, internal + by_internal @ move)
-        return shift.shift_and_derivatives(
+        return shift.momentum_shift_and_derivatives(
             recorded, DrivenJointMotion(*parts, by_angles, by_torque, by_internal), own, wanted
         )
 
@@ -118,7 +120,7 @@ def test_derivatives_are_those_of_differences(plain, names):
 
 def test_an_effect_away_from_neutral_or_sought_shifts_the_momentum(plain):
     step = compiled(plain, EFFECTS["armature"])
-    shift = MomentumShift(step)
+    shift = EffectMomentumShift(step)
     [name] = shift.parameter_names
     theta = step.system.parameters.vector()
     neutral = shift.theta_without_effects(theta)

@@ -61,7 +61,7 @@ def test_every_row_and_every_slope_has_its_name(case, made):
     counts = {"del": s["n"] - s["nc"], "internal": s["nz"], "constraint": s["m"], "p1": s["n"]}
     assert {kind: kinds.count(kind) for kind in counts} == counts
     assert kinds == [kind for kind, count in counts.items() for _ in range(count)]
-    assert made.residual_names[0] == f"del[{system.mechanism.joint_names[system.free_indices[0]]}]"
+    assert made.residual_names[0] == f"del[{system.mechanism.joint_names[system.unprescribed_coordinate_indices[0]]}]"
     assert made.residual.numel() == len(made.residual_names)
     by_rows, by_effort = made.parameter_jacobians(system.parameters.names[:2])
     assert by_rows.shape == (len(made.residual_names), 2)

@@ -77,7 +77,9 @@ def derivatives(step, rest, given, held, stiffness, theta):
     e, n = equilibrium_equations(step.equations), step.system.n_coordinates
     others = ca.vertcat(e.inputs[4], e.inputs[1])
     outputs = [ca.densify(ca.jacobian(f, x)) for f in (e.residual, e.state) for x in (e.inputs[0], others)]
-    w = np.concatenate([rest.state[list(step.system.free_indices)], rest.state[2 * n :], rest.constraint_reactions])
+    w = np.concatenate(
+        [rest.state[list(step.system.unprescribed_coordinate_indices)], rest.state[2 * n :], rest.constraint_reactions]
+    )
     at = (w, given, held, stiffness, theta, step.time_step)
     by_w, by_others, state_by_w, state_by_others = (np.array(x) for x in ca.Function("by", e.inputs, outputs)(*at))
     return state_by_others - state_by_w @ np.linalg.lstsq(by_w, by_others, rcond=None)[0]
@@ -86,8 +88,8 @@ def derivatives(step, rest, given, held, stiffness, theta):
 def test_compiled_and_interpreted_equilibria_are_one(case):
     """Of every feature of a step; those without a spring have nowhere to rest."""
     system, names = case.step.system, case.step.system.parameters.names
-    fixed = list(system.prescribed_indices)
-    given = np.concatenate([case.start[list(system.driven_indices)], case.path[0]])
+    fixed = list(system.prescribed_coordinate_indices)
+    given = np.concatenate([case.start[list(system.driven_coordinate_indices)], case.path[0]])
     torque = 0.3 * case.torque[0] if len(system.driven) else None
     guess = case.start[: system.n_coordinates].copy()
     guess[fixed] = case.path[0]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.step import compile_step, with_time_step
+from yid_ocp.integrator.step import compile_step, step_with_time_step
 from yid_ocp.integrator.step_model import NewtonStatus
 from yid_ocp.model import Parameters, Segment, StepTerms, System, flexible_object, forward_kinematics
-from yid_ocp.model.urdf import example_robot_urdf, read_urdf
+from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 
 ARM = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
 BENT = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
@@ -39,7 +39,7 @@ def test_effort_of_prescribed_joints_is_inverse_dynamics_to_second_order(roll, m
     pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
     system = System.build(read_urdf("package:baxter", joints=ARM), prescribed=ARM)
     theta = system.parameters.vector()
-    full = pin.buildModelFromUrdf(str(example_robot_urdf("baxter")))
+    full = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
     rest = [i for i in range(1, full.njoints) if full.names[i] not in ARM]
     model = pin.buildReducedModel(full, rest, pin.neutral(full))
     assert list(model.names[1:]) == ARM
@@ -300,7 +300,7 @@ def test_wrong_shapes_name_the_array(parts, urdf_folder, change, words):
 def test_a_step_of_another_length_is_one_compiled_for_it(parts, use_compiler):
     system = parts.cable()
     coarse, expected = (compile_step(system, h, use_compiler=use_compiler) for h in (4e-3, 1e-4))
-    fine = with_time_step(coarse, 1e-4)
+    fine = step_with_time_step(coarse, 1e-4)
     assert fine.model.tolerance == expected.model.tolerance < coarse.model.tolerance
     state, theta = np.concatenate([BENT, np.zeros(9)]), system.parameters.vector()
     names = ("C.bend", "C.twist")
@@ -315,4 +315,4 @@ def test_a_step_of_another_length_is_one_compiled_for_it(parts, use_compiler):
     assert coarse.time_step == 4e-3
     assert np.max(np.abs(coarse(state[:9], state[9:], [], theta)[0] - made[0])) > 1e-6
     with pytest.raises(ModelError, match="time_step = 0"):
-        with_time_step(coarse, 0.0)
+        step_with_time_step(coarse, 0.0)

@@ -13,7 +13,7 @@ from placed_frames import numbers, positions
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model import Segment, flexible_object
-from yid_ocp.model.flexible import polyline_rotations
+from yid_ocp.model.flexible import parallel_transport_rotations
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 
 
@@ -118,7 +118,7 @@ def test_polyline_is_reproduced_by_forward_kinematics(seed, count):
     vertices = np.cumsum(rng.normal(size=(count, 3)), axis=0)
     start = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     start *= np.sign(np.linalg.det(start))
-    first, *later = polyline_rotations(vertices, start)
+    first, *later = parallel_transport_rotations(vertices, start)
     lengths = np.linalg.norm(np.diff(vertices, axis=0), axis=1)
     segment = Segment("C", 0.0, 1.0, 0.01, link_lengths=lengths, rest_rotation=first, link_rest_rotations=later)
     item = flexible_object([segment], root_placement=homogeneous_transform(start, vertices[0]))
@@ -127,7 +127,7 @@ def test_polyline_is_reproduced_by_forward_kinematics(seed, count):
 
 
 def test_polyline_turns_the_shortest_way():
-    straight, back, sideways = polyline_rotations([[0, 0, 0], [0, 0, 1], [0, 0, 0], [0, 1, 0]])
+    straight, back, sideways = parallel_transport_rotations([[0, 0, 0], [0, 0, 1], [0, 0, 0], [0, 1, 0]])
     np.testing.assert_array_equal(straight, np.eye(3))
     np.testing.assert_allclose(back @ [0, 0, 1], [0, 0, -1])
     assert np.trace(sideways) == pytest.approx(1.0)
@@ -195,4 +195,4 @@ def test_errors_of_a_segment(name):
 )
 def test_a_degenerate_polyline_is_refused(vertices):
     with pytest.raises(ModelError, match="vertices"):
-        polyline_rotations(vertices)
+        parallel_transport_rotations(vertices)

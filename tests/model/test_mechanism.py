@@ -8,16 +8,16 @@ from placed_frames import numbers
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model.mechanism import Inertia, merge_bodies
-from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.rotations import homogeneous_transform, transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
 
 
 def test_joined_mechanisms_hang_on_a_frame(urdf_folder):
     carrier = read_urdf(urdf_folder / "double_pendulum.urdf")
-    item = y_object().mechanism
+    item = foam_y_object().mechanism
     placement = transform_from_xyz_rpy([0.0, 0.1, 0.0], [0.0, 0.3, 0.0])
-    both = carrier.with_mechanism(item, "tip", placement)
+    both = carrier.with_attached_mechanism(item, "tip", placement)
     assert both.joint_names == (*carrier.joint_names, *item.joint_names)
     assert both.joints[2].parent_index == 1
     assert both.frames["object_root"].joint_index == 1
@@ -53,7 +53,7 @@ def test_merged_bodies_weigh_what_they_weigh_together():
 def test_a_frame_that_the_file_does_not_have(urdf_folder):
     robot = read_urdf(urdf_folder / "double_pendulum.urdf").with_numeric_values()
     at = homogeneous_transform(np.eye(3), [0.1, 0.2, 0.3])
-    more = robot.with_frame("load", "tip", at).with_frame("wall", None, at)
+    more = robot.with_added_frame("load", "tip", at).with_added_frame("wall", None, at)
     tip, load = more.frame("tip"), more.frame("load")
     assert load.joint_index == tip.joint_index
     np.testing.assert_allclose(
@@ -62,6 +62,6 @@ def test_a_frame_that_the_file_does_not_have(urdf_folder):
     )
     assert more.frame("wall").joint_index == -1
     with pytest.raises(ModelError, match="there is a frame 'tip' already"):
-        robot.with_frame("tip", None, at)
+        robot.with_added_frame("tip", None, at)
     with pytest.raises(ModelError, match="no frame 'tips'"):
-        robot.with_frame("load", "tips", at)
+        robot.with_added_frame("load", "tips", at)

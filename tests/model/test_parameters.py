@@ -40,7 +40,7 @@ def test_symbols_stand_for_the_entries(three):
 
 
 def test_changed_sets_keep_order_and_symbols(three):
-    changed = three.with_values({"T1.bend": 5.0})
+    changed = three.with_nominal_values({"T1.bend": 5.0})
     assert changed.names == three.names
     assert (changed["T1.bend"].value, changed["T1.bend"].lower) == (5.0, 0.0)
     assert three["T1.bend"].value == 3.0
@@ -61,8 +61,8 @@ def test_bounds(three):
         (lambda p: p["T1.bent"], ["'T1.bent'", "did you mean 'T1.bend'?"]),
         (lambda p: p.vector({"zz": 1.0}), ["'zz'", "T1.bend, T1.mass, wind@object.speed"]),
         (lambda p: p.vector({"T1.bend": math.nan}), ["T1.bend = nan", "finite"]),
-        (lambda p: p.with_values({"T1.mass": 2.0}), ["T1.mass = 2 kg", "0 to 1 kg"]),
-        (lambda p: p.with_values({"T1.mas": 2.0}), ["did you mean 'T1.mass'?"]),
+        (lambda p: p.with_nominal_values({"T1.mass": 2.0}), ["T1.mass = 2 kg", "0 to 1 kg"]),
+        (lambda p: p.with_nominal_values({"T1.mas": 2.0}), ["did you mean 'T1.mass'?"]),
         (lambda p: p.bounds(["T2.bend"]), ["'T2.bend'", "'T1.bend'"]),
         (lambda p: p.with_added([Parameter("T1.bend", 1.0, "1")]), ["named twice", "T1.bend"]),
         (lambda p: Parameter("x", math.inf, "1"), ["x = inf"]),

@@ -71,7 +71,9 @@ def test_points_stay_when_the_tree_is_put_together():
     """On a robot, after another joint was inserted before it, and with numbers for its parameters."""
     base = flexible_object([Segment("B", 0.3, 0.1, 0.01, 2)]).mechanism
     base = replace(base, frames={name: frame for name, frame in base.frames.items() if name != "object_root"})
-    tree = base.with_mechanism(branched().mechanism, "B:50%", homogeneous_transform(np.eye(3), [1.0, 0.0, 0.0]))
+    tree = base.with_attached_mechanism(
+        branched().mechanism, "B:50%", homogeneous_transform(np.eye(3), [1.0, 0.0, 0.0])
+    )
     found = places(tree, ["B:50%", "T1:40%"])
     np.testing.assert_allclose(found[0][:3, 3], [0.0, 0.0, 0.15], atol=1e-12)
     np.testing.assert_allclose(found[1][:3, 3], [1.1, 0.2, 0.15 + 0.3 + 0.32], atol=1e-12)

@@ -12,11 +12,11 @@ from placed_frames import numbers
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.model.rotations import (
-    axis_angle_rotation,
+    rotation_from_axis_sin_cos,
     rotation_from_rpy,
     rpy_from_rotation,
-    snap_to_unit_entries,
-    symbolic_axis_rotation,
+    snap_near_integer_entries,
+    symbolic_rotation_from_axis_angle,
     symbolic_rotation_from_rpy,
 )
 
@@ -29,9 +29,9 @@ AXES = st.sampled_from([*map(tuple, np.eye(3)), (0.0, -1.0, 0.0), (0.0, 0.0, -1.
 def test_a_turn_about_an_axis(axis, angle):
     expected = Rotation.from_rotvec(angle * np.array(axis)).as_matrix()
     np.testing.assert_allclose(
-        axis_angle_rotation(axis, math.sin(angle), math.cos(angle)), expected, rtol=0, atol=1e-14
+        rotation_from_axis_sin_cos(axis, math.sin(angle), math.cos(angle)), expected, rtol=0, atol=1e-14
     )
-    symbolic = symbolic_axis_rotation(axis, ca.SX(angle))
+    symbolic = symbolic_rotation_from_axis_angle(axis, ca.SX(angle))
     assert symbolic.is_dense()
     np.testing.assert_allclose(numbers(symbolic), expected, rtol=0, atol=1e-14)
 
@@ -56,13 +56,13 @@ def test_angles_of_a_rotation_give_it_back(roll, pitch, yaw):
 
 def test_a_turn_about_a_coordinate_axis_keeps_exact_zeros():
     """The step's equations stay small because products with these zeros vanish."""
-    matrix = symbolic_axis_rotation((0.0, -1.0, 0.0), ca.SX.sym("angle"))
+    matrix = symbolic_rotation_from_axis_angle((0.0, -1.0, 0.0), ca.SX.sym("angle"))
     assert [i for i in range(9) if matrix[i].is_zero()] == [1, 3, 5, 7]
     assert matrix[4].is_one()
 
 
 def test_entries_next_to_0_and_1_are_meant_to_be_these():
     matrix = np.array([[1 - 1e-12, 1e-12, -1 + 1e-12], [1 + 1e-10, 0.5, -1e-10]])
-    rounded = snap_to_unit_entries(matrix)
+    rounded = snap_near_integer_entries(matrix)
     np.testing.assert_array_equal(rounded, [[1.0, 0.0, -1.0], [1 + 1e-10, 0.5, -1e-10]])
     assert matrix[0, 0] != 1.0

@@ -22,7 +22,7 @@ from yid_ocp.model import (
     forward_kinematics,
 )
 from yid_ocp.model.mechanism import merge_bodies
-from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
@@ -41,8 +41,8 @@ def test_configuration_order_of_the_paper(dual_arm):
     assert dual_arm.n_constraints == 6
     assert dual_arm.parameters["right_s0.damping"].value == 0.05
     assert dual_arm.point_frames == ("w_T1", "w_T2", "w_T3")
-    assert dual_arm.driven_indices == tuple(range(14))
-    assert dual_arm.free_indices == tuple(range(50))
+    assert dual_arm.driven_coordinate_indices == tuple(range(14))
+    assert dual_arm.unprescribed_coordinate_indices == tuple(range(50))
     assert [segment.name for segment in dual_arm.segment_layouts] == ["T1", "T2", "T3"]
     assert dual_arm.segment_layout("T2").parent_segment == "T1"
 
@@ -73,11 +73,11 @@ def test_forces_and_energy(robot):
 @pytest.mark.parametrize(("kind", "count"), [("point", 3), ("axis", 5), ("weld", 6)])
 def test_grasp_equations(kind, count):
     """Zero where holder, turned and offset, meets the held frame; linear in small displacements."""
-    tree = floating_clamp("one").with_mechanism(floating_clamp("two"))
+    tree = floating_clamp("one").with_attached_mechanism(floating_clamp("two"))
     turn = rotation_from_rpy(0.3, -0.5, 0.9)
     grasp = Grasp("g", "one", "two", kind, ca.SX(ca.DM(turn)), ca.SX(ca.DM([0.1, 0.2, 0.3])), axial_slip=ca.SX(0.05))
     system = System.build(tree, grasps=[grasp])
-    assert grasp.n_equations == system.n_constraints == count
+    assert grasp.n_constraint_equations == system.n_constraints == count
     # `two` turned as Rx Ry Rz, its origin 0.05 m ahead of the grasped point along its own z
     ry = np.arcsin(turn[0, 2])
     angles = [np.arctan2(-turn[1, 2], turn[2, 2]), ry, np.arctan2(-turn[0, 1], turn[0, 0])]
@@ -149,8 +149,8 @@ WRONG = {
     "grasp_twice": (lambda robot: System.build(robot, grasps=[Grasp("g", "tool", "nose")] * 2), ["'g'", "grasps"]),
     "point": (lambda robot: System.build(robot, point_frames=["w_T1"]), ["'w_T1'"]),
     "gravity": (lambda robot: System.build(robot, gravity=[9.81]), ["gravity", "three numbers"]),
-    "frame": (lambda robot: System.build(robot, objects=[(y_object(), "rotr", None)]), ["'rotr'", "'rotor'"]),
-    "objects": (lambda robot: System.build(objects=[(y_object(), None, None)] * 2), ["two parts", "'T1_0_tip'"]),
+    "frame": (lambda robot: System.build(robot, objects=[(foam_y_object(), "rotr", None)]), ["'rotr'", "'rotor'"]),
+    "objects": (lambda robot: System.build(objects=[(foam_y_object(), None, None)] * 2), ["two parts", "'T1_0_tip'"]),
     "segment": (lambda robot: System.build(robot).segment_layout("T1"), ["segment 'T1'"]),
 }
 

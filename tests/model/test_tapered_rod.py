@@ -13,9 +13,9 @@ from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System, flexible_object, forward_kinematics
-from yid_ocp.model.objects.base import init_templates
+from yid_ocp.model.objects.base import init_command_object_templates
 from yid_ocp.model.objects.tapered_rod import TaperedRod
-from yid_ocp.workflow.build import build_system, link_division_factor
+from yid_ocp.workflow.build import build_system, divided_link_parameter_scale
 
 LENGTH, MASS, BEND, TIP_MASS, GRAVITY = 1.2, 0.05, 40.0, 0.02, 9.81
 
@@ -67,9 +67,9 @@ def test_a_configuration_and_init_describe_it(tmp_path: Path) -> None:
     system = build_system(run, link_division=2)
     assert system.parameters["rod.taper"].value == 0.4
     assert len(system.segment_layout("rod").link_joints) == 8
-    assert link_division_factor(run, "rod.bend", 2) == 1  # a rigidity
+    assert divided_link_parameter_scale(run, "rod.bend", 2) == 1  # a rigidity
     numbers = {"length": LENGTH, "mass": MASS, "radius": 0.006, "tip_radius": 0.003}
-    made = init_templates()["tapered_rod"].build(numbers, 4)
+    made = init_command_object_templates()["tapered_rod"].build(numbers, 4)
     assert made.settings == TaperedRod(
         length=LENGTH, mass=MASS, base_radius=0.006, tip_radius=0.003, links=4, joint_axes="xy"
     )

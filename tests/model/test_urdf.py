@@ -77,8 +77,8 @@ def test_kept_joints_in_the_order_given(urdf_folder):
     assert robot.joint_names == ("slide", "swing", "nod", "spin")
     assert robot.parent_indices == (-1, 0, 1, 0)
     assert robot.name == "mixed_joints"
-    assert robot.ancestor_joints(robot.joint_index("nod")) == (0, 1, 2)
-    assert robot.ancestor_joints(-1) == ()
+    assert robot.ancestor_joint_indices(robot.joint_index("nod")) == (0, 1, 2)
+    assert robot.ancestor_joint_indices(-1) == ()
 
 
 def test_limits_and_kinds(urdf_folder):
@@ -205,8 +205,8 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
         (lambda path: read_urdf(path, joints=["bolt"]), ["movable joint 'bolt'"]),
         (lambda path: read_urdf(path).joint_index("slider"), ["'slider'", "'slide'", "mixed_joints"]),
         (lambda path: read_urdf(path).frame("tol"), ["frame 'tol'", "'tool'"]),
-        (lambda path: read_urdf(path).with_mechanism(read_urdf(path)), ["two parts", "'bracket'"]),
-        (lambda path: read_urdf(path).with_mechanism(floating_clamp("c"), "rotr"), ["'rotr'", "'rotor'"]),
+        (lambda path: read_urdf(path).with_attached_mechanism(read_urdf(path)), ["two parts", "'bracket'"]),
+        (lambda path: read_urdf(path).with_attached_mechanism(floating_clamp("c"), "rotr"), ["'rotr'", "'rotor'"]),
     ],
 )
 def test_errors_name_what_is_wrong_and_what_is_near(urdf_folder, action, words):

@@ -12,9 +12,13 @@ from small_problems import pendulum_step, taken
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.planning.information_plan import plan_informative_motion
-from yid_ocp.planning.informative_motion_search import DOptimality, EffectDiscrimination, InformativeMotionSearch
+from yid_ocp.planning.informative_motion_search import (
+    DOptimalityCriterion,
+    EffectDiscriminationCriterion,
+    InformativeMotionSearch,
+)
 from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
-from yid_ocp.planning.plan_shooting import ValueWithJacobian
+from yid_ocp.planning.plan_shooting import _ValueWithJacobian
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 
@@ -63,7 +67,7 @@ def some_motion(experiment, seed=0, size=0.1):
 def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem):
     experiment = PlannedExperiment.from_options(driven_problem, values_of(driven_problem), OPTIONS)
     w = some_motion(experiment)
-    planned, base = experiment.estimation_problem(w), driven_problem
+    planned, base = experiment.planned_estimation_problem(w), driven_problem
     spent = base.episodes[0].grid.steps * base.step.time_step
     for new, old in zip(planned.episodes[0].measurements, base.episodes[0].measurements, strict=True):
         assert new.sensor.channel_names == old.sensor.channel_names
@@ -71,7 +75,7 @@ def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem):
         np.testing.assert_allclose(
             np.sum(new.weight**2, axis=0) / length, np.sum(old.weight**2, axis=0) / spent, rtol=1e-9
         )
-    joints = experiment.noise_free_recording(w).joints
+    joints = experiment._noise_free_recording(w).joints
     np.testing.assert_allclose(
         joints.position[:, 0], experiment.simulator.joint_positions(w)[: len(joints.t), 0], atol=1e-12
     )
@@ -87,16 +91,21 @@ def test_slopes_are_derivatives_of_the_sensitivities(kind, request):
     problem = request.getfixturevalue(kind)
     experiment = PlannedExperiment.from_options(problem, values_of(problem), OPTIONS)
     w, way = some_motion(experiment), some_motion(experiment, 1, 1.0)
-    rows, e = experiment.search_sensitivities(w), 1e-4
-    slope = np.tensordot(way.ravel(), experiment.sensitivity_derivatives(w, rows), 1)
-    central = (experiment.search_sensitivities(w + e * way) - experiment.search_sensitivities(w - e * way)) / (2 * e)
+    rows, e = experiment.search_problem_sensitivities(w), 1e-4
+    slope = np.tensordot(way.ravel(), experiment.sensitivity_derivatives_by_coefficients(w, rows), 1)
+    central = (
+        experiment.search_problem_sensitivities(w + e * way) - experiment.search_problem_sensitivities(w - e * way)
+    ) / (2 * e)
     np.testing.assert_allclose(slope, central, atol=2e-3 * np.abs(central).max())
 
 
 def test_prescribed_arms_tell_what_identifiability_says(moved_problem):
     experiment = PlannedExperiment.from_options(moved_problem, values_of(moved_problem), OPTIONS)
     w = some_motion(experiment, size=0.3)
-    searched, judged = experiment.search_sensitivities(w), identifiability(experiment.estimation_problem(w))
+    searched, judged = (
+        experiment.search_problem_sensitivities(w),
+        identifiability(experiment.planned_estimation_problem(w)),
+    )
     # the search sees fewer samples of points, each telling more
     np.testing.assert_allclose(np.diag(searched.T @ searched), np.diag(judged.fisher_information), rtol=0.05)
 
@@ -105,36 +114,41 @@ def test_driven_arms_tell_about_what_the_innovations_say(driven_problem):
     experiment = PlannedExperiment.from_options(driven_problem, values_of(driven_problem), OPTIONS)
     for seed in range(3):
         w = some_motion(experiment, seed, 0.3)
-        searched, judged = experiment.search_sensitivities(w), experiment.configured_sensitivities(w)
-        for criterion in (DOptimality((i,), (0, 1)) for i in (0, 1)):  # logarithms of standard deviations
-            told, true = (criterion.value_and_gradient(rows, False)[0] for rows in (searched, judged))
+        searched, judged = experiment.search_problem_sensitivities(w), experiment.configured_problem_sensitivities(w)
+        for criterion in (DOptimalityCriterion((i,), (0, 1)) for i in (0, 1)):  # logarithms of standard deviations
+            told, true = (criterion.value_and_gradient_by_sensitivities(rows, False)[0] for rows in (searched, judged))
             assert told == pytest.approx(true, abs=0.5)
 
 
 ROWS = np.random.default_rng(4).normal(size=(30, 7))
 CRITERIA = {
-    "all": DOptimality((0, 1, 2), (0, 1, 2)),
-    "one": DOptimality((1,), (0, 1, 2)),
-    "apart": EffectDiscrimination(((3,), (4, 5)), (np.array([[2.0]]), np.diag([0.5, 3.0])), (0, 1, 2, 3, 4, 5)),
+    "all": DOptimalityCriterion((0, 1, 2), (0, 1, 2)),
+    "one": DOptimalityCriterion((1,), (0, 1, 2)),
+    "apart": EffectDiscriminationCriterion(
+        ((3,), (4, 5)), (np.array([[2.0]]), np.diag([0.5, 3.0])), (0, 1, 2, 3, 4, 5)
+    ),
 }
 
 
 @pytest.mark.parametrize("name", CRITERIA)
 def test_criteria_know_their_derivatives(name):
     criterion, way, e = CRITERIA[name], np.random.default_rng(5).normal(size=ROWS.shape), 1e-6
-    _, slope = criterion.value_and_gradient(ROWS)
-    after, before = (criterion.value_and_gradient(ROWS + sign * e * way)[0] for sign in (1, -1))
+    _, slope = criterion.value_and_gradient_by_sensitivities(ROWS)
+    after, before = (criterion.value_and_gradient_by_sensitivities(ROWS + sign * e * way)[0] for sign in (1, -1))
     assert float(np.sum(slope * way)) == pytest.approx((after - before) / (2 * e), rel=1e-6)
 
 
 def test_precision_is_that_of_the_marginal_standard_deviation():
     wide = np.vstack([1e3 * ROWS, np.eye(7)[3:]])
     covariance = np.linalg.inv(wide.T @ wide)
-    one, both = (DOptimality(chosen, (0, 1, 2)).value_and_gradient(wide)[0] for chosen in ((1,), (0, 1)))
+    one, both = (
+        DOptimalityCriterion(chosen, (0, 1, 2)).value_and_gradient_by_sensitivities(wide)[0]
+        for chosen in ((1,), (0, 1))
+    )
     assert one == pytest.approx(-0.5 * np.log(covariance[1, 1]), abs=1e-5)
     assert both == pytest.approx(-0.5 * np.log(np.linalg.det(covariance[:2, :2])), abs=1e-5)
     # with no data a parameter is known to within 400 %
-    assert CRITERIA["one"].value_and_gradient(np.zeros((1, 7)))[0] == pytest.approx(-np.log(4.0))
+    assert CRITERIA["one"].value_and_gradient_by_sensitivities(np.zeros((1, 7)))[0] == pytest.approx(-np.log(4.0))
 
 
 def test_distances_are_what_others_cannot_explain():
@@ -142,11 +156,11 @@ def test_distances_are_what_others_cannot_explain():
     rows = np.zeros((6, 7))
     rows[[0, 1, 2], [3, 4, 5]] = 50.0, 20.0, 10.0
     rows[0, 0] = 1e4  # a free parameter does to the data what the first effect does
-    first, second = criterion.effect_distances(rows)[[0, 1], [1, 0]]
+    first, second = criterion.pairwise_effect_distances(rows)[[0, 1], [1, 0]]
     assert first < 0.2
     assert second == pytest.approx(np.sqrt((10.0**2 + 30.0**2) / 2))
     rows[3, 3] = 7.0  # now a reading of its own
-    assert criterion.effect_distances(rows)[0, 1] == pytest.approx(14.0, rel=1e-3)
+    assert criterion.pairwise_effect_distances(rows)[0, 1] == pytest.approx(14.0, rel=1e-3)
 
 
 def line(w):
@@ -163,10 +177,14 @@ def searched(limits, rounds=50):
     values, upper = limits
     bounds = np.full((2, 1), -1.0), np.full((2, 1), 1.5)
     simulator = SimpleNamespace(coefficient_bounds=lambda: bounds, simulate_path=lambda w, slopes=False: w)
-    experiment = SimpleNamespace(simulator=simulator, search_sensitivities=line, sensitivity_derivatives=slopes)
+    experiment = SimpleNamespace(
+        simulator=simulator, search_problem_sensitivities=line, sensitivity_derivatives_by_coefficients=slopes
+    )
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
-    kept = SimpleNamespace(limit_rows=bounded, limit_values=lambda rolled, w: ValueWithJacobian(*values(w.ravel())))
-    search = InformativeMotionSearch(experiment, kept, DOptimality((0, 1), (0, 1)))
+    kept = SimpleNamespace(
+        limit_rows=bounded, limited_quantity_values=lambda rolled, w: _ValueWithJacobian(*values(w.ravel()))
+    )
+    search = InformativeMotionSearch(experiment, kept, DOptimalityCriterion((0, 1), (0, 1)))
     return search, search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
 
 
@@ -191,7 +209,7 @@ def test_a_straight_line_is_read_at_the_ends_of_its_range():
 def test_a_limit_is_kept_on_the_way_and_used_up_in_the_end(limits, apart):
     for rounds in (1, 2, 50):
         search, found = searched(limits, rounds)
-        assert search.max_limit_violation(found.w) <= 0.0
+        assert search._max_limit_violation(found.w) <= 0.0
     assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(apart, abs=5e-3)
 
 

@@ -14,8 +14,8 @@ from yid_ocp.data import read_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.report.diagnosis_summaries import _planning_command
 from yid_ocp.report.summaries import plan_summary
-from yid_ocp.report.terminal import terminal_lines
-from yid_ocp.workflow.plan import next_plan_settings, run_plan
+from yid_ocp.report.terminal import summary_terminal_lines
+from yid_ocp.workflow.plan import discrimination_plan_settings, run_plan
 
 PLAN = """\
   elbow.damping: {free: true}
@@ -65,7 +65,7 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(config, tmp_path):
     np.testing.assert_allclose(planned.joints.position, outcome.output.joint_positions)
     page = (tmp_path / "out" / "report.html").read_text()
     assert '<section id="information">' in page
-    words = "\n".join(terminal_lines(plan_summary(result)))
+    words = "\n".join(summary_terminal_lines(plan_summary(result)))
     for name, known in outcome.output.parameter_precisions.items():
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
         assert f"± {100 * known.std_planned:.2g} %" in words
@@ -77,9 +77,9 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(config, tmp_path):
 def test_a_diagnosis_hands_over_its_parameters_and_effects(config, tmp_path):
     folder = diagnosed(tmp_path / "diagnosed", 4.0)
     alike = [[{"kind": label.partition("@")[0], "location": label.partition("@")[2]} for label in PAIR]]
-    section = next_plan_settings(alike, folder)
+    section = discrimination_plan_settings(alike, folder)
     assert section == {"goal": "information", "discriminate": list(PAIR), "parameter_run": str(folder)}
-    assert next_plan_settings([], folder) is None
+    assert discrimination_plan_settings([], folder) is None
     command = _planning_command(section)
     assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")
     overrides = [f"plan.discriminate=[{', '.join(PAIR)}]", f"plan.parameter_run={folder}", "plan.max_iterations=3"]
@@ -89,7 +89,7 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(config, tmp_path):
     pairs = {(entry["effect"], entry["explained_by"]) for entry in outcome.result["distances"]}
     assert pairs == {PAIR, PAIR[::-1]}
     assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
-    assert f"{PAIR[0]}" in "\n".join(terminal_lines(plan_summary(outcome.result)))
+    assert f"{PAIR[0]}" in "\n".join(summary_terminal_lines(plan_summary(outcome.result)))
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def test_control_points_bound_the_path_and_its_derivatives_at_all_times(path):
     for order in (0, 1, 2):
         for _ in range(20):
             w = rng.normal(size=path.n_coefficients)
-            value, hull = path.basis_values(t, order) @ w, path.control_point_matrix(order) @ w
+            value, hull = path.basis_values(t, order) @ w, path.coefficients_to_control_points_matrix(order) @ w
             assert hull.min() - 1e-9 <= value.min()
             assert value.max() <= hull.max() + 1e-9
 

@@ -11,9 +11,9 @@ from yid_ocp.errors import ConfigError, ModelError, YidError
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.planning.joint_paths import FramePositions, PathSimulator, PlanLimits, PlanOptions, SplinePath
-from yid_ocp.planning.motion_plan import ParameterCovariance, plan_motion
-from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShooting
+from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanLimits, PlanOptions, SplinePath
+from yid_ocp.planning.motion_plan import ParameterCovariance, plan_motion_to_target
+from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShootingProblem
 
 START, GOAL = 0.2, 0.7
 
@@ -31,7 +31,7 @@ def rested(step, theta, angle=START, path=None):
 
 def places(mover, state, name="tip"):
     """Positions of a frame along states."""
-    return mover.trajectories(FramePositions(mover.step.system, [name]), state)[:, 0]
+    return mover.trajectories(FramePositionFunction(mover.step.system, [name]), state)[:, 0]
 
 
 def elsewhere(plan, change):
@@ -57,7 +57,7 @@ def wanted(moved):
 
 @pytest.fixture(scope="module")
 def found(moved, wanted):
-    return plan_motion(moved, wanted)
+    return plan_motion_to_target(moved, wanted)
 
 
 BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.3))
@@ -74,13 +74,13 @@ BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.3))
 )
 def test_slopes_are_derivatives(moved, wanted, more):
     options, mover = replace(wanted, **more), rested(moved, moved.system.parameters.vector())
-    frames, simple = FramePositions(moved.system, ("tip", "lower")), mover.path.straight_line_coefficients([0.4])
+    frames, simple = FramePositionFunction(moved.system, ("tip", "lower")), mover.path.straight_line_coefficients([0.4])
     inside = frames if options.box else None
     rows = PlanResidualsAndLimits(mover, options, frames, np.array(options.target_position), simple, inside)
-    shooting = PlanShooting([rows], simple.shape)
+    shooting = PlanShootingProblem([rows], simple.shape)
     rng, x, e = np.random.default_rng(5), simple.ravel() + 0.1, 1e-5
     way = rng.normal(size=x.size)
-    before, after, here = (shooting.residual_and_limits(y) for y in (x - e * way, x + e * way, x))
+    before, after, here = (shooting._residual_and_limit_values(y) for y in (x - e * way, x + e * way, x))
     for low, high, middle in zip(before, after, here, strict=True):
         slope = (high.value - low.value) / (2 * e)
         np.testing.assert_allclose(middle.jacobian @ way, slope, rtol=1e-5, atol=1e-5 * np.abs(slope).max())
@@ -111,15 +111,15 @@ def test_the_point_arrives_and_stays_without_swinging(moved, wanted, found):
 def test_what_hangs_below_the_point_comes_to_rest_as_well(moved, wanted):
     # the shoulder alone brings this one there, whatever the elbow does
     goal = tuple(map(float, point_at(moved, GOAL, "lower")))
-    done = plan_motion(moved, replace(wanted, point="lower", target_position=goal))
+    done = plan_motion_to_target(moved, replace(wanted, point="lower", target_position=goal))
     assert done.is_successful, done.message
-    moves = np.diff(done.point_trajectories["tip"][done.simulator.standstill_nodes], axis=0)
+    moves = np.diff(done.point_trajectories["tip"][done.simulator.standstill_node_indices], axis=0)
     assert np.linalg.norm(moves, axis=1).max() / done.simulator.step.time_step < wanted.rest_speed_tolerance
 
 
 def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
     coarse, fine = (compile_step(moved.system, h, use_compiler=False) for h in (0.05, 0.001))
-    done = plan_motion(coarse, wanted)
+    done = plan_motion_to_target(coarse, wanted)
     assert done.is_successful, done.message
     assert done.simulator.step.time_step < coarse.time_step
     start = EquilibriumSolver(fine).solve([START], done.simulator.theta)
@@ -133,24 +133,24 @@ def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
 def test_limits_are_kept_at_the_price_of_the_goal_or_of_calm(moved, wanted, found):
     top = np.abs(found.joint_accelerations).max()
     bound = 0.8 * top
-    calm = plan_motion(moved, replace(wanted, duration=0.8, limits=PlanLimits(max_acceleration=bound)))
+    calm = plan_motion_to_target(moved, replace(wanted, duration=0.8, limits=PlanLimits(max_acceleration=bound)))
     assert calm.is_successful, calm.message
     assert np.abs(calm.joint_accelerations).max() <= bound * 1.001
     strong = np.abs(found.joint_efforts).max()
     share = 0.97 * strong / 40.0
-    gentle = plan_motion(moved, replace(wanted, duration=0.8, limits=PlanLimits(effort_fraction=share)))
+    gentle = plan_motion_to_target(moved, replace(wanted, duration=0.8, limits=PlanLimits(effort_fraction=share)))
     assert np.abs(gentle.joint_efforts).max() <= share * 40.0 * 1.005, gentle.message
 
 
 def test_a_limit_that_cannot_be_kept_is_named(moved, wanted):
-    hasty = plan_motion(moved, replace(wanted, duration=0.15))
+    hasty = plan_motion_to_target(moved, replace(wanted, duration=0.15))
     assert not hasty.is_successful
     assert "shoulder passes its limit" in hasty.message or "leaves the point" in hasty.message
     assert "plan.duration" in hasty.message
 
 
 def test_a_motion_that_leaves_the_point_elsewhere_has_not_arrived(moved, wanted):
-    few = plan_motion(
+    few = plan_motion_to_target(
         moved, replace(wanted, n_spline_coefficients=2, duration=0.4, limits=PlanLimits(max_acceleration=1e3))
     )
     assert few.max_position_error > 2 * wanted.position_tolerance, "the motion must fail for this to be a test"
@@ -164,9 +164,9 @@ def test_a_path_is_followed(moved, wanted):
     options = replace(
         wanted, goal="path", waypoint_offsets=via, duration=1.5, n_spline_coefficients=12, position_tolerance=5e-3
     )
-    followed = plan_motion(moved, options)
+    followed = plan_motion_to_target(moved, options)
     assert followed.is_successful, followed.message
-    direct = plan_motion(moved, replace(options, goal="place")).point_trajectories["tip"]
+    direct = plan_motion_to_target(moved, replace(options, goal="place")).point_trajectories["tip"]
     passed = np.linalg.norm(direct - (begin + via[1]), axis=1).min()
     assert passed > 0.03, "the direct motion must not pass there for this to be a test"
     for share, shift in zip((1 / 3, 2 / 3), via, strict=True):
@@ -182,7 +182,7 @@ def test_points_stay_in_the_box(moved, wanted, found):
     assert top > wanted.target_position[2] + 2e-3, "the free motion must overshoot for this to be a test"
     lid = 0.5 * (top + wanted.target_position[2])
     box = ((-1.0, float(low[1]) - 1.0, float(low[2]) - 1.0), (1.0, float(high[1]) + 1.0, lid))
-    kept = plan_motion(
+    kept = plan_motion_to_target(
         moved, replace(wanted, goal="box", box=box, frames_in_box=("tip",), duration=0.8, n_spline_coefficients=8)
     )
     assert kept.is_successful, kept.message
@@ -190,7 +190,7 @@ def test_points_stay_in_the_box(moved, wanted, found):
 
 
 def test_the_shortest_duration_is_shorter_and_arrives(moved, wanted):
-    quick = plan_motion(moved, replace(wanted, duration=0.9, minimize_duration=True))
+    quick = plan_motion_to_target(moved, replace(wanted, duration=0.9, minimize_duration=True))
     assert quick.is_successful
     assert quick.max_residual_speed <= wanted.rest_speed_tolerance
     assert quick.simulator.path.duration < 0.8
@@ -198,7 +198,7 @@ def test_the_shortest_duration_is_shorter_and_arrives(moved, wanted):
 
 def test_spread_is_the_derivative_times_the_uncertainty(moved, wanted):
     known = ParameterCovariance(("elbow.stiffness",), np.array([[0.3**2]]))
-    told = plan_motion(moved, wanted, known=known)
+    told = plan_motion_to_target(moved, wanted, known=known)
     below, above = (
         places(mover, mover.simulate_path(told.spline_coefficients).state[-1:])[0]
         for mover in (elsewhere(told, -1e-4), elsewhere(told, 1e-4))
@@ -210,11 +210,11 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
     known = ParameterCovariance(("elbow.stiffness",), np.array([[0.6**2]]))
     options, worst = replace(wanted, n_spline_coefficients=8, duration=1.0), []
     for spread in (False, True):
-        done = plan_motion(moved, replace(options, minimize_parameter_sensitivity=spread), known=known)
+        done = plan_motion_to_target(moved, replace(options, minimize_parameter_sensitivity=spread), known=known)
         assert done.is_successful, done.message
         errors = []
         for mover in (elsewhere(done, -0.6), elsewhere(done, 0.6)):
-            state = mover.simulate_path(done.spline_coefficients).state[mover.standstill_nodes]
+            state = mover.simulate_path(done.spline_coefficients).state[mover.standstill_node_indices]
             errors.append(np.sqrt(np.mean(np.sum((places(mover, state) - options.target_position) ** 2, axis=1))))
         worst.append(max(errors))
     assert worst[1] < 0.8 * worst[0]
@@ -243,7 +243,7 @@ def test_a_motion_planned_for_uncertainty_errs_less_where_the_stiffness_is_anoth
 )
 def test_what_is_refused(moved, wanted, more, words):
     with pytest.raises(YidError) as caught:
-        plan_motion(moved, replace(wanted, **more))
+        plan_motion_to_target(moved, replace(wanted, **more))
     assert isinstance(caught.value, (ConfigError, ModelError))
     for word in words:
         assert word in str(caught.value)
@@ -253,4 +253,4 @@ def test_a_system_without_moved_joints_is_refused(urdf_folder, wanted):
     from small_problems import pendulum_step
 
     with pytest.raises(ConfigError, match="no joint is prescribed"):
-        plan_motion(pendulum_step(urdf_folder), wanted)
+        plan_motion_to_target(pendulum_step(urdf_folder), wanted)

@@ -11,9 +11,9 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.rollout import simulate
-from yid_ocp.planning.joint_paths import FramePositions
+from yid_ocp.planning.joint_paths import FramePositionFunction
 from yid_ocp.workflow.plan import run_plan
-from yid_ocp.workflow.run_inputs import recording_path
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 STIFF = "parameters={T*.bend: {initial: 15}, T*.twist: {initial: 10}}"
 COARSE = {
@@ -86,14 +86,14 @@ def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, 
     assert outcome.result["swing"] < run.plan.rest_speed_tolerance
     found = outcome.output
     # it begins where the recording does, and both arms take part
-    recorded = read_recording(recording_path(run.recordings.estimate[0])).joints
+    recorded = read_recording(resolve_recording_path(run.recordings.estimate[0])).joints
     first = recorded.position[0, [recorded.names.index(name) for name in found.joint_names]]
     np.testing.assert_allclose(found.joint_positions[0], first, atol=5e-3)
     travel = dict(zip(found.joint_names, np.ptp(found.joint_positions, axis=0), strict=True))
     assert min(max(v for k, v in travel.items() if k.startswith(side)) for side in ("left", "right")) > 0.01
     system = found.simulator.step.system
     names = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
-    at = found.simulator.trajectories(FramePositions(system, names), found.rollout.state)
+    at = found.simulator.trajectories(FramePositionFunction(system, names), found.rollout.state)
     at = at.reshape(len(found.t), -1, 2, 3)
     assert np.abs(at[:, :, 0] - at[:, :, 1]).max() < 1e-8
 
@@ -118,7 +118,7 @@ def test_limits_that_rest_itself_passes_are_refused(repository, tmp_path, limit,
 def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tmp_path):
     file = repository / "configs" / "deft_bdlo1.yaml"
     run = load_config(file)
-    if not recording_path(run.recordings.estimate[0]).is_file():
+    if not resolve_recording_path(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
     way = "plan={point: p6, target_offset: [0.02, 0.02, 0.0], duration: 1.0, n_spline_coefficients: 4}"
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", way)

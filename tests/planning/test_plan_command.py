@@ -12,7 +12,7 @@ import pytest
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
-from yid_ocp.workflow.plan import compile_planning_step, identified_parameters, run_plan
+from yid_ocp.workflow.plan import compile_step_for_planning, identified_parameters_with_covariance, run_plan
 from yid_ocp.workflow.simulate import run_simulate
 
 PLAN = """\
@@ -68,8 +68,8 @@ def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
 def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_path):
     folder = solved(tmp_path / "solved", 4.0, 0.25)
     run = load_config(config, [f"plan.parameter_run={folder}"])
-    step = compile_planning_step(run)
-    theta, known, source = identified_parameters(run, step)
+    step = compile_step_for_planning(run)
+    theta, known, source = identified_parameters_with_covariance(run, step)
     assert theta[step.system.parameters.index("elbow.stiffness")] == 4.0
     assert known.parameter_names == ("elbow.stiffness",)
     assert known.covariance.tolist() == [[0.0625]]
@@ -78,7 +78,7 @@ def test_parameters_and_their_uncertainty_come_from_a_run_of_solve(config, tmp_p
     assert max(outcome.result["std"]) > 1e-4
     # what is not known is not counted, and said
     run = load_config(config, [f"plan.parameter_run={solved(tmp_path / 'unsure', 4.0, np.inf)}"])
-    _, known, source = identified_parameters(run, step)
+    _, known, source = identified_parameters_with_covariance(run, step)
     assert known.parameter_names == ()
     assert source["uncertainty_unknown"] == ["elbow.stiffness"]
 

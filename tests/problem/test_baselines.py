@@ -7,7 +7,7 @@ from yid_ocp.problem.prediction_errors import (
     clamp_displacement_baseline,
     constant_position_baseline,
     interpolated_displacement_baseline,
-    measured_positions,
+    measured_point_positions,
     position_rmse,
 )
 
@@ -30,7 +30,7 @@ def recording():
 
 def test_stay_repeats_the_last_given_frame(recording):
     predicted = constant_position_baseline(recording, NAMES)
-    np.testing.assert_array_equal(predicted[:2], measured_positions(recording, NAMES)[:2])
+    np.testing.assert_array_equal(predicted[:2], measured_point_positions(recording, NAMES)[:2])
     np.testing.assert_array_equal(predicted[2:], np.broadcast_to(predicted[1], (9, 7, 3)))
 
 

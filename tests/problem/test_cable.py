@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.data.channel_checks import _measured_positions, median_edge_lengths
+from yid_ocp.data.channel_checks import _measured_positions, median_point_pair_distances
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import DataError, ModelError
@@ -17,15 +17,15 @@ from yid_ocp.model.objects.cable import (
     CableBranchOptions,
     CableOptions,
     cable_system,
-    edge_length_parameters,
-    estimable_parameters,
+    edge_length_parameter_values,
+    estimable_parameter_names,
     read_vertex_positions,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.prediction_errors import (
     interpolated_displacement_baseline,
-    measured_positions,
+    measured_point_positions,
     point_rmse_by_recording,
     position_rmse,
 )
@@ -52,12 +52,15 @@ def line(at, towards, length):
 def cable_options(cable, recordings, noise, model_error, path_cutoff=8.0, options=None):
     """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
     options = options or CableOptions()
-    known = {r.name: edge_length_parameters(cable, median_edge_lengths(cable.edges, [r], 2)) for r in recordings}
-    names = [name for name in estimable_parameters(cable, options) if name.endswith(".rest")]
+    known = {
+        r.name: edge_length_parameter_values(cable, median_point_pair_distances(cable.edges, [r], 2))
+        for r in recordings
+    }
+    names = [name for name in estimable_parameter_names(cable, options) if name.endswith(".rest")]
     return ProblemOptions(
         initial_state="fitted_to_points",
         path_cutoff=path_cutoff,
-        sensors={"points": SensorOptions(std=model_error, points=cable.free_vertices)},
+        sensors={"points": SensorOptions(std=model_error, points=cable.free_vertex_names)},
         clamp_paths=cable.clamp_paths,
         prior_stds=dict.fromkeys(names, 0.2),
         start_fit_window=PERIOD,
@@ -101,7 +104,7 @@ def twin(cable, clamps):
         lengths_per_recording=False,
     )
     stub = as_recording(cable, t, held)
-    system = cable_system(median_edge_lengths(cable.edges, [as_recording(cable, t, {})]), cable, options)
+    system = cable_system(median_point_pair_distances(cable.edges, [as_recording(cable, t, {})]), cable, options)
     step = compile_step(system, PERIOD)
     path = prescribed_path(stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamp_paths)
     theta = system.parameters.vector(TRUTH)
@@ -127,8 +130,8 @@ def test_a_cable_names_segments_clamps_junctions_and_vertices(cable, twin):
     assert system.prescribed[:6] == tuple(f"clamp_start_{k}" for k in ("x", "y", "z", "rx", "ry", "rz"))
     assert set(cable.vertices) | {"junction_c", "clamp_start", "clamp_end"} <= set(system.mechanism.frames)
     assert system.n_constraints == 5
-    assert cable.free_vertices == ("p2", "p3", "p4", "c1", "c2")
-    assert cable.clamped_vertices == ("p0", "p1", "p5", "p6")
+    assert cable.free_vertex_names == ("p2", "p3", "p4", "c1", "c2")
+    assert cable.clamped_vertex_names == ("p0", "p1", "p5", "p6")
 
 
 def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
@@ -179,13 +182,13 @@ def test_the_values_of_a_twin_are_found_from_its_vertices(cable, twin):
     )
     free = ("parent.bend", "parent.damping", "c.bend")
     problem = EstimationProblem(step, [recording], free, settings)
-    before = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertices)["twin"]
+    before = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)["twin"]
     solution = solve(problem, GaussNewton())
     # what the points leave open of the start follows the stiffnesses with which it was fitted, so once more
     problem = problem.with_free_parameters(free, dict(zip(free, solution.x, strict=True)))
     solution = solve(problem, GaussNewton())
     np.testing.assert_allclose(solution.x, [TRUTH[name] for name in free], rtol=0.08)
-    after = point_rmse_by_recording(problem, solution.x, cable.free_vertices)["twin"]
+    after = point_rmse_by_recording(problem, solution.x, cable.free_vertex_names)["twin"]
     assert after < 5e-4
     assert before > 10 * after
 
@@ -205,7 +208,7 @@ def test_the_roll_of_a_clamp_is_found_from_two_frames(cable, twin):
 def test_held_out_starts_use_no_frame_after_the_second(cable, twin):
     step, options, recording = twin
     seen = recording.points[0].position.copy()
-    free = [recording.points[0].names.index(v) for v in cable.free_vertices]
+    free = [recording.points[0].names.index(v) for v in cable.free_vertex_names]
     seen[2:, free] += 1.0
     other = Recording(points=(replace(recording.points[0], position=seen),), name="other")
     settings = cable_options(cable, [recording, other], 1e-6, 1e-3, options=options)
@@ -219,12 +222,14 @@ def test_edges_are_as_long_as_measured(cable):
     t = PERIOD * np.arange(4)
     seen = {v: np.tile(1.25 * np.asarray(UNDEFORMED[v]), (4, 1)) for v in cable.vertices}
     recording = as_recording(cable, t, seen)
-    lengths = median_edge_lengths(cable.edges, [recording])
+    lengths = median_point_pair_distances(cable.edges, [recording])
     expected = 1.25 * np.linalg.norm(np.subtract(UNDEFORMED["c2"], UNDEFORMED["c1"]))
     assert lengths["c1", "c2"] == pytest.approx(expected)
-    values = edge_length_parameters(cable, median_edge_lengths(cable.edges, [recording], 2))
+    values = edge_length_parameter_values(cable, median_point_pair_distances(cable.edges, [recording], 2))
     assert values["c.length_1"] == pytest.approx(expected)
-    assert set(values) <= set(cable_system(median_edge_lengths(cable.edges, [recording]), cable).parameters.names)
+    assert set(values) <= set(
+        cable_system(median_point_pair_distances(cable.edges, [recording]), cable).parameters.names
+    )
     np.testing.assert_array_equal(_measured_positions(recording, "c1"), seen["c1"])
 
 
@@ -233,9 +238,9 @@ def test_free_parameters_are_parameters(cable):
         shape_memory=0.5, has_rest_angle_parameters=True, default_branch=CableBranchOptions(separate_twist_damping=True)
     )
     recording = as_recording(cable, PERIOD * np.arange(4), {})
-    names = estimable_parameters(cable, options)
+    names = estimable_parameter_names(cable, options)
     assert set(names) <= set(
-        cable_system(median_edge_lengths(cable.edges, [recording]), cable, options).parameters.names
+        cable_system(median_point_pair_distances(cable.edges, [recording]), cable, options).parameters.names
     )
     assert {"parent.memory", "c.twist_damping", "parent_3_y.rest", "c_0_x.rest"} <= set(names)
     assert not any(name.endswith(".mass") for name in names)
@@ -277,11 +282,11 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository):
     )
     recording = read_recording(folder / "bdlo1_train_021.h5")
     options = CableOptions(shape_memory=0.75)
-    step = compile_step(cable_system(median_edge_lengths(cable.edges, [recording]), cable, options), PERIOD)
+    step = compile_step(cable_system(median_point_pair_distances(cable.edges, [recording]), cable, options), PERIOD)
     settings = cable_options(cable, [recording], 2e-4, 0.1, options=options)
-    problem = EstimationProblem(step, [recording], estimable_parameters(cable, options), settings)
-    error = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertices)[recording.name]
+    problem = EstimationProblem(step, [recording], estimable_parameter_names(cable, options), settings)
+    error = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)[recording.name]
     carried = interpolated_displacement_baseline(
-        recording, cable.free_vertices, cable.parent_vertices, cable.child_vertices, cable.clamped_vertices
+        recording, cable.free_vertex_names, cable.parent_vertices, cable.child_vertices, cable.clamped_vertex_names
     )
-    assert error < 0.5 * position_rmse(carried, measured_positions(recording, cable.free_vertices))
+    assert error < 0.5 * position_rmse(carried, measured_point_positions(recording, cable.free_vertex_names))

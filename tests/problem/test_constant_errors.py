@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step, taken
 
-from yid_ocp.inference.whitening import whitened_at
+from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import (
-    ConstantErrorModel,
-    constant_error_sensitivities,
+    ConstantSensorErrorModel,
+    sensitivities_to_constant_errors,
     subtract_estimated_biases,
 )
 from yid_ocp.problem.options import SensorOptions
@@ -53,11 +53,14 @@ def test_the_map_is_that_of_generalised_least_squares():
     rng = np.random.default_rng(3)
     slopes, columns = rng.standard_normal((40, 3)) * [0.1, 2.0, 30.0], rng.standard_normal((40, 5))
     covariance = np.eye(40) + slopes @ slopes.T
-    made = ConstantErrorModel.from_sensitivities(slopes).whiten(columns)
+    made = ConstantSensorErrorModel.from_sensitivities(slopes).whiten(columns)
     np.testing.assert_allclose(made.T @ made, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
     expected = -slopes.T @ np.linalg.solve(covariance, columns[:, 0])
     np.testing.assert_allclose(
-        ConstantErrorModel.from_sensitivities(slopes).estimate_errors(columns[:, 0]), expected, rtol=1e-9, atol=1e-12
+        ConstantSensorErrorModel.from_sensitivities(slopes).estimate_constant_errors(columns[:, 0]),
+        expected,
+        rtol=1e-9,
+        atol=1e-12,
     )
 
 
@@ -85,9 +88,12 @@ def test_beside_noise_that_drives_other_joints_too(urdf_folder):
     stated = EstimationProblem(step, recorded, ("elbow.mass",), given)
     bare = replace(given, sensors={"joints.effort": SensorOptions(std=0.05, bias_std={"shoulder": 0.1, "elbow": 0.0})})
     spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, prior_stds={name: 0.5}))
-    assert stated.episodes[0].has_constant_sensor_errors
-    assert not spelt.episodes[0].has_constant_sensor_errors
-    weighted, beside = whitened_at(stated, stated.initial_unknowns), whitened_at(spelt, spelt.initial_unknowns)
+    assert stated.episodes[0].has_uncertain_sensor_biases
+    assert not spelt.episodes[0].has_uncertain_sensor_biases
+    weighted, beside = (
+        problem_whitened_at(stated, stated.initial_unknowns),
+        problem_whitened_at(spelt, spelt.initial_unknowns),
+    )
     assert weighted.whitening_filters[0] is not None
     assert weighted.evaluate(stated.initial_unknowns).cost == pytest.approx(
         least(beside, spelt.initial_unknowns)[0], rel=1e-6
@@ -127,11 +133,11 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
 def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
     [(episode, result)] = problem.predict_held_out(problem.initial_unknowns)
-    counted = problem.held_out_residual(0, episode, result).residual
+    counted = problem.whitened_held_out_residual(0, episode, result).residual
     plain = np.concatenate(
         [s.residual_block(y).residual for s, y in zip(episode.measurements, result.predicted_outputs, strict=True)]
     )
-    slopes = constant_error_sensitivities(episode.measurements)
+    slopes = sensitivities_to_constant_errors(episode.measurements)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T

@@ -35,16 +35,18 @@ def test_rows_are_independent_whatever_of_a_sample_was_seen():
     predicted = np.array([[0.0, 1.0, 5.0], [1.0, 9.0, 2.0]])
     plain = 2.0 * np.array([-1.0, -1.0, 2.0, -3.0, -4.0])
     np.testing.assert_allclose(made.residual_block(predicted).residual, mixing @ plain, rtol=1e-12)
-    np.testing.assert_allclose(made.whitened_residual(predicted)[made.is_used], mixing @ plain, rtol=1e-12)
+    np.testing.assert_allclose(made.whitened_residual(predicted)[made.used_output_mask], mixing @ plain, rtol=1e-12)
     assert made.whitened_residual(predicted)[1, 1] == 0.0
     slopes = np.random.default_rng(0).standard_normal((2, 3, 4))
     found = made.residual_block(predicted, slopes, threshold=1.5)
     np.testing.assert_allclose(
-        found.jacobian, found.robust_factor[:, None] * (mixing @ (2.0 * slopes[made.is_used])), rtol=1e-12
+        found.jacobian, found.robust_factor[:, None] * (mixing @ (2.0 * slopes[made.used_output_mask])), rtol=1e-12
     )
     pull = np.random.default_rng(1).standard_normal((2, 3))
-    back = np.einsum("mk,mkd->d", made.whitening_adjoint(np.where(made.is_used, pull, 0.0)), slopes)
-    np.testing.assert_allclose(back, pull[made.is_used] @ made.residual_block(predicted, slopes).jacobian, rtol=1e-12)
+    back = np.einsum("mk,mkd->d", made.whitened_residual_adjoint(np.where(made.used_output_mask, pull, 0.0)), slopes)
+    np.testing.assert_allclose(
+        back, pull[made.used_output_mask] @ made.residual_block(predicted, slopes).jacobian, rtol=1e-12
+    )
 
 
 def arm(step, path, effort, angle=ANGLE, std=EFFORT, free=("shoulder.damping",), cutoff=CUTOFF):
@@ -133,7 +135,7 @@ def test_unknown_forces_are_seen_as_correlated(urdf_folder):
     [samples] = (s for s in problem.episodes[0].measurements if s.sensor.effort_joints)
     slopes = samples.weight[:, :, None] * np.diag(linear.reference_std[at])
     assert np.array_equal(samples.sensor.effort_joints, JOINTS)
-    seen = samples.decorrelation_matrix @ slopes[samples.is_used]
+    seen = samples.decorrelation_matrix @ slopes[samples.used_output_mask]
     # but for the first and the last step, of which a node sees half
     np.testing.assert_allclose(found, seen.T @ seen, rtol=0.03)
     assert abs(found[0, 1]) > 0.05 * found.diagonal().min()

@@ -43,14 +43,14 @@ def test_an_estimated_start_is_estimated_in_held_out_recordings_too(swinging):
 def test_only_the_first_moments_count(swinging):
     problem = swinging(initial_state="estimated", start_configuration_std=0.2, start_velocity_std=1.0)
     episode = problem.held_out[0]
-    found = problem.held_out_evaluation_points(problem.initial_unknowns)[0][2]
+    found = problem.held_out_prediction_inputs(problem.initial_unknowns)[0][2]
     assert np.any(found)
     moved = {}
     for first in (50, 5):
         value = episode.measurements[0].value.copy()
         value[first:] += 1.0
         changed = replace(episode, measurements=(replace(episode.measurements[0], value=value),))
-        moved[first] = problem.with_episodes(problem.episodes, [changed]).held_out_evaluation_points(
+        moved[first] = problem.with_episodes(problem.episodes, [changed]).held_out_prediction_inputs(
             problem.initial_unknowns
         )[0][2]
     assert moved[50] == pytest.approx(found, abs=1e-12)

@@ -9,8 +9,8 @@ from small_problems import PENDULUM, pendulum_step, taken
 from yid_ocp.data.recording import JointGroup
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.problem.recorded_inputs import mean_step_inputs, mean_step_inputs_by_delay
-from yid_ocp.sensors.joints import EFFORT_GROUP
+from yid_ocp.problem.recorded_inputs import mean_step_input_delay_derivative, mean_step_inputs
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME
 
 H = 0.01
 
@@ -24,7 +24,7 @@ def test_torque_acts_late() -> None:
     late = mean_step_inputs(joints, ("a", "b"), grid, "made", np.array([H, 0.25 * H]))
     assert late[:, 0] == pytest.approx([1.0, 1, 2, 4, 8])
     assert late[1:, 1] == pytest.approx(0.75 * prompt[1:, 1] + 0.25 * prompt[:-1, 1])
-    slope = mean_step_inputs_by_delay(joints, ("a", "b"), grid, "made", np.array([0.0, 0.25 * H]))
+    slope = mean_step_input_delay_derivative(joints, ("a", "b"), grid, "made", np.array([0.0, 0.25 * H]))
     assert slope[:, 0] == pytest.approx(-np.array([0.5, 1.5, 3.0, 6.0, 12.0]) / H)
     assert slope[1:, 1] == pytest.approx(-np.diff(prompt[:, 1]) / H)
 
@@ -33,7 +33,7 @@ def test_torque_acts_late() -> None:
 def test_settings_say_what_recorded_efforts_are(urdf_folder, kind):
     step = pendulum_step(urdf_folder, driven=PENDULUM)
     recorded = taken(step, 1)
-    stated = ProblemOptions(sensors={EFFORT_GROUP: SensorOptions(effort_kind=kind)})
+    stated = ProblemOptions(sensors={JOINT_EFFORT_GROUP_NAME: SensorOptions(effort_kind=kind)})
     (said,) = EstimationProblem(step, [recorded], ["shoulder.damping"], stated).episodes
     (held,) = EstimationProblem(
         step, [recorded.with_effort_kind(kind)], ["shoulder.damping"], ProblemOptions()

@@ -35,7 +35,7 @@ def solved(course, time_constant: float, start: float, times: np.ndarray, breaks
 
 
 def test_steps_have_the_mean_of_the_differential_equation() -> None:
-    mean, _ = lag().filter_step_means(VALUE, None)
+    mean, _ = lag().lagged_step_means(VALUE, None)
     breaks = H * np.arange(N + 1)
     fine = H / 20 * (np.arange(20 * N) + 0.5)
     for column, time in enumerate((0.02, 0.004)):
@@ -45,7 +45,7 @@ def test_steps_have_the_mean_of_the_differential_equation() -> None:
 
 
 def test_nodes_follow_straight_lines_between_them() -> None:
-    followed, _ = lag().filter_node_values(VALUE, None)
+    followed, _ = lag().lagged_node_values(VALUE, None)
     times = H * np.arange(N)
     for column, time in enumerate((0.02, 0.004)):
         x = VALUE[:, column]
@@ -56,12 +56,12 @@ def test_nodes_follow_straight_lines_between_them() -> None:
 
 def test_without_a_time_constant_all_is_followed_at_once() -> None:
     at_once = lag(0.0, 0.0)
-    np.testing.assert_array_equal(at_once.filter_step_means(VALUE, None)[0], VALUE)
-    np.testing.assert_array_equal(at_once.filter_node_values(VALUE, None)[0], VALUE)
+    np.testing.assert_array_equal(at_once.lagged_step_means(VALUE, None)[0], VALUE)
+    np.testing.assert_array_equal(at_once.lagged_node_values(VALUE, None)[0], VALUE)
     # and there is a slope all the same, that of a delay
-    _, slope = at_once.filter_step_means(VALUE, None)
+    _, slope = at_once.lagged_step_means(VALUE, None)
     np.testing.assert_allclose(slope[1:, 0, 0], -np.diff(VALUE[:, 0]) / H)
-    _, slope = at_once.filter_node_values(VALUE, np.zeros((N, 2, 3)))
+    _, slope = at_once.lagged_node_values(VALUE, np.zeros((N, 2, 3)))
     np.testing.assert_allclose(slope[2:, 0, 0], -np.diff(VALUE[1:, 0]) / H)
 
 
@@ -71,8 +71,8 @@ def test_of_a_negative_time_constant_the_value_follows() -> None:
     value = np.stack([np.sin(5 * t), np.cos(3 * t)], axis=1)
     there = FirstOrderLag(np.array([-0.03, 0.0]), BY, 0.001)
     back = FirstOrderLag(np.array([0.03, 0.0]), BY, 0.001)
-    ahead, _ = there.filter_node_values(value, None)
-    again, _ = back.filter_node_values(ahead, None)
+    ahead, _ = there.lagged_node_values(value, None)
+    again, _ = back.lagged_node_values(ahead, None)
     np.testing.assert_allclose(again[300:], value[300:], atol=2e-5)
     assert np.abs(ahead - value)[300:, 0].max() == pytest.approx(0.15, rel=0.02)
     np.testing.assert_array_equal(ahead[:, 1], value[:, 1])
@@ -81,11 +81,11 @@ def test_of_a_negative_time_constant_the_value_follows() -> None:
 @pytest.mark.parametrize(
     ("form", "size"),
     [
-        ("filter_step_means", 0.02),
-        ("filter_step_means", 1e-3),
-        ("filter_node_values", 0.02),
-        ("filter_node_values", 1e-3),
-        ("filter_node_values", -0.02),
+        ("lagged_step_means", 0.02),
+        ("lagged_step_means", 1e-3),
+        ("lagged_node_values", 0.02),
+        ("lagged_node_values", 1e-3),
+        ("lagged_node_values", -0.02),
     ],
 )
 def test_derivatives_agree_with_differences(form, size) -> None:
@@ -104,7 +104,7 @@ def test_derivatives_agree_with_differences(form, size) -> None:
 @pytest.mark.parametrize("size", [0.02, -0.02])
 def test_a_pull_comes_back_by_the_transpose(size) -> None:
     pull = np.random.default_rng(5).normal(size=(N, 2))
-    _, slope = lag(size).filter_node_values(VALUE, SLOPE)
-    back, direct = lag(size).node_values_adjoint(VALUE, pull)
+    _, slope = lag(size).lagged_node_values(VALUE, SLOPE)
+    back, direct = lag(size).lagged_node_values_adjoint(VALUE, pull)
     total = np.einsum("kn,knd->d", back, SLOPE) + direct
     np.testing.assert_allclose(total, np.einsum("kn,knd->d", pull, slope), rtol=1e-12)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from small_problems import swinging_pendulum
 
 from yid_ocp.data import read_recording
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 
@@ -161,12 +161,12 @@ def test_the_residual_says_what_its_rows_are(pendulum):
     ):
         for samples, part, predicted in zip(episode.measurements, groups, result.predicted_outputs, strict=True):
             np.testing.assert_array_equal(
-                evaluation.residual[part], samples.whitened_residual(predicted)[samples.is_used]
+                evaluation.residual[part], samples.whitened_residual(predicted)[samples.used_output_mask]
             )
     stated = evaluation.residual[rows.stated_priors]
     assert np.count_nonzero(stated) == 1
     assert stated[np.flatnonzero(stated)[0]] == pytest.approx(0.01 / problem.options.start_configuration_std)
     # a factor of two of the ten that call one standard deviation
     assert sorted(evaluation.residual[rows.weak_priors]) == pytest.approx([0.0, np.log10(2.0)])
-    residual, jacobian = residual_without_weak_priors(problem, evaluation)
+    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
     assert len(residual) == len(jacobian) == rows.stated_priors.stop

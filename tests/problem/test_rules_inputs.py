@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 from small_problems import joints, recording, seen
 
 from yid_ocp.errors import DataError
-from yid_ocp.model.objects.base import ClampPath
+from yid_ocp.model.objects.base import ClampPoseDefinition
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import (
     _smoothed_point_path,
+    mean_step_input_delay_derivative,
     mean_step_inputs,
-    mean_step_inputs_by_delay,
     prescribed_path,
-    recorded_sensors,
+    recorded_sensor_kinds,
     smoothed_joint_angles,
     smoothed_joint_efforts,
 )
@@ -121,20 +121,20 @@ def test_beyond_the_recording_torque_is_held(kind, first, last):
 def test_the_slope_by_the_delay_is_that_of_differences(delay, kind):
     made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0], kind=kind), TimeGrid(0.1, 0.1, 3)
     ends = [mean_step_inputs(made, ("a",), grid, "run", np.array([delay + sign * 1e-6])) for sign in (1, -1)]
-    found = mean_step_inputs_by_delay(made, ("a",), grid, "run", np.array([delay]))
+    found = mean_step_input_delay_derivative(made, ("a",), grid, "run", np.array([delay]))
     np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-6, rtol=1e-6, atol=1e-6)
 
 
 def test_at_a_jump_the_slope_is_the_mean_of_both_sides():
     made, grid = driven([1.0, 2.0, 4.0, 8.0, 5.0, 1.0]), TimeGrid(0.1, 0.1, 3)
-    sides = [mean_step_inputs_by_delay(made, ("a",), grid, "run", np.array([delay])) for delay in (1e-3, -1e-3)]
+    sides = [mean_step_input_delay_derivative(made, ("a",), grid, "run", np.array([delay])) for delay in (1e-3, -1e-3)]
     np.testing.assert_allclose(
-        mean_step_inputs_by_delay(made, ("a",), grid, "run", np.zeros(1)), np.mean(sides, axis=0)
+        mean_step_input_delay_derivative(made, ("a",), grid, "run", np.zeros(1)), np.mean(sides, axis=0)
     )
     # beyond the ends the torque is held, and so does not change
-    beyond = mean_step_inputs_by_delay(made, ("a",), TimeGrid(0.7, 0.1, 2), "run", np.zeros(1))
+    beyond = mean_step_input_delay_derivative(made, ("a",), TimeGrid(0.7, 0.1, 2), "run", np.zeros(1))
     np.testing.assert_array_equal(beyond, np.zeros((2, 1)))
-    before = mean_step_inputs_by_delay(made, ("a",), TimeGrid(-0.7, 0.1, 2), "run", np.zeros(1))
+    before = mean_step_input_delay_derivative(made, ("a",), TimeGrid(-0.7, 0.1, 2), "run", np.zeros(1))
     np.testing.assert_array_equal(before, np.zeros((2, 1)))
 
 
@@ -187,8 +187,11 @@ def test_loads_are_smoothed_and_interpolated():
     ids=["efforts", "no efforts", "points", "camera by its pose", "camera by its name", "nominal clock"],
 )
 def test_sensors_are_known_by_what_was_recorded(made, expected):
-    assert recorded_sensors([made]) == expected
-    assert recorded_sensors([recording(driven([1.0, 2.0])), made]) == expected | {"joints.position", "joints.effort"}
+    assert recorded_sensor_kinds([made]) == expected
+    assert recorded_sensor_kinds([recording(driven([1.0, 2.0])), made]) == expected | {
+        "joints.position",
+        "joints.effort",
+    }
 
 
 # -- prescribed paths -------------------------------------------------------------------------------------------------
@@ -232,7 +235,7 @@ def test_a_clamp_stands_at_its_point_and_looks_along_its_direction():
     turned = Rotation.from_euler("XYZ", np.stack([np.linspace(0.3, 4.0, 8), np.linspace(-0.5, 0.8, 8), np.zeros(8)], 1))
     made = clamped(origin, origin + turned.apply([0.0, 0.0, 0.25]))
     grid = TimeGrid(0.0, 0.1, 7)
-    path = prescribed_path(made, moving(*AXES), grid, PLAIN, (ClampPath("end", "o", "d", "zero"),))
+    path = prescribed_path(made, moving(*AXES), grid, PLAIN, (ClampPoseDefinition("end", "o", "d", "zero"),))
     np.testing.assert_allclose(path[:, :3], origin, atol=1e-12)
     np.testing.assert_allclose(path[:, 3], np.linspace(0.3, 4.0, 8), atol=1e-9)
     np.testing.assert_allclose(path[:, 4], np.linspace(-0.5, 0.8, 8), atol=1e-9)
@@ -246,7 +249,11 @@ def test_a_transported_clamp_does_not_turn_about_its_axis():
     t = np.linspace(0.0, 1.0, steps + 1)
     made = clamped(np.zeros((steps + 1, 3)), direction, t)
     path = prescribed_path(
-        made, moving(*AXES), TimeGrid(0.0, 1.0 / steps, steps), PLAIN, (ClampPath("end", "o", "d", "transported"),)
+        made,
+        moving(*AXES),
+        TimeGrid(0.0, 1.0 / steps, steps),
+        PLAIN,
+        (ClampPoseDefinition("end", "o", "d", "transported"),),
     )
     frames = Rotation.from_euler("XYZ", path[:, 3:])
     turns = (frames[:-1].inv() * frames[1:]).as_rotvec()
@@ -260,7 +267,11 @@ def test_a_clamp_needs_two_points_apart_and_seen_often_enough():
     origin = np.zeros((5, 3))
     with pytest.raises(DataError, match="'o' and 'd' coincide"):
         prescribed_path(
-            clamped(origin, origin), moving(*AXES), TimeGrid(0, 0.1, 4), PLAIN, (ClampPath("end", "o", "d", "zero"),)
+            clamped(origin, origin),
+            moving(*AXES),
+            TimeGrid(0, 0.1, 4),
+            PLAIN,
+            (ClampPoseDefinition("end", "o", "d", "zero"),),
         )
     hidden = np.tile([0.0, 0.0, 1.0], (5, 1))
     hidden[1, 2] = math.nan

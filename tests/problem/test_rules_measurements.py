@@ -9,7 +9,13 @@ import pytest
 from small_problems import efforts, joints, measured, points, recording, seen
 
 from yid_ocp.errors import DataError
-from yid_ocp.problem.measurements import TimeGrid, huber_loss, make_time_grid, place_on_grid, with_paper_weights
+from yid_ocp.problem.measurements import (
+    TimeGrid,
+    huber_loss_and_residual_factors,
+    locate_measurements_on_grid,
+    make_time_grid,
+    with_paper_weights,
+)
 from yid_ocp.sensors.base import SensorData
 
 NAN = math.nan
@@ -86,13 +92,13 @@ def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
     ],
 )
 def test_hubers_loss_is_square_first_and_then_straight(residual, scale, cost, factor):
-    found, weight = huber_loss(np.array([residual]), scale)
+    found, weight = huber_loss_and_residual_factors(np.array([residual]), scale)
     assert found == pytest.approx(cost)
     assert weight == pytest.approx([factor])
 
 
 def test_losses_add():
-    cost, factor = huber_loss(np.array([[1.0, 4.0], [0.0, -1.0]]), 2.0)
+    cost, factor = huber_loss_and_residual_factors(np.array([[1.0, 4.0], [0.0, -1.0]]), 2.0)
     assert cost == pytest.approx(0.5 + 2 * 3 + 0.5)
     np.testing.assert_allclose(factor, [[1.0, math.sqrt(0.5)], [1.0, 1.0]])
 
@@ -111,7 +117,7 @@ def test_rows_are_whitened_differences_where_something_was_measured():
     assert found.cost == pytest.approx(0.5 * (4 + 1 + 100))
     assert found.jacobian is None
     assert TWO.n_residuals == 3
-    np.testing.assert_array_equal(TWO.is_used, [[True, False], [True, True]])
+    np.testing.assert_array_equal(TWO.used_output_mask, [[True, False], [True, True]])
 
 
 def test_rows_have_the_slopes_of_their_predictions_and_a_robust_weight():
@@ -125,8 +131,8 @@ def test_rows_have_the_slopes_of_their_predictions_and_a_robust_weight():
 
 def test_every_output_of_a_point_has_its_channel():
     made = measured(points("p", "r"), [0], [0.0], np.zeros((1, 6)))
-    assert made.channel_of_column == ("points.p",) * 3 + ("points.r",) * 3
-    assert TWO.channel_of_column == ("joints.effort.a", "joints.effort.b")
+    assert made.output_channel_names == ("points.p",) * 3 + ("points.r",) * 3
+    assert TWO.output_channel_names == ("joints.effort.a", "joints.effort.b")
 
 
 # -- from a sensor ----------------------------------------------------------------------------------------------------
@@ -134,22 +140,22 @@ def test_every_output_of_a_point_has_its_channel():
 
 def test_data_are_placed_on_nodes_and_whitened():
     data = SensorData(efforts("a"), np.array([5.05, 5.2]), np.array([[1.0], [NAN]]), np.array([[0.5], [7.0]]))
-    found = place_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
+    found = locate_measurements_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
     assert (found.node.tolist(), found.fraction.tolist()) == ([0, 2], [pytest.approx(0.5), 0.0])
     np.testing.assert_array_equal(found.weight, [[2.0], [0.0]])
     np.testing.assert_array_equal(found.std, [[0.5], [NAN]])
     assert (found.predictable_nodes, found.sensor) == ((0, 3), data.sensor)
     narrow = SensorData(efforts("a"), data.t, data.value, data.std, (1, 2))
-    assert place_on_grid(narrow, TimeGrid(5.0, 0.1, 3), "run").predictable_nodes == (1, 2)
+    assert locate_measurements_on_grid(narrow, TimeGrid(5.0, 0.1, 3), "run").predictable_nodes == (1, 2)
 
 
 @pytest.mark.parametrize("std", [0.0, -1.0, NAN])
 def test_a_noise_level_that_is_not_positive_is_refused_where_something_was_measured(std):
     data = SensorData(efforts("a"), np.array([5.0, 5.1]), np.array([[1.0], [2.0]]), np.array([[0.5], [std]]))
     with pytest.raises(DataError, match="zero or missing"):
-        place_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
+        locate_measurements_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
     hidden = SensorData(efforts("a"), data.t, np.array([[1.0], [NAN]]), data.std)
-    assert place_on_grid(hidden, TimeGrid(5.0, 0.1, 3), "run").weight.tolist() == [[2.0], [0.0]]
+    assert locate_measurements_on_grid(hidden, TimeGrid(5.0, 0.1, 3), "run").weight.tolist() == [[2.0], [0.0]]
 
 
 @pytest.mark.parametrize(
@@ -178,25 +184,25 @@ def test_predictions_are_interpolated_between_the_nodes_that_are_needed():
     made = measured(efforts("a", "b"), [2, 2, 5, 9], [0.0, 0.25, 0.0, 0.5], np.zeros((4, 2)))
     assert made.evaluation_nodes.tolist() == [2, 3, 5, 9, 10]
     at_nodes = np.array([[k, k**2] for k in made.evaluation_nodes], float)
-    np.testing.assert_allclose(made.interpolate(at_nodes), [[2, 4], [2.25, 5.25], [5, 25], [9.5, 90.5]])
+    np.testing.assert_allclose(made.interpolate_to_samples(at_nodes), [[2, 4], [2.25, 5.25], [5, 25], [9.5, 90.5]])
     deep = np.stack([at_nodes, 10 * at_nodes], axis=2)
-    np.testing.assert_allclose(made.interpolate(deep)[:, :, 1], 10 * made.interpolate(at_nodes))
+    np.testing.assert_allclose(made.interpolate_to_samples(deep)[:, :, 1], 10 * made.interpolate_to_samples(at_nodes))
 
 
 def test_a_sample_on_its_node_does_not_look_at_the_next_one():
     made = measured(efforts("a"), [2, 3], [0.0, 0.0], np.zeros((2, 1)))
     assert made.evaluation_nodes.tolist() == [2, 3]
-    np.testing.assert_array_equal(made.interpolate(np.array([[1.0], [NAN]])), [[1.0], [NAN]])
+    np.testing.assert_array_equal(made.interpolate_to_samples(np.array([[1.0], [NAN]])), [[1.0], [NAN]])
 
 
 @pytest.mark.parametrize("late", [None, (0.0, 1.3), (0.4, 2.0)])
 def test_distributing_is_the_transpose_of_interpolating(late):
     made = measured(efforts("a", "b"), [4, 4, 6, 9], [0.0, 0.25, 0.5, 1.0], np.zeros((4, 2)), span=(0, 10))
-    made = made if late is None else made.delayed_by(np.array(late))
+    made = made if late is None else made.shifted_earlier_by(np.array(late))
     rng = np.random.default_rng(1)
     count = len(made.evaluation_nodes)
     at_nodes, at_samples = rng.standard_normal((count, 2)), rng.standard_normal((4, 2))
-    there, back = made.interpolate(at_nodes), made.interpolation_adjoint(at_samples)
+    there, back = made.interpolate_to_samples(at_nodes), made.interpolation_adjoint(at_samples)
     assert back.shape == (count, 2)
     assert np.sum(there * at_samples) == pytest.approx(np.sum(at_nodes * back), rel=1e-12)
     deep = rng.standard_normal((4, 2, 3))
@@ -234,24 +240,24 @@ def test_distributing_is_the_transpose_of_interpolating(late):
     ],
 )
 def test_a_late_sample_is_that_of_before_within_the_span(node, fraction, steps, late_node, late_fraction):
-    made = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8)).delayed_by(np.array([steps]))
+    made = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8)).shifted_earlier_by(np.array([steps]))
     assert made.node.tolist() == [[late_node]]
     np.testing.assert_allclose(made.fraction, [[late_fraction]], atol=1e-12)
 
 
 def test_outputs_are_late_by_different_times_and_their_nodes_have_neighbours():
-    made = measured(efforts("a", "b"), [5, 6], [0.5, 0.0], np.zeros((2, 2)), span=(0, 10)).delayed_by(
+    made = measured(efforts("a", "b"), [5, 6], [0.5, 0.0], np.zeros((2, 2)), span=(0, 10)).shifted_earlier_by(
         np.array([0.25, 2.0])
     )
     assert made.node.tolist() == [[5, 3], [5, 4]]
     np.testing.assert_allclose(made.fraction, [[0.25, 0.5], [0.75, 0.0]])
     assert made.evaluation_nodes.tolist() == [2, 3, 4, 5, 6]
-    near_start = measured(efforts("a"), [0], [0.0], [[1.0]], span=(0, 3)).delayed_by(np.zeros(1))
+    near_start = measured(efforts("a"), [0], [0.0], [[1.0]], span=(0, 3)).shifted_earlier_by(np.zeros(1))
     assert near_start.evaluation_nodes.tolist() == [0, 1]
-    near_end = measured(efforts("a"), [3], [0.0], [[1.0]], span=(0, 3)).delayed_by(np.zeros(1))
+    near_end = measured(efforts("a"), [3], [0.0], [[1.0]], span=(0, 3)).shifted_earlier_by(np.zeros(1))
     assert near_end.evaluation_nodes.tolist() == [1, 2, 3]
     at_nodes = np.array([[k, 10 * k] for k in made.evaluation_nodes], float)
-    np.testing.assert_allclose(made.interpolate(at_nodes), [[5.25, 35.0], [5.75, 40.0]])
+    np.testing.assert_allclose(made.interpolate_to_samples(at_nodes), [[5.25, 35.0], [5.75, 40.0]])
 
 
 @pytest.mark.parametrize(
@@ -281,21 +287,21 @@ def test_outputs_are_late_by_different_times_and_their_nodes_have_neighbours():
 )
 def test_a_late_sample_changes_by_the_slope_on_its_node_by_the_mean_of_two(node, fraction, steps, rate):
     plain = measured(efforts("a"), [node], [fraction], [[1.0]], span=(2, 8))
-    late = plain.delayed_by(np.array([steps]))
+    late = plain.shifted_earlier_by(np.array([steps]))
     at_nodes = np.array([[float(k**2)] for k in late.evaluation_nodes])
-    np.testing.assert_allclose(late.prediction_rate(at_nodes, plain, np.array([steps])), [[rate]])
+    np.testing.assert_allclose(late.prediction_rate_per_step(at_nodes, plain, np.array([steps])), [[rate]])
     # others beside it make no difference
     several = measured(efforts("a"), [2, node, 8], [0.25, fraction, 0.0], np.ones((3, 1)), span=(2, 8))
-    all_late = several.delayed_by(np.array([steps]))
+    all_late = several.shifted_earlier_by(np.array([steps]))
     at_nodes = np.array([[float(k**2)] for k in all_late.evaluation_nodes])
-    np.testing.assert_allclose(all_late.prediction_rate(at_nodes, several, np.array([steps]))[1], [rate])
+    np.testing.assert_allclose(all_late.prediction_rate_per_step(at_nodes, several, np.array([steps]))[1], [rate])
 
 
 def test_late_samples_of_which_a_short_piece_holds_none_change_by_nothing():
     none = measured(efforts("a"), np.zeros(0, int), np.zeros(0), np.zeros((0, 1)), span=(2, 8))
-    late = none.delayed_by(np.array([0.5]))
-    assert late.prediction_rate(np.zeros((0, 1)), none, np.array([0.5])).shape == (0, 1)
-    assert late.interpolate(np.zeros((0, 1, 3))).shape == (0, 1, 3)
+    late = none.shifted_earlier_by(np.array([0.5]))
+    assert late.prediction_rate_per_step(np.zeros((0, 1)), none, np.array([0.5])).shape == (0, 1)
+    assert late.interpolate_to_samples(np.zeros((0, 1, 3))).shape == (0, 1, 3)
 
 
 @pytest.mark.parametrize(("t", "time_step"), [(np.linspace(0.0, 3e3, 400), 0.01), (np.arange(0.0, 3e3, 10.0), 0.01)])

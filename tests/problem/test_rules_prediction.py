@@ -73,7 +73,7 @@ def test_forward_and_adjoint_derivatives_are_those_of_differences(problem):
     forward = evaluation.jacobian.T @ evaluation.residual
     np.testing.assert_allclose(gradient * scale, forward * scale, rtol=1e-6, atol=1e-8 * np.abs(forward * scale).max())
     assert cost == pytest.approx(evaluation.cost, rel=1e-12)
-    rows = problem.residual_rows.without_weak_priors
+    rows = problem.residual_rows.slice_without_weak_priors
     for i in range(len(x)):
         step = np.zeros(len(x))
         step[i] = 1e-5 * scale[i]
@@ -191,16 +191,16 @@ def test_a_torque_acts_as_it_was_recorded_less_what_its_sensor_adds(urdf_folder)
 
 def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
     plain = problem_of(urdf_folder, "free", seeds=(1,))
-    assert plain.has_uncorrected_inputs
+    assert plain.uses_inputs_as_recorded
     for case in ("prescribed", "prescribed gears", "driven", "driven, filtered", "robust"):
-        assert not problem_of(urdf_folder, case, seeds=(1,)).has_uncorrected_inputs, case
+        assert not problem_of(urdf_folder, case, seeds=(1,)).uses_inputs_as_recorded, case
     neutral = {"encoder_offset@shoulder.offset": 0.0, "effort_gain@shoulder.inverse": 1.0}
     made = problem_of(urdf_folder, "all prescribed", seeds=(1,))
-    assert not made.with_parameter_values(neutral).has_uncorrected_inputs, "a free one may change it"
+    assert not made.with_parameter_values(neutral).uses_inputs_as_recorded, "a free one may change it"
     fixed = made.with_free_subset(("elbow.damping",))
-    assert fixed.with_parameter_values(neutral).has_uncorrected_inputs
-    assert not fixed.with_parameter_values(neutral | {"encoder_offset@shoulder.offset": 0.01}).has_uncorrected_inputs
-    assert problem_of(urdf_folder, "local", seeds=(1,)).has_uncorrected_inputs
+    assert fixed.with_parameter_values(neutral).uses_inputs_as_recorded
+    assert not fixed.with_parameter_values(neutral | {"encoder_offset@shoulder.offset": 0.01}).uses_inputs_as_recorded
+    assert problem_of(urdf_folder, "local", seeds=(1,)).uses_inputs_as_recorded
 
 
 def test_efforts_along_a_rollout_are_those_of_driven_and_prescribed_joints(urdf_folder):
@@ -236,9 +236,14 @@ def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder)
     episode, vector = problem.episodes[0], problem.system.parameters.vector
     neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral_values.items()}
     none = np.zeros(problem.step.sizes["nx"])
-    assert problem.predictor.tracking_inputs(episode, vector(neutral), (), none).momentum_shift is None
+    assert (
+        problem.predictor.corrected_inputs_with_momentum_shift(episode, vector(neutral), (), none).momentum_shift
+        is None
+    )
     armature = neutral | {"rotor_inertia@shoulder.armature": 0.05}
-    found = problem.predictor.tracking_inputs(episode, vector(armature), ("rotor_inertia@shoulder.armature",), none)
+    found = problem.predictor.corrected_inputs_with_momentum_shift(
+        episode, vector(armature), ("rotor_inertia@shoulder.armature",), none
+    )
     # of the motion up to each node; it begins from a stand
     rate = np.diff(episode.smoothed_driven_angles[:, 0], prepend=episode.smoothed_driven_angles[0, 0])[:-1] / H
     np.testing.assert_allclose(found.momentum_shift, np.stack([0.05 * rate, 0 * rate], axis=1), atol=1e-12)
@@ -357,16 +362,16 @@ def test_a_moving_reference_moves_the_torque_by_the_gain():
     by_arm, by_momentum = np.zeros((4, 2, 1)), np.zeros((3, 2, 1))
     by_arm[:, 1], by_momentum[:, 0] = 1.0, 2.0
     plain = CorrectedInputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), np.zeros((4, 2)))
-    assert plain.nominal_torque_tangents(feedback, (0, 1), 1) is None
+    assert plain.nominal_torque_sensitivity(feedback, (0, 1), 1) is None
     by_torque = np.full((3, 2, 1), 100.0)
     full = replace(
         plain, torque_sensitivity=by_torque, driven_angles_sensitivity=by_arm, momentum_shift_sensitivity=by_momentum
     )
-    np.testing.assert_array_equal(full.nominal_torque_tangents(None, (0, 1), 1), by_torque)
-    found = full.nominal_torque_tangents(feedback, (0, 1), 1)
+    np.testing.assert_array_equal(full.nominal_torque_sensitivity(None, (0, 1), 1), by_torque)
+    found = full.nominal_torque_sensitivity(feedback, (0, 1), 1)
     np.testing.assert_array_equal(found[:, :, 0], 100.0 + gain[:, :, 1] + 2 * gain[:, :, 2])
     np.testing.assert_array_equal(by_torque, np.full((3, 2, 1), 100.0))
-    alone = replace(plain, momentum_shift_sensitivity=by_momentum).nominal_torque_tangents(feedback, (0, 1), 1)
+    alone = replace(plain, momentum_shift_sensitivity=by_momentum).nominal_torque_sensitivity(feedback, (0, 1), 1)
     np.testing.assert_array_equal(alone[:, :, 0], 2 * gain[:, :, 2])
 
 

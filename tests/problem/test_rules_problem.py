@@ -12,15 +12,15 @@ import scipy.optimize
 from small_problems import PENDULUM, H, pendulum_step, recording, seen, taken
 
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.episodes import _joint_mass_matrices, mass_matrix_diagonal, truncate_episode
-from yid_ocp.problem.evaluation import ResidualRows
+from yid_ocp.problem.episodes import _joint_mass_matrices, mass_matrix_diagonal_at_zero, truncate_episode
+from yid_ocp.problem.evaluation import ResidualVectorLayout
 from yid_ocp.problem.unknown_vector import (
     UnknownVectorLayout,
     check_parameter_bounds,
-    soft_logarithm,
+    soft_logarithm_and_slope,
     with_named_entries,
 )
 
@@ -67,15 +67,15 @@ def test_unknowns_are_shared_ones_then_those_of_every_recording():
         "start.p.x[two]",
     )
     assert LAYOUT.free_parameters == ("a", "b", "l")
-    assert LAYOUT.recording_columns(0).tolist() == [0, 1, 2, 3, 4]
-    assert LAYOUT.recording_columns(1).tolist() == [0, 1, 5, 6, 7]
+    assert LAYOUT.unknown_indices_of_recording(0).tolist() == [0, 1, 2, 3, 4]
+    assert LAYOUT.unknown_indices_of_recording(1).tolist() == [0, 1, 5, 6, 7]
 
 
 def test_blocks_and_values_find_their_places():
     block = np.arange(10.0).reshape(2, 5)
-    wide = LAYOUT.scatter_columns(block, 1)
+    wide = LAYOUT.scatter_to_unknown_columns(block, 1)
     np.testing.assert_array_equal(wide[1], [5, 6, 0, 0, 0, 7, 8, 9])
-    np.testing.assert_array_equal(LAYOUT.pack([1, 2], [3], [4, 5]), [1, 2, 3, 4, 5, 3, 4, 5])
+    np.testing.assert_array_equal(LAYOUT.pack_same_for_all_recordings([1, 2], [3], [4, 5]), [1, 2, 3, 4, 5, 3, 4, 5])
     np.testing.assert_array_equal(
         with_named_entries(np.array([1.0, 2.0]), ("a", "b"), {"b": 7.0, "c": 9.0}), [1.0, 7.0]
     )
@@ -137,14 +137,16 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
     np.testing.assert_allclose(
         problem.initial_state_prior_std, [0.07, 0.07, 0.3 * inertia[0], 0.3 * inertia[1]], rtol=1e-9
     )
-    np.testing.assert_allclose(mass_matrix_diagonal(free_step, theta, ("elbow", "shoulder")), inertia[::-1], rtol=1e-9)
+    np.testing.assert_allclose(
+        mass_matrix_diagonal_at_zero(free_step, theta, ("elbow", "shoulder")), inertia[::-1], rtol=1e-9
+    )
     assert problem.unknown_names[3:] == tuple(f"start.{kind}.{joint}[run_1]" for kind in "qp" for joint in PENDULUM)
-    assert problem.predictor.estimated_state_indices == (0, 1, 2, 3)
+    assert problem.predictor.estimated_initial_state_indices == (0, 1, 2, 3)
 
 
 def test_without_estimated_starts_there_are_none(make):
     problem = make()
-    assert problem.predictor.estimated_state_indices == ()
+    assert problem.predictor.estimated_initial_state_indices == ()
     assert problem.initial_state_prior_std.shape == (0,)
     assert problem.unknown_names == FREE
 
@@ -152,7 +154,7 @@ def test_without_estimated_starts_there_are_none(make):
 def test_stated_priors_are_gaussian_about_the_start(make):
     problem = make(prior_stds={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_factor=0.0)
     x = np.array([7.0, 4.0, 0.14])
-    residual, rows = problem.prior_residual(x)
+    residual, rows = problem.prior_residual_and_jacobian(x)
     np.testing.assert_allclose(residual, [2.0, 2.0])
     np.testing.assert_allclose(rows, [[0.0, 2.0, 0.0], [0.0, 0.0, 50.0]])
     assert problem.residual_rows.stated_priors.stop - problem.residual_rows.stated_priors.start == 2
@@ -162,26 +164,26 @@ def test_stated_priors_are_gaussian_about_the_start(make):
 def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_another(make):
     problem = make(prior_stds={"shoulder.stiffness": 2.0}, weak_prior_factor=10.0)
     x = np.array([7.0, 30.0, 0.5])
-    residual, rows = problem.prior_residual(x)
+    residual, rows = problem.prior_residual_and_jacobian(x)
     np.testing.assert_allclose(residual, [0.5, 1.0])
     np.testing.assert_allclose(rows, [[0.5, 0.0, 0.0], [0.0, 1 / (math.log(10.0) * 30.0), 0.0]])
-    assert problem.is_positive.tolist() == [True, True, False]
-    assert (problem.residual_rows.weak_priors, problem.residual_rows.without_weak_priors) == (
+    assert problem.positive_unknowns_mask.tolist() == [True, True, False]
+    assert (problem.residual_rows.weak_priors, problem.residual_rows.slice_without_weak_priors) == (
         slice(problem.residual_rows.data.stop + 1, problem.residual_rows.data.stop + 2),
         slice(0, problem.residual_rows.data.stop + 1),
     )
     # at its bound the row is one that a step can follow: a thousandth of the start has its value but for 0.65
-    low, slope = problem.prior_residual(np.array([7.0, 0.0, 0.5]))
+    low, slope = problem.prior_residual_and_jacobian(np.array([7.0, 0.0, 0.5]))
     assert low[1] == pytest.approx(-3.0 - 1.5 / math.log(10.0))
     assert slope[1, 1] == pytest.approx(2000.0 / (math.log(10.0) * 3.0))
 
 
 def test_the_weak_priors_logarithm_ends_smoothly_where_the_ratio_is_small():
     ratio = np.array([0.0, 1e-6, 5e-4, 0.999e-3, 1.001e-3, 0.1, 1.0, 700.0])
-    value, slope = soft_logarithm(ratio)
+    value, slope = soft_logarithm_and_slope(ratio)
     np.testing.assert_array_equal(value[4:], np.log(ratio[4:]))
     step = 1e-7 * np.maximum(ratio, 1e-2)
-    np.testing.assert_allclose((soft_logarithm(ratio + step)[0] - value) / step, slope, rtol=1e-5)
+    np.testing.assert_allclose((soft_logarithm_and_slope(ratio + step)[0] - value) / step, slope, rtol=1e-5)
     assert np.all(np.diff(value) > 0)
     assert slope[3] == pytest.approx(slope[4], rel=3e-3)
 
@@ -189,10 +191,10 @@ def test_the_weak_priors_logarithm_ends_smoothly_where_the_ratio_is_small():
 @pytest.mark.parametrize("options", [{"weak_prior_factor": 1.0}, {"weak_prior_factor": 0.0}, {"weighting": "paper"}])
 def test_some_problems_have_no_weak_prior(make, options):
     problem = make(**options)
-    residual, rows = problem.prior_residual(problem.initial_unknowns)
+    residual, rows = problem.prior_residual_and_jacobian(problem.initial_unknowns)
     assert residual.shape == (0,)
     assert rows.shape == (0, 3)
-    assert make(weak_prior_factor=1.1).prior_residual(problem.initial_unknowns)[0].shape == (2,)
+    assert make(weak_prior_factor=1.1).prior_residual_and_jacobian(problem.initial_unknowns)[0].shape == (2,)
 
 
 def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(make):
@@ -218,10 +220,12 @@ def test_the_residual_is_made_of_measurements_then_priors(make):
     assert (rows.data, rows.stated_priors, rows.weak_priors) == (slice(0, 228), slice(228, 229), slice(229, 230))
     np.testing.assert_allclose(evaluation.residual[228:], [2.0, math.log(7.0 / 6.0) / math.log(5.0)])
     assert evaluation.cost == pytest.approx(0.5 * evaluation.residual @ evaluation.residual)
-    residual, jacobian = residual_without_weak_priors(problem, evaluation)
+    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
     np.testing.assert_array_equal(residual, evaluation.residual[:229])
     np.testing.assert_array_equal(jacobian, evaluation.jacobian[:229])
-    assert ResidualRows.from_episodes((), 2, 3) == ResidualRows((), slice(0, 0), slice(0, 2), slice(2, 5))
+    assert ResidualVectorLayout.from_episodes((), 2, 3) == ResidualVectorLayout(
+        (), slice(0, 0), slice(0, 2), slice(2, 5)
+    )
 
 
 @pytest.mark.parametrize("stated", [None, 2.0], ids=["small", "more than a metre"])
@@ -232,14 +236,14 @@ def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, state
     evaluation = problem.evaluate(problem.initial_unknowns + np.array([0.0, 2.0, 0.0]))
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
     noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
-    assert problem.data_noise_unit == pytest.approx(noise)
-    residual, jacobian = residual_without_weak_priors(problem, evaluation)
+    assert problem.data_residual_noise_std == pytest.approx(noise)
+    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
     data = problem.residual_rows.data
     np.testing.assert_allclose(residual[data], evaluation.residual[data] / noise)
     np.testing.assert_allclose(jacobian[data], evaluation.jacobian[data] / noise)
     assert residual[-1] == 2.0
     assert jacobian[-1].tolist() == [0.0, 1.0, 0.0]
-    assert make().data_noise_unit == 1.0
+    assert make().data_residual_noise_std == 1.0
 
 
 def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
@@ -327,7 +331,7 @@ def test_a_held_out_start_balances_its_prior_and_its_first_moments(make, held, c
     best = scipy.optimize.least_squares(
         rows, np.zeros(4), x_scale=problem.initial_state_prior_std, xtol=1e-12, ftol=1e-14
     )
-    found = problem.held_out_evaluation_points(x)[1][2]
+    found = problem.held_out_prediction_inputs(x)[1][2]
     np.testing.assert_allclose(
         found / problem.initial_state_prior_std, best.x / problem.initial_state_prior_std, atol=2e-3
     )
@@ -340,9 +344,9 @@ def test_held_out_recordings_are_predicted_with_shared_parameters_only(make, hel
     assert [episode.name for episode, _ in found] == ["run_8", "run_9"]
     for i, (episode, result) in enumerate(found):
         theta = problem.system.parameters.vector({"elbow.stiffness": 4.0, "elbow.rest": 0.1})
-        expected = problem.predictor.predict_episode(episode, theta, problem.held_out_evaluation_points(x)[i][2], False)
+        expected = problem.predictor.predict_episode(episode, theta, problem.held_out_prediction_inputs(x)[i][2], False)
         np.testing.assert_allclose(result.predicted_outputs[0], expected.predicted_outputs[0], atol=1e-12)
-        assert np.any(problem.held_out_evaluation_points(x)[i][2])
+        assert np.any(problem.held_out_prediction_inputs(x)[i][2])
 
 
 def test_a_held_out_part_of_a_recording_shares_its_start(make):
@@ -350,7 +354,7 @@ def test_a_held_out_part_of_a_recording_shares_its_start(make):
     part = replace(problem.episodes[1], initial_state_shared_with=1)
     split = problem.with_episodes(problem.episodes, [part])
     x = problem.vector({name: 0.01 * i for i, name in enumerate(problem.unknown_names[3:])})
-    assert split.held_out_evaluation_points(x)[0][2].tolist() == problem.split(x, 1)[1].tolist()
+    assert split.held_out_prediction_inputs(x)[0][2].tolist() == problem.split(x, 1)[1].tolist()
     np.testing.assert_array_equal(
         split.predict_held_out(x)[0][1].predicted_outputs[0],
         problem.evaluate(x, False).episode_predictions[1].predicted_outputs[0],
@@ -358,7 +362,7 @@ def test_a_held_out_part_of_a_recording_shares_its_start(make):
 
 
 def test_a_start_at_rest_needs_no_offset(make, held):
-    assert make(held_out=held).held_out_evaluation_points(np.array([6.0, 3.0, 0.1]))[0][2].shape == (0,)
+    assert make(held_out=held).held_out_prediction_inputs(np.array([6.0, 3.0, 0.1]))[0][2].shape == (0,)
 
 
 def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, held):
@@ -369,11 +373,11 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
         changed = value.copy()
         changed[first:] += 0.3
         moved = replace(episode, measurements=(replace(episode.measurements[0], value=changed),))
-        found = problem.with_episodes(problem.episodes, [moved]).held_out_evaluation_points(problem.initial_unknowns)[
+        found = problem.with_episodes(problem.episodes, [moved]).held_out_prediction_inputs(problem.initial_unknowns)[
             0
         ][2]
         assert (
-            np.allclose(found, problem.held_out_evaluation_points(problem.initial_unknowns)[0][2], atol=1e-12) is same
+            np.allclose(found, problem.held_out_prediction_inputs(problem.initial_unknowns)[0][2], atol=1e-12) is same
         )
 
 
@@ -401,7 +405,7 @@ def test_problems_prepared_anew_keep_what_is_not_changed(make, held):
         held_out=held, values={"elbow.damping": 0.7}, prior_stds={"elbow.rest": 0.1}, local_parameters=("elbow.rest",)
     )
     index = problem.system.parameters.index
-    shorter = problem.truncated_to(0.1)
+    shorter = problem.truncated_to_duration(0.1)
     assert (shorter.episodes[0].grid.steps, shorter.held_out, shorter.free) == (10, (), FREE)
     assert shorter.theta[index("elbow.damping")] == 0.7
     changed = problem.with_options(replace(problem.options, weak_prior_factor=3.0))

@@ -10,12 +10,12 @@ import pytest
 from small_problems import PENDULUM, H, joints, pendulum_step, recording
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.effects import SENSOR_KINDS, candidate_effects, make_effect
+from yid_ocp.effects import _SENSOR_KINDS, candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.rollout import applied_joint_torque, simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, PositionServoOptions
+from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, PositionServoOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.recorded_inputs import mean_step_inputs
@@ -67,7 +67,7 @@ def test_the_torque_is_that_of_a_spring_and_a_damper_within_a_limit(step, demand
     command = np.array([0.3 + (demand + 4.0 * 0.7) / 60.0, 0.0])
     found = np.array(torque(command, [0.3, 0.0], [0.7, 0.0], theta)).ravel()
     assert found[0] == pytest.approx(
-        demand / (1 + (abs(demand) / 9.0) ** TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER)
+        demand / (1 + (abs(demand) / 9.0) ** TORQUE_SATURATION_EXPONENT) ** (1 / TORQUE_SATURATION_EXPONENT)
     )
     assert abs(found[0]) < 9.0
     assert found[1] == 0.0
@@ -75,7 +75,10 @@ def test_the_torque_is_that_of_a_spring_and_a_damper_within_a_limit(step, demand
 
 def test_a_clip_is_what_the_limit_is_away_from_its_corner(step) -> None:
     for ratio, most in ((0.5, 1e-3), (0.9, 0.012), (1.0, 0.045), (1.1, 0.013)):
-        assert abs(ratio / (1 + ratio**TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER) - min(ratio, 1.0)) < most
+        assert (
+            abs(ratio / (1 + ratio**TORQUE_SATURATION_EXPONENT) ** (1 / TORQUE_SATURATION_EXPONENT) - min(ratio, 1.0))
+            < most
+        )
 
 
 def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
@@ -91,7 +94,9 @@ def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
         ]
     )
     demand = np.array([60.0, 25.0]) * sag
-    torque = demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER)
+    torque = demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** TORQUE_SATURATION_EXPONENT) ** (
+        1 / TORQUE_SATURATION_EXPONENT
+    )
     np.testing.assert_allclose(torque, -weight, rtol=1e-8)
     still = simulate(step, theta, rest.state, 30, np.tile(command, (30, 1)))
     np.testing.assert_allclose(still.state, np.tile(rest.state, (31, 1)), atol=1e-9)
@@ -115,7 +120,7 @@ def test_the_torque_along_a_rollout_is_what_moves_it(step) -> None:
     demand = np.array([60.0, 25.0]) * (result.rollout.torque - middle) - np.array([4.0, 1.5]) * rate
     np.testing.assert_allclose(
         torque,
-        demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER),
+        demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** TORQUE_SATURATION_EXPONENT) ** (1 / TORQUE_SATURATION_EXPONENT),
         rtol=1e-9,
     )
 
@@ -208,10 +213,10 @@ def test_without_commands_it_says_what_is_missing(step) -> None:
 
 
 def test_effects_on_efforts_are_none_of_a_servo(step) -> None:
-    kinds = {kind for kind, place in candidate_effects(step.system, SENSOR_KINDS) if place in PENDULUM}
+    kinds = {kind for kind, place in candidate_kinds_and_locations(step.system, _SENSOR_KINDS) if place in PENDULUM}
     assert {"servo_gain", "servo_delay", "servo_saturation", "backlash", "encoder_offset"} <= kinds
     assert not kinds & {"effort_gain", "effort_offset", "effort_lag", "series_elasticity"}
-    without = {kind for kind, _ in candidate_effects(step.system, ["joints.position"])}
+    without = {kind for kind, _ in candidate_kinds_and_locations(step.system, ["joints.position"])}
     assert {"servo_gain", "servo_delay", "servo_saturation", "backlash"} <= without
 
 
@@ -248,7 +253,8 @@ def test_a_saturation_reports_its_limit_and_binds_like_the_servos_own(urdf_folde
     [effect] = limited.system.effects
     name = effect.amplitude_names[0]
     told = effect.reported_parameters(
-        {name: 5.0**-TORQUE_LIMIT_POWER}, {name: 0.01 * TORQUE_LIMIT_POWER * 5.0**-TORQUE_LIMIT_POWER}
+        {name: 5.0**-TORQUE_SATURATION_EXPONENT},
+        {name: 0.01 * TORQUE_SATURATION_EXPONENT * 5.0**-TORQUE_SATURATION_EXPONENT},
     )["limit"]
     assert (told.value, told.std, told.unit) == (pytest.approx(5.0), pytest.approx(0.05), "N m")
     one = problem_of(limited, made, ["shoulder.damping"], far)
@@ -300,7 +306,7 @@ def test_an_estimated_start_frees_the_arm_as_well(step) -> None:
 
 def test_the_effect_is_an_effect_of_the_servos_joint_only(step) -> None:
     assert make_effect("servo_gain", "elbow", step.system).neutral_values == {"servo_gain@elbow.scale": 1.0}
-    assert candidate_effects(replace(step.system, servos={}, driven=()), SENSOR_KINDS)
+    assert candidate_kinds_and_locations(replace(step.system, servos={}, driven=()), _SENSOR_KINDS)
     assert "servo_gain" not in {
-        kind for kind, _ in candidate_effects(replace(step.system, servos={}, driven=()), SENSOR_KINDS)
+        kind for kind, _ in candidate_kinds_and_locations(replace(step.system, servos={}, driven=()), _SENSOR_KINDS)
     }

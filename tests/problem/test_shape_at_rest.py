@@ -12,7 +12,7 @@ from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.episode_initialization import _MAX_FIRST_SAMPLE_TIME
-from yid_ocp.sensors import sensor_function
+from yid_ocp.sensors import sensor_reading_function
 from yid_ocp.sensors.points import PointSensor
 
 POSTURE = (0.5, 0.5)
@@ -51,7 +51,7 @@ def problem_of(step, state, first=0.1, std=1e-3, **options):
     n, m, t = step.system.n_coordinates, step.system.n_constraints, 0.01 * np.arange(int(100 * (first + 0.3)))
     sensor = PointSensor("points_camera", (MIDDLE,), (MIDDLE,), None)
     at = (state[:n], np.zeros(n), [], np.zeros(n), np.zeros(m), step.system.parameters.vector())
-    place = np.array(sensor_function(step.system, sensor, ())(*at)[0])
+    place = np.array(sensor_reading_function(step.system, sensor, ())(*at)[0])
     late = t[t >= first - 1e-9]
     camera = seen(
         [MIDDLE], late, np.tile(place.ravel(), (len(late), 1, 1)), "points_camera", std=np.full((len(late), 1, 3), std)

@@ -42,7 +42,7 @@ def test_its_own_values_without_any_and_noise_by_its_seed(problem):
     own = problem.evaluate(problem.initial_unknowns, derivatives=False).episode_predictions[0]
     [samples] = [s for s in problem.episodes[0].measurements if s.sensor.group_name == plain.points[0].name]
     predicted = own.predicted_outputs[problem.episodes[0].measurements.index(samples)]
-    where = samples.is_used
+    where = samples.used_output_mask
     assert np.allclose(plain.points[0].position.reshape(predicted.shape)[where], predicted[where], atol=1e-12)
     assert np.array_equal(first.points[0].position, same.points[0].position, equal_nan=True)
     assert not np.array_equal(first.points[0].position, other.points[0].position, equal_nan=True)
@@ -59,7 +59,7 @@ def test_a_parameter_that_is_not_there_is_named(problem):
 def test_residuals_are_those_of_the_result(problem):
     solution = yid.solve(problem, yid.GaussNewton())
     errors = rmse_by_channel(solution.episode_predictions, problem.episodes)
-    found = solution.channel_predictions()
+    found = solution.channel_measurements_and_predictions()
     assert {entry.channel: entry.rmse for entry in found} == pytest.approx({k: v["rmse"] for k, v in errors.items()})
     for entry in found:
         assert entry.unit == errors[entry.channel]["unit"]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
 from yid_ocp.model.kinematics import mass_matrix
-from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import read_urdf
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -49,7 +49,7 @@ def cases(urdf_folder):
         "double_pendulum": case(read("double_pendulum"), 2e-3),
         "arm": case(System.build(read_urdf("package:baxter", joints=arm)), 5e-3),
         "cable": case(System.build(objects=[(cable, None, None)]), 1e-3),
-        "foam_y": case(System.build(objects=[(y_object(), None, None)]), 1e-3),
+        "foam_y": case(System.build(objects=[(foam_y_object(), None, None)]), 1e-3),
     }
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import read_urdf
 
 # The foam's thin tubes twist too fast (70 000 1/s) for a time step in the range where the order shows: thicker, softer.
@@ -74,7 +74,7 @@ def one_arm(urdf_folder):
 
 def y_alone(urdf_folder):
     driven = ["T1_3_x", "T2_1_y"]
-    system = System.build(objects=[(y_object(), None, None)], driven=driven)
+    system = System.build(objects=[(foam_y_object(), None, None)], driven=driven)
     rng = np.random.default_rng(2)
     q, v = 0.05 * rng.normal(size=system.n_coordinates), 0.2 * rng.normal(size=system.n_coordinates)
     return Motion(system, q, v, np.array([0.8, 0.3]), 0.02, (100, 200, 400), SLOW_OBJECT)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.model import Mechanism, forward_kinematics, rotations
-from yid_ocp.model.kinematics import lagrangian_second_derivatives, mass_matrix, rigid_body_derivatives
-from yid_ocp.model.objects.foam_y import y_object
-from yid_ocp.model.urdf import example_robot_urdf, read_urdf
+from yid_ocp.model.kinematics import lagrangian_second_derivatives, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.objects.foam_y import foam_y_object
+from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 
 pin = pytest.importorskip("pinocchio", reason="the reference needs Pinocchio: pip install pin")
 
@@ -44,7 +44,7 @@ class Twin:
         n = len(self.mechanism.joints)
         q, v, a = (ca.SX.sym(name, n) for name in "qva")
         kinematics = forward_kinematics(self.mechanism, q)
-        rigid = rigid_body_derivatives(kinematics, v, ca.SX(ca.DM(GRAVITY)))
+        rigid = rigid_body_lagrangian_derivatives(kinematics, v, ca.SX(ca.DM(GRAVITY)))
         by_qv = lagrangian_second_derivatives(rigid, self.mechanism)[1]
         M = mass_matrix(rigid, self.mechanism)
         effort = M @ a + by_qv.T @ v - rigid.lagrangian_by_q
@@ -89,11 +89,11 @@ def make_twin(urdf_folder, file, joints, locked):
     if file is None or file == "y_object.urdf":
         path = urdf_folder / "y_object.urdf"
     elif file.startswith("package:"):
-        path = example_robot_urdf(file.removeprefix("package:"))
+        path = _example_robot_urdf(file.removeprefix("package:"))
     else:
         path = urdf_folder / file
     if file is None:
-        mechanism = y_object().mechanism.with_numeric_values()
+        mechanism = foam_y_object().mechanism.with_numeric_values()
     else:
         mechanism = read_urdf(path, joints=joints, locked=locked).with_numeric_values()
     full = pin.buildModelFromUrdf(str(path))
@@ -162,7 +162,7 @@ def test_mass_matrix_gravity_and_inverse_dynamics(twin):
 
 def test_generated_object_has_the_frames_of_its_urdf(urdf_folder):
     model = pin.buildModelFromUrdf(str(urdf_folder / "y_object.urdf"))
-    assert all(model.existFrame(name) for name in y_object().mechanism.frames)
+    assert all(model.existFrame(name) for name in foam_y_object().mechanism.frames)
 
 
 @pytest.mark.parametrize("file", ["mixed_joints.urdf", "turntable.urdf"])
@@ -170,7 +170,7 @@ def test_second_derivatives_against_automatic_differentiation(urdf_folder, file)
     mechanism = read_urdf(urdf_folder / file).with_numeric_values()
     n = len(mechanism.joints)
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
-    rigid = rigid_body_derivatives(forward_kinematics(mechanism, q), v, ca.SX(ca.DM(GRAVITY)))
+    rigid = rigid_body_lagrangian_derivatives(forward_kinematics(mechanism, q), v, ca.SX(ca.DM(GRAVITY)))
     lagrangian = rigid.kinetic_energy - rigid.potential_energy
     by_q, by_v = ca.gradient(lagrangian, q), ca.gradient(lagrangian, v)
     expected = [by_q, by_v, ca.jacobian(by_q, q), ca.jacobian(by_q, v), ca.jacobian(by_v, v)]

@@ -12,11 +12,11 @@ import pytest
 
 from yid_ocp.data import JointGroup, Recording, write_recording
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.events import DisturbanceEvent, EventForceSeries, EventSet, Overspeed
-from yid_ocp.diagnosis.pulse_detection import DetectedPulse
+from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, _EventForceSeries, _Overspeed
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse
 from yid_ocp.report import categorical_charts, figures
-from yid_ocp.report.categorical_charts import BeforeAfter, RankedCandidate, TimeMapRow
-from yid_ocp.report.figures import TimePlot
+from yid_ocp.report.categorical_charts import RankedCandidate, TimeHeatMapRow, ValueBeforeAfter
+from yid_ocp.report.figures import TimePlotData
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
 from yid_ocp.workflow.build_problem import load_problem
@@ -130,19 +130,19 @@ def test_a_result_alone_gives_words_and_tables(found, tmp_path):
 
 
 def test_changes_of_very_different_sizes_get_a_logarithmic_axis():
-    close = categorical_charts.before_after_figure(
-        {"a": BeforeAfter(2.0, 1.0), "b": BeforeAfter(3.0, None, reference=1.0)}, "x [m]", ("1", "2", "3")
+    close = categorical_charts.values_before_after_figure(
+        {"a": ValueBeforeAfter(2.0, 1.0), "b": ValueBeforeAfter(3.0, None, reference=1.0)}, "x [m]", ("1", "2", "3")
     )
-    far = categorical_charts.before_after_figure(
-        {"a": BeforeAfter(20.0, 0.1), "b": BeforeAfter(3.0, 1.0)}, "x [m]", ("1", "2", "3")
+    far = categorical_charts.values_before_after_figure(
+        {"a": ValueBeforeAfter(20.0, 0.1), "b": ValueBeforeAfter(3.0, 1.0)}, "x [m]", ("1", "2", "3")
     )
     assert (close.layout.xaxis.type, far.layout.xaxis.type) == (None, "log")
     assert [trace.name for trace in close.data[1:]] == ["1", "2", "3"]
 
 
 def test_bars_of_what_cannot_be_told_do_not_widen_the_axis():
-    figure = categorical_charts.before_after_figure(
-        {"a": BeforeAfter(2.0, 1.0, float("inf"), 1e7)}, "x", ("1", "2", "")
+    figure = categorical_charts.values_before_after_figure(
+        {"a": ValueBeforeAfter(2.0, 1.0, float("inf"), 1e7)}, "x", ("1", "2", "")
     )
     assert figure.layout.xaxis.range[1] < 3.0
     assert figure.data[1].error_x.array is None
@@ -151,8 +151,8 @@ def test_bars_of_what_cannot_be_told_do_not_widen_the_axis():
 
 def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
     values = np.array([1.0, np.nan, -4000.0])
-    rows = [TimeMapRow(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
-    figure = categorical_charts.time_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
+    rows = [TimeHeatMapRow(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
+    figure = categorical_charts.time_heat_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
     heat = figure.data[0]
     assert heat.z[0][1] is None
     assert heat.zmax == -heat.zmin > 0
@@ -178,12 +178,12 @@ def test_a_ranking_says_what_lies_beyond_its_axis():
 
 def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     t = np.linspace(0, 2, 21)
-    pulse = DetectedPulse(0.5, 1.0, 0.7, False, 0.05, 1e-9)
+    pulse = DetectedForcePulse(0.5, 1.0, 0.7, False, 0.05, 1e-9)
     event = DisturbanceEvent("run", "elbow", "elbow", "force", 0.5, 1.0, 0.7, pulse.impulse, 0.0125, "N m", pulse)
     events = EventSet(
         (event,),
-        (Overspeed("run", "elbow", 1.5),),
-        (EventForceSeries("run", "elbow", "N m", t, pulse.evaluate_at(t), 0.1 + 0 * t),),
+        (_Overspeed("run", "elbow", 1.5),),
+        (_EventForceSeries("run", "elbow", "N m", t, pulse.filtered_force_at(t), 0.1 + 0 * t),),
     )
     page = page_of(replace(found["no_gap"], events=events), tmp_path / "report.html")
     assert 'id="events"' in page
@@ -195,6 +195,6 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
 
 def test_bands_and_spans_are_shaded():
     t = np.linspace(0, 3, 31)
-    plots = [TimePlot("a", {"line": (t, t)}, t, t, 0.2, [(1.0, 2.0)])]
+    plots = [TimePlotData("a", {"line": (t, t)}, t, t, 0.2, [(1.0, 2.0)])]
     band, span = figures.time_plots_figure(plots, "#000000", {"line": "blue"}).layout.shapes
     assert (band.y0, band.y1, span.x0, span.x1) == (-0.2, 0.2, 1.0, 2.0)

@@ -113,7 +113,7 @@ def solved_page(tmp_path_factory, pendulum_data) -> Path:
 
 def test_a_page_says_what_the_terminal_says(solved_page):
     result = json.loads((solved_page.parent / "result.json").read_text())
-    said = terminal.terminal_lines(SUMMARY_BY_FORMAT[result["format"]](result))
+    said = terminal.summary_terminal_lines(SUMMARY_BY_FORMAT[result["format"]](result))
     assert_same_words("\n".join([*said, "run folder: x"]), text_of(solved_page.read_text(encoding="utf-8")))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from yid_ocp.analysis.sparsity_patterns import NamedRange, SparsityPattern
+from yid_ocp.analysis.sparsity_patterns import NamedIndexRange, SparsityPattern
 from yid_ocp.errors import OutputError
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
 
@@ -27,11 +27,11 @@ def drawn(monkeypatch):
 def pattern(height=6, width=8, **more):
     mask = np.random.default_rng(0).random((height, width)) < 0.4
     rows = (
-        NamedRange("del", 0, height - 2),
-        NamedRange("internal", height - 2, height - 2),
-        NamedRange("constraint", height - 2, height),
+        NamedIndexRange("del", 0, height - 2),
+        NamedIndexRange("internal", height - 2, height - 2),
+        NamedIndexRange("constraint", height - 2, height),
     )
-    columns = (NamedRange("q1", 0, width - 3), NamedRange("lam", width - 3, width))
+    columns = (NamedIndexRange("q1", 0, width - 3), NamedIndexRange("lam", width - 3, width))
     row_labels = (*(f"T{1 + i // 3}_{i % 3}_x" for i in range(height - 2)), "left.x", "left.y")
     column_labels = (*(f"T{1 + i // 3}_{i % 3}_x" for i in range(width - 3)), "left.x", "left.y", "left.z")
     return SparsityPattern("dR_dy", "a step", mask, rows, columns, row_labels, column_labels, **more)

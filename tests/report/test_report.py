@@ -120,8 +120,8 @@ def test_sections_may_have_nothing_to_say():
 
 def test_a_new_section_is_a_file_and_a_template(solved, tmp_path, monkeypatch):
     (tmp_path / "weather_section.py").write_text(
-        "from yid_ocp.report.sections import register_section\n\n\n"
-        "@register_section('weather', 15, 'The weather')\n"
+        "from yid_ocp.report.sections import register_report_section\n\n\n"
+        "@register_report_section('weather', 15, 'The weather')\n"
         "def prepare(findings):\n"
         "    return {'sky': 'blue & dry'} if 'parameters' in findings.result else None\n"
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.data import JointGroup, Recording
-from yid_ocp.inference.uncertainty import VERDICT_PREDICATES, VERDICT_WORDS, parameter_verdict
+from yid_ocp.inference.uncertainty import VERDICT_PREDICATES, VERDICT_TABLE_TEXTS, parameter_verdict
 from yid_ocp.report import summaries, terminal
 from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
 
@@ -55,7 +55,7 @@ def judged(said: str) -> dict:
 
 
 def told(summary: str, result: dict) -> list[str]:
-    return terminal.terminal_lines(getattr(summaries, summary)(result))
+    return terminal.summary_terminal_lines(getattr(summaries, summary)(result))
 
 
 def line_of(lines: list[str], name: str) -> str:
@@ -65,13 +65,13 @@ def line_of(lines: list[str], name: str) -> str:
 def test_every_verdict_has_its_words():
     possible = {parameter_verdict(1.0, std) for std in (0.01, 1.0, 100.0, float("inf"))} | {"fixed"}
     possible |= {parameter_verdict(1.0, 0.01, explains=False), parameter_verdict(1.0, 0.01, at_bound=True)}
-    assert set(VERDICT_PREDICATES) == set(VERDICT_WORDS) == possible
-    assert VERDICT_WORDS["identifiable"] == "found"
+    assert set(VERDICT_PREDICATES) == set(VERDICT_TABLE_TEXTS) == possible
+    assert VERDICT_TABLE_TEXTS["identifiable"] == "found"
 
 
 @pytest.mark.parametrize("said", ["identifiable", "weak", "not_identifiable", "at_bound"])
 def test_a_verdict_reads_alike_in_every_command(said):
-    words, name = VERDICT_WORDS[said], f"p_{said}"
+    words, name = VERDICT_TABLE_TEXTS[said], f"p_{said}"
     assert words in line_of(told("solve_summary", solved()), name)
     assert words in line_of(told("compare_summary", compared()), name)
     result = information(parameters={name: judged(said)})
@@ -133,7 +133,7 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
 
 def test_a_failed_solve_says_nothing_of_its_parameters():
     lines = told("solve_summary", solved(status="failed", message="step 3"))
-    assert not any(word in line for line in lines for word in VERDICT_WORDS.values())
+    assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
     assert "the values are the best point that was reached; nothing can be said about how sure they are" in lines
 
 
@@ -191,15 +191,16 @@ def test_a_recording_in_a_table():
 
 def test_blocks_on_a_terminal():
     table = SummaryTable([("a", "b"), ("1", "2")], "a title for the page")
-    assert terminal.terminal_lines([]) == []
+    assert terminal.summary_terminal_lines([]) == []
     hidden = replace(table, is_page_only=True)
-    assert terminal.terminal_lines([table, SummaryStatement("said"), table, hidden, CodeBlock("do it\nnow")]) == [
+    blocks = [table, SummaryStatement("said"), table, hidden, CodeBlock("do it\nnow")]
+    assert terminal.summary_terminal_lines(blocks) == [
         "a  b", "-  -", "1  2", "", "said", "", "a  b", "-  -", "1  2", "", "  do it", "  now",
     ]  # fmt: skip
-    prose = terminal.terminal_lines([SummaryStatement("A sentence of some length. " * 9 + "It ends.")])
+    prose = terminal.summary_terminal_lines([SummaryStatement("A sentence of some length. " * 9 + "It ends.")])
     assert len(prose) > 1
     assert max(map(len, prose)) <= terminal._PROSE_WIDTH
-    note = terminal.terminal_lines([SummaryStatement("a note " * 40)])
+    note = terminal.summary_terminal_lines([SummaryStatement("a note " * 40)])
     assert all(line.startswith("  ") for line in note[1:])
 
 

@@ -11,7 +11,7 @@ import pytest
 from yid_ocp.model import Mechanism, Segment, System, flexible_object
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
-from yid_ocp.sensors import Sensor, sensor_function
+from yid_ocp.sensors import Sensor, sensor_reading_function
 
 Read = Callable[..., np.ndarray]
 
@@ -38,7 +38,7 @@ def read() -> Read:
         system: System, sensor: Sensor, q: Sequence[float] | None = None, effort: Sequence[float] | None = None
     ) -> np.ndarray:
         n = system.n_coordinates
-        function = sensor_function(system, sensor, ())
+        function = sensor_reading_function(system, sensor, ())
         at = (np.zeros(n) if q is None else q, np.zeros(n), np.zeros(len(system.internal_coordinates)))
         loads = (np.zeros(n) if effort is None else effort, np.zeros(system.n_constraints))
         return np.array(ca.densify(function(*at, *loads, system.parameters.vector())[0])).ravel()

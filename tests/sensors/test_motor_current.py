@@ -108,7 +108,7 @@ def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, m
     with h5py.File(tmp_path / "run.h5") as file:
         assert {key: file["motors_left"][key].attrs["unit"] for key in ("t", "current")} == {"t": "s", "current": "A"}
     assert made.time_slice(1.0, 2.0).channel_groups[0].t[[0, -1]] == pytest.approx([1.0, 2.0])
-    assert made.sensor_keys == ("joints.effort", "joints.position", "motors_left.current")
+    assert made.sensor_setting_keys == ("joints.effort", "joints.position", "motors_left.current")
     for change, message in (
         (lambda file: file.create_group("motor"), "no group 'motor'"),
         (lambda file: file["motors_left"].create_dataset("voltage", data=T), "no dataset 'voltage'"),

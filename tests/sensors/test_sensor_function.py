@@ -16,7 +16,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.sensors import Channel, EffortSensor, PointSensor, Sensor, sensor_function
+from yid_ocp.sensors import ChannelKind, EffortSensor, PointSensor, Sensor, sensor_reading_function
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
 LABEL = "drift@left"
@@ -58,17 +58,17 @@ def whole(system: System) -> System:
 
 @pytest.mark.parametrize("sensor", [CAMERA, EFFORT], ids=["points", "effort"])
 def test_outputs_have_a_row_for_every_reading(whole: System, sensor: Sensor) -> None:
-    function = sensor_function(whole, sensor, NAMES)
+    function = sensor_reading_function(whole, sensor, NAMES)
     rows = sensor.outputs_per_channel * len(sensor.channel_names)
     n = whole.n_coordinates
     assert [function.size_out(i) for i in range(7)] == [(rows, size) for size in (1, n, 0, 1, n, 0, len(NAMES))]
-    assert sensor_function(whole, sensor, ()).size_out(6) == (rows, 0)
+    assert sensor_reading_function(whole, sensor, ()).size_out(6) == (rows, 0)
 
 
 @pytest.mark.parametrize("sensor", [CAMERA, EFFORT], ids=["points", "effort"])
 def test_derivatives_agree_with_differences(whole: System, sensor: Sensor) -> None:
     rng = np.random.default_rng(1)
-    function = sensor_function(whole, sensor, NAMES)
+    function = sensor_reading_function(whole, sensor, NAMES)
     at = [
         rng.uniform(-0.6, 0.6, whole.n_coordinates),
         np.zeros(whole.n_coordinates),
@@ -103,7 +103,7 @@ def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None
     a, b = (whole.mechanism.joint_index(name) for name in ("left_a", "left_b"))
     effort[a], effort[b] = 2.0, 3.0
     assert a == 0
-    function = sensor_function(whole, EFFORT, ())
+    function = sensor_reading_function(whole, EFFORT, ())
     still = np.zeros(whole.n_coordinates)
     read = np.array(function(still, still, [0.5], effort, [], whole.parameters.vector())[0]).ravel()
     drift = 0.2 * (0.25 + np.sin(2.0))
@@ -114,7 +114,7 @@ def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None
 class Hand(Sensor):
     """How fast the elbow turns and what holds the hand: what a node has beside its coordinates."""
 
-    channel = Channel("hand", "touch", "1")
+    channel = ChannelKind("hand", "touch", "1")
     group_name: str = "hand.touch"
     frame_names = point_names = ()
 

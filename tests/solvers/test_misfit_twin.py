@@ -12,7 +12,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, run_virtual_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 pytest.importorskip("mujoco")
@@ -41,7 +41,7 @@ def arm_with_cable(links: int, mode: str) -> System:
 def recording():
     system = arm_with_cable(FINE, "driven")
     excitation = MultisineOptions(duration=DURATION, gripper_travel=0.15)
-    motion = random_multisine(system, None, seed=3, initial_joint_angles=POSTURE, excitation=excitation)
+    motion = random_multisine_motion(system, None, seed=3, initial_joint_angles=POSTURE, excitation=excitation)
     simulation = SimulationOptions(duration=DURATION, time_step=1e-3)
     camera = PointCamera(frame_rate=30.0, point_std=1e-3, has_dropouts=False)
     how = VirtualExperiment(motion=motion, initial_joint_angles=POSTURE, simulation=simulation, camera=camera, seed=3)

@@ -14,7 +14,7 @@ from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.solvers.initial_guess import initialize_free_effects
+from yid_ocp.solvers.initial_guess import unknowns_with_active_effects
 
 H, STEPS, STD = 0.01, 150, 0.02
 JOINTS = ("shoulder", "elbow")
@@ -66,25 +66,27 @@ def test_from_its_neutral_value_a_spring_that_would_have_to_push_stays_at_zero(m
 
 def test_an_amplitude_seen_at_its_neutral_value_begins_there(moved):
     problem = moved("joint_viscous", {"b": 0.3}, ("b",))
-    np.testing.assert_array_equal(initialize_free_effects(problem, problem.initial_unknowns), problem.initial_unknowns)
+    np.testing.assert_array_equal(
+        unknowns_with_active_effects(problem, problem.initial_unknowns), problem.initial_unknowns
+    )
     fixed = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ())
-    np.testing.assert_array_equal(initialize_free_effects(fixed, fixed.initial_unknowns), fixed.initial_unknowns)
+    np.testing.assert_array_equal(unknowns_with_active_effects(fixed, fixed.initial_unknowns), fixed.initial_unknowns)
 
 
 def test_an_effect_that_was_given_a_value_begins_there(moved):
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
     begun = problem.with_parameter_values({"joint_spring@elbow.stiffness": 2.0})
-    np.testing.assert_array_equal(initialize_free_effects(begun, begun.initial_unknowns), begun.initial_unknowns)
+    np.testing.assert_array_equal(unknowns_with_active_effects(begun, begun.initial_unknowns), begun.initial_unknowns)
 
 
 def test_a_start_that_cannot_be_rolled_out_is_drawn_back(moved, monkeypatch):
     problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
-    whole, plain = initialize_free_effects(problem, problem.initial_unknowns), problem.evaluate
+    whole, plain = unknowns_with_active_effects(problem, problem.initial_unknowns), problem.evaluate
 
     def stiff(x, derivatives=True, warm=None):
         found = plain(x, derivatives, warm)
         return found if x[1] < 0.6 * whole[1] else type(found)(np.inf, found.residual, None, False, "it snaps", ())
 
     monkeypatch.setattr(problem, "evaluate", stiff)
-    drawn = initialize_free_effects(problem, problem.initial_unknowns)
+    drawn = unknowns_with_active_effects(problem, problem.initial_unknowns)
     assert drawn[1] == pytest.approx(0.5 * whole[1])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import SolverError
-from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorBlock
-from yid_ocp.solvers.program_terms import LocalFunction, ProgramTerm, ResidualTerm, RidgeRegularization
+from yid_ocp.solvers.nonlinear_program import NonlinearProgram, _VectorBlock
+from yid_ocp.solvers.program_terms import LocalVariableFunction, ProgramTerm, ResidualTerm, RidgeRegularization
 
 # a chain of COUNT places: x_0, y_0, x_1, y_1, ... x_COUNT, with one shared unknown in front
 COUNT = 5
@@ -20,29 +20,32 @@ SIZE = 2 + 2 * COUNT
 def chain(use_compiler=False, threshold=math.inf, ridge=None):
     """x_{k+1} = x_k + d_k sin(y_k) a s, residuals of x between the places and of y itself."""
     v, d, s = ca.SX.sym("v", 4), ca.SX.sym("d", 1), ca.SX.sym("s", 1)
-    motion = LocalFunction(
+    motion = LocalVariableFunction(
         "motion", [v, d, s], ca.vertcat(v[3] - v[1] - d * ca.sin(v[2]) * v[0] * s, v[2] * v[0]), None, use_compiler
     )
     places = np.array([[0, 1 + 2 * k, 2 + 2 * k, 3 + 2 * k] for k in range(COUNT)])
     stages = ProgramTerm("motion", ("gap", "work"), motion, places, np.arange(COUNT)[:, None], np.array([COUNT]))
     one, two = ca.SX.sym("q", 1), ca.SX.sym("q", 2)
     none = ca.SX(0, 1)
-    square = LocalFunction("square", [one, none, none], one + 0.2 * one**2)
+    square = LocalVariableFunction("square", [one, none, none], one + 0.2 * one**2)
     at = np.arange(1, SIZE, 2)[:, None]
     seen = ProgramTerm("x", ("x",), square, at, np.zeros((len(at), 0), int), np.zeros(0, int))
     between = ca.DM(COUNT, COUNT + 1)
     for k in range(COUNT):
         between[k, k], between[k, k + 1] = 0.25, 0.75
     target, weight = COUNT + 1 + np.arange(COUNT), 2 * COUNT + 1 + np.arange(COUNT)
-    pair = LocalFunction("pair", [two, none, none], two[0] * two[1] - 0.3)
+    pair = LocalVariableFunction("pair", [two, none, none], two[0] * two[1] - 0.3)
     beside = ProgramTerm("y", ("y",), pair, np.array([[0, 2], [0, 4]]), np.zeros((2, 0), int), np.zeros(0, int))
     rng = np.random.default_rng(0)
     values = np.concatenate([rng.random(COUNT), [1.5], rng.random(COUNT), 1 + rng.random(COUNT)])
     states = np.arange(1, SIZE).reshape(1, -1)
-    variables = {"shared": VectorBlock(np.array([[0]]), ("a",), "N m"), "chain[one]": VectorBlock(states, ("x or y",))}
+    variables = {
+        "shared": _VectorBlock(np.array([[0]]), ("a",), "N m"),
+        "chain[one]": _VectorBlock(states, ("x or y",)),
+    }
     return NonlinearProgram(
         variables,
-        {"s": VectorBlock(np.array([[COUNT]]), ("s",))},
+        {"s": _VectorBlock(np.array([[COUNT]]), ("s",))},
         (stages,),
         (ResidualTerm(seen, between, weight, target, threshold), ResidualTerm(beside)),
         np.full(SIZE, -np.inf),

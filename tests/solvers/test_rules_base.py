@@ -209,7 +209,7 @@ def test_a_solver_that_needs_no_rollout_is_not_given_shorter_horizons(needs):
 
 @pytest.fixture(autouse=True)
 def weighted_as_made_up_problems_say(monkeypatch):
-    for name in ("whitened_at", "whitened_by_sensor_noise"):
+    for name in ("problem_whitened_at", "problem_whitened_by_sensor_noise"):
         monkeypatch.setattr(base, name, lambda problem, *at, name=name, **how: getattr(problem, name)(*at, **how))
 
 
@@ -220,7 +220,7 @@ class Disturbed(MadeUp):
         super().__init__(*arguments, **more)
         self.has_process_noise, self.frozen = True, [] if asked is None else asked
 
-    def whitened_at(self, x, warm=None):
+    def problem_whitened_at(self, x, warm=None):
         self.frozen.append((np.asarray(x).tolist(), warm))
         made = Disturbed(self._rows, self.initial_unknowns, asked=self.frozen)
         made.frozen_at = np.asarray(x).tolist()
@@ -324,7 +324,7 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
                 ok=ok, episode_predictions=("plain a", "plain b") if ok else ()
             ),
         )
-        return SimpleNamespace(has_process_noise=True, whitened_by_sensor_noise=lambda: plain)
+        return SimpleNamespace(has_process_noise=True, problem_whitened_by_sensor_noise=lambda: plain)
 
     fitted = solve(MadeUp(misfit(lambda x: 1.0)), Steps())
     assert replace(fitted, evaluation=smoothed, problem=known(True)).episode_predictions == ("plain a", "plain b")

@@ -9,8 +9,8 @@ import pytest
 from made_problems import MadeUp, Steps, linear
 
 from yid_ocp.errors import DataError, SolverError
-from yid_ocp.inference.linearized_residual import is_stationary, predicted_reduction
-from yid_ocp.problem.unknown_vector import soft_logarithm
+from yid_ocp.inference.linearized_residual import is_stationary_point, predicted_cost_reduction
+from yid_ocp.problem.unknown_vector import soft_logarithm_and_slope
 from yid_ocp.solvers import GaussNewton, Status, solve
 from yid_ocp.solvers.gauss_newton import _PATIENCE_STEPS
 
@@ -19,7 +19,7 @@ def with_weak_prior(target, std=0.1, start=3.0):
     """One stiffness that the data want at a value, with the weak prior of a problem."""
 
     def rows(x, duration):
-        value, slope = soft_logarithm(x / start)
+        value, slope = soft_logarithm_and_slope(x / start)
         spread = math.log(10.0)
         residual = np.concatenate([(x - target) / std, value / spread])
         return residual, np.array([[1 / std], [slope[0] / (spread * start)]])
@@ -42,9 +42,9 @@ def test_a_short_step_beside_a_steep_row_is_no_end():
         return np.array([10 * (x[0] - 1.0), wall]), np.array([[10.0, 0.0], [-1.0, 1e9]])
 
     problem = MadeUp(rows, (3.0, 1.0), lower=-np.inf)
-    assert not is_stationary(problem, np.array([3.0, 0.0]), problem.evaluate([3.0, 0.0]))
+    assert not is_stationary_point(problem, np.array([3.0, 0.0]), problem.evaluate([3.0, 0.0]))
     end = np.array([1.0, -2e-9])
-    assert is_stationary(problem, end, problem.evaluate(end))
+    assert is_stationary_point(problem, end, problem.evaluate(end))
     found = GaussNewton(max_iterations=3).minimize_cost(problem, np.array([3.0, 0.0]), None)
     assert found.status != Status.CONVERGED
 
@@ -64,7 +64,7 @@ def test_a_short_step_beside_a_steep_row_is_no_end():
 )
 def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(x, residual, expected):
     problem = MadeUp(lambda at, duration: (np.array(residual), np.eye(2)), (1.0, 1.0), upper=9.0, count=2)
-    assert is_stationary(problem, np.array(x), problem.evaluate(x)) is expected
+    assert is_stationary_point(problem, np.array(x), problem.evaluate(x)) is expected
 
 
 @pytest.mark.parametrize(
@@ -81,18 +81,20 @@ def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(x, resi
 )
 def test_no_step_longer_than_the_unknowns_size_counts(size, slope, residual, expected):
     problem = MadeUp(linear(slope, residual), lower=-np.inf, scales=(size,))
-    assert is_stationary(problem, np.zeros(1), problem.evaluate([0.0])) is expected
+    assert is_stationary_point(problem, np.zeros(1), problem.evaluate([0.0])) is expected
 
 
 def test_without_unknowns_a_search_is_at_its_end():
     none = MadeUp(linear(np.zeros((2, 0)), [3.0, 3.0]), ())
-    assert is_stationary(none, np.zeros(0), none.evaluate(np.zeros(0)))
+    assert is_stationary_point(none, np.zeros(0), none.evaluate(np.zeros(0)))
 
 
 def test_the_promise_of_a_step_is_the_fall_of_a_linear_models_cost():
     jacobian, residual, step = np.array([[1.0, 2.0], [0.5, -1.0]]), np.array([3.0, -1.0]), np.array([0.2, -0.4])
     after = residual + jacobian @ step
-    assert predicted_reduction(jacobian, residual, step) == pytest.approx(0.5 * (residual @ residual - after @ after))
+    assert predicted_cost_reduction(jacobian, residual, step) == pytest.approx(
+        0.5 * (residual @ residual - after @ after)
+    )
 
 
 def test_a_method_that_stops_short_has_not_converged_whatever_it_says():
@@ -114,14 +116,14 @@ def failing_beyond(limit):
 
 def test_a_horizon_too_short_for_a_filter_is_left_out():
     problem = MadeUp(failing_beyond(3.0), count=10)
-    whole = problem.truncated_to
+    whole = problem.truncated_to_duration
 
     def shortened(duration):
         if duration < 2.0:
             raise DataError("0.6 s of efforts are too short for a filter of 8 Hz")
         return whole(duration)
 
-    problem.truncated_to = shortened
+    problem.truncated_to_duration = shortened
     solver = Steps([[2.0]], [[2.0]])
     solution = solve(problem, solver)
     assert [duration for _, duration in solver.runs] == [2.5, 10.0]

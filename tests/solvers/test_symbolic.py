@@ -12,15 +12,19 @@ from small_problems import PENDULUM, STEPS, pendulum_step, taken
 
 import yid_ocp
 from yid_ocp.errors import SolverError
-from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise, without_input_errors
+from yid_ocp.inference.whitening import (
+    problem_whitened_at,
+    problem_whitened_by_sensor_noise,
+    problem_without_input_errors,
+)
 from yid_ocp.integrator.nlp_stage import nlp_stage
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
-from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorBlock
-from yid_ocp.solvers.program_terms import LocalFunction, ProgramTerm, ResidualTerm
-from yid_ocp.solvers.symbolic_transcription import transcribe, unknowns_from_program
+from yid_ocp.solvers.nonlinear_program import NonlinearProgram, _VectorBlock
+from yid_ocp.solvers.program_terms import LocalVariableFunction, ProgramTerm, ResidualTerm
+from yid_ocp.solvers.symbolic_transcription import problem_unknowns_from_program, transcribe
 
 TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
 CASES = {
@@ -52,7 +56,7 @@ def problem_of(folder, case, seeds=(1, 2), **more):
     names = ("elbow.damping", *springs, *(n for e in step.system.effects for n in e.parameters.names))
     recordings = [taken(step, seed) for seed in seeds]
     settings = ProblemOptions(path_cutoff=math.inf, **options | more)
-    return without_input_errors(EstimationProblem(step, recordings, names, settings))
+    return problem_without_input_errors(EstimationProblem(step, recordings, names, settings))
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -69,7 +73,7 @@ def rolled_out(problem, program, x):
     w[program.variables["theta"].index.ravel()] = x[:shared]
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
         state = result.rollout.state
-        own = x[problem.unknowns.recording_columns(i)[shared:]]
+        own = x[problem.unknowns.unknown_indices_of_recording(i)[shared:]]
         parts = {"q": state[:, :n].T, "p": state[:, n : 2 * n].T, "z": state[:, 2 * n :].T}
         parts |= {"lam": result.rollout.multipliers.T, "local": own[: len(problem.local_parameters), None]}
         if result.equilibrium is not None:
@@ -104,7 +108,7 @@ def test_along_a_rollout_it_has_the_problems_cost_residual_and_no_defects(proble
     assert np.abs(defects).max() < 1e-7
     if math.isinf(problem.options.huber_threshold):
         np.testing.assert_allclose(np.sort(residual.ravel()), np.sort(evaluation.residual), rtol=0, atol=1e-8)
-    np.testing.assert_allclose(unknowns_from_program(problem, program, w), x, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(problem_unknowns_from_program(problem, program, w), x, rtol=0, atol=1e-9)
 
 
 def test_its_reduced_gradient_is_the_problems(problem):
@@ -114,7 +118,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
     w, _ = rolled_out(problem, program, x)
     gradient, jacobian = values_at(program, w, program.grad_f, program.jac_g)
     own = [program.variables["theta"].index.ravel()] if problem.shared_parameters else []
-    rows, n = list(problem.predictor.estimated_state_indices), problem.step.sizes["n"]
+    rows, n = list(problem.predictor.estimated_initial_state_indices), problem.step.sizes["n"]
     for episode in problem.episodes:
         if problem.local_parameters:
             own.append(program.variables[f"local[{episode.name}]"].index.ravel())
@@ -135,7 +139,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
         ]
         count = len(problem.shared_parameters)
         for i, by in enumerate(begin):
-            at = problem.unknowns.recording_columns(i)[len(problem.unknowns.free_parameters) :]
+            at = problem.unknowns.unknown_indices_of_recording(i)[len(problem.unknowns.free_parameters) :]
             expected[:count] -= by[:, :count].T @ expected[at]
         assert n > 0
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
@@ -143,7 +147,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
 
 def test_the_program_and_condensing_have_one_solution(urdf_folder):
     """Of sensor noise alone, which is what condensing knows; the Hessian changes the way, not the end."""
-    problem = without_input_errors(problem_of(urdf_folder, "driven, proportional", seeds=(1,)))
+    problem = problem_without_input_errors(problem_of(urdf_folder, "driven, proportional", seeds=(1,)))
     tight = {"tol": 1e-12, "acceptable_iter": 0, "mu_init": 1e-12, "mu_target": 1e-15}
     condensed = MultipleShooting(condensing=True, node_interval=5, cost_tolerance=1e-12, step_tolerance=1e-10)
     solvers = (condensed, MultipleShooting(ipopt=tight), MultipleShooting(hessian="exact", ipopt=tight))
@@ -256,7 +260,7 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
         replace(
             s,
             value=y + size * 1e-4 * rng.standard_normal(y.shape),
-            weight=np.where(s.is_used, 1e4 / size, 0.0),
+            weight=np.where(s.used_output_mask, 1e4 / size, 0.0),
         )
         for s, y in zip(episode.measurements, plain.predicted_outputs, strict=True)
     )
@@ -265,8 +269,8 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     )
     episode = replace(episode, measurements=samples, torque=episode.torque + wrong + 1.5 * errors.torque_bias_std)
     problem = first.with_episodes([episode], ())
-    expected = whitened_at(problem, x).evaluate(x).cost
-    assert whitened_by_sensor_noise(problem).evaluate(x).cost > 3 * expected
+    expected = problem_whitened_at(problem, x).evaluate(x).cost
+    assert problem_whitened_by_sensor_noise(problem).evaluate(x).cost > 3 * expected
     program = transcribe(problem)
     arguments = program.solver_arguments
     theta = program.block("theta").index.ravel()
@@ -313,14 +317,14 @@ def test_a_motion_is_planned_with_the_same_stages(urdf_folder):
     moved = ProgramTerm(
         "step",
         one.residual_names,
-        LocalFunction("step", [v, none, one.theta], one.residual, slopes),
+        LocalVariableFunction("step", [v, none, one.theta], one.residual, slopes),
         np.hstack([states[:-1], states[1:], torques]),
         nothing,
         np.arange(len(theta)),
     )
     u = ca.SX.sym("u")
     effort = ProgramTerm(
-        "effort", ("u",), LocalFunction("effort", [u, none, none], 0.1 * u), torques, nothing, np.zeros(0, int)
+        "effort", ("u",), LocalVariableFunction("effort", [u, none, none], 0.1 * u), torques, nothing, np.zeros(0, int)
     )
     start, end = np.zeros(4), np.array([0.6, 0.0, 0.0, 0.0])
     rest = EquilibriumSolver(step).solve([0.0], theta)
@@ -332,7 +336,7 @@ def test_a_motion_is_planned_with_the_same_stages(urdf_folder):
         lower[at] = upper[at] = state
     lower[torques], upper[torques] = -8.0, 8.0
     program = NonlinearProgram(
-        {"q": VectorBlock(states[:, :2].T, PENDULUM), "u": VectorBlock(torques.T, ("shoulder",), "N m")},
+        {"q": _VectorBlock(states[:, :2].T, PENDULUM), "u": _VectorBlock(torques.T, ("shoulder",), "N m")},
         {},
         (moved,),
         (ResidualTerm(effort),),

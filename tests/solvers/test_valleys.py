@@ -35,7 +35,7 @@ def disturbed(start):
 
 def test_a_search_that_ends_in_the_wrong_valley_goes_on_from_the_other(monkeypatch):
     problem = disturbed(1.3)
-    monkeypatch.setattr(base, "whitened_at", lambda problem, x, warm=None, rounds=1: problem)
+    monkeypatch.setattr(base, "problem_whitened_at", lambda problem, x, warm=None, rounds=1: problem)
     # no other reason to start again
     monkeypatch.setattr(base, "_good_fit", lambda *_: True)
     monkeypatch.setattr(base, "_doubtful", lambda *_: np.zeros(1, bool))

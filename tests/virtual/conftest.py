@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 from virtual_examples import SEEDS, SYSTEMS, TRUTH, Runs
 
-from yid_ocp.virtual.joint_motion import random_multisine
+from yid_ocp.virtual.joint_motion import random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
 
 
@@ -15,7 +15,7 @@ def runs() -> Runs:
 
     @cache
     def run(arms: int, step: float, duration: float = 2.0) -> SimulationResult:
-        motion = random_multisine(SYSTEMS[arms], TRUTH, seed=SEEDS[arms])
+        motion = random_multisine_motion(SYSTEMS[arms], TRUTH, seed=SEEDS[arms])
         return simulate_in_mujoco(SYSTEMS[arms], TRUTH, motion, SimulationOptions(duration, time_step=step))
 
     return run

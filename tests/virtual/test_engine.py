@@ -10,11 +10,11 @@ import pytest
 from virtual_examples import SYSTEMS, TRUTH, Runs
 
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.model.kinematics import forward_kinematics, rigid_body_derivatives
-from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.joint_motion import grasping_joint_angles, random_multisine
+from yid_ocp.virtual.joint_motion import grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import (
     MujocoScene,
@@ -50,7 +50,7 @@ def test_starts_in_static_equilibrium_of_the_symbolic_equations(runs: Runs, arms
     run, system = runs(arms, 1e-4), SYSTEMS[arms]
     q, u = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("u", len(system.driven))
     kinematics = forward_kinematics(system.mechanism, q)
-    rigid = rigid_body_derivatives(kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), system.gravity)
+    rigid = rigid_body_lagrangian_derivatives(kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), system.gravity)
     force = rigid.lagrangian_by_q - ca.gradient(system.elastic_energy(q), q) + system.input_force(u, q, q)
     jacobian = ca.jacobian(system.constraint_residual(kinematics), q)
     function = ca.Function("statics", [q, u, system.parameters.symbols], [force, jacobian])
@@ -76,7 +76,7 @@ def test_other_grasps_hold(kind: str) -> None:
     turned = ca.SX(ca.densify(ca.Function("r", [q], [rotation])(start)))
     grasp = Grasp("left", "left_gripper", "w_T2", kind, held_orientation=turned)  # type: ignore[arg-type]
     system = replace(system, grasps=(grasp,))
-    motion = random_multisine(system, TRUTH, seed=1, initial_joint_angles=posture)
+    motion = random_multisine_motion(system, TRUTH, seed=1, initial_joint_angles=posture)
     run = simulate_in_mujoco(
         system, TRUTH, motion, SimulationOptions(0.8, time_step=2e-4), initial_joint_angles=posture
     )
@@ -85,12 +85,12 @@ def test_other_grasps_hold(kind: str) -> None:
     )
     assert np.abs(run.q[-1] - run.q[0]).max() > 0.02
     residual = np.array([np.array(phi(row)).ravel() for row in run.q])
-    assert residual.shape[1] == grasp.n_equations
+    assert residual.shape[1] == grasp.n_constraint_equations
     assert np.abs(residual).max() < 1e-4
 
 
 def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
-    motion = random_multisine(SYSTEMS[1], TRUTH, seed=1)
+    motion = random_multisine_motion(SYSTEMS[1], TRUTH, seed=1)
 
     def run(**choices: Any) -> SimulationResult:
         return simulate_in_mujoco(SYSTEMS[1], TRUTH, motion, SimulationOptions(0.4, time_step=2.5e-4, **choices))
@@ -129,7 +129,7 @@ def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) 
 
 def test_simulations_that_do_not_fit_are_refused() -> None:
     system = SYSTEMS[1]
-    motion = random_multisine(system, seed=0)
+    motion = random_multisine_motion(system, seed=0)
     with pytest.raises(ModelError, match="driven joints"):
         simulate_in_mujoco(replace(system, driven=system.driven[:3], prescribed=system.driven[3:]), None, motion)
 
@@ -138,7 +138,7 @@ def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
     coarse = SYSTEMS[2]
     fine = System.build(
         read_urdf("package:baxter", joints=list(coarse.driven)),
-        objects=[(y_object(links=8), None, None)],
+        objects=[(foam_y_object(links=8), None, None)],
         grasps=coarse.grasps,
         driven=coarse.driven,
         damping=0.1,
@@ -189,6 +189,6 @@ def test_a_state_that_is_lost_is_told(later: bool, said: str, tmp_path: Path, mo
                 data.qfrc_passive[:] += 1e14
 
     system = SYSTEMS[1]
-    motion = random_multisine(system, TRUTH, seed=1)
+    motion = random_multisine_motion(system, TRUTH, seed=1)
     with pytest.raises(ModelError, match=said):
         simulate_in_mujoco(system, TRUTH, motion, SimulationOptions(0.1), injected=Thrown())

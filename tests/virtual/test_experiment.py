@@ -21,7 +21,7 @@ from yid_ocp.virtual.experiment import (
     baxter_foam_y_system,
     run_virtual_experiment,
 )
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
@@ -31,7 +31,7 @@ DEFAULTS = Path(yid_ocp.__file__).parent / "data" / "defaults"
 
 def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
     system, run = SYSTEMS[1], runs(1, 2e-4, 5.0)
-    motion = random_multisine(system, TRUTH, seed=SEEDS[1])
+    motion = random_multisine_motion(system, TRUTH, seed=SEEDS[1])
     simulation = SimulationOptions(time_step=2e-4)
     recording = run_virtual_experiment(system, TRUTH, VirtualExperiment(motion=motion, simulation=simulation, seed=5))
     joints = recording.joints
@@ -60,7 +60,7 @@ def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
 
 def test_sensors_have_their_own_noise() -> None:
     system = SYSTEMS[1]
-    motion = random_multisine(system, TRUTH, seed=1)
+    motion = random_multisine_motion(system, TRUTH, seed=1)
 
     often_hidden = PointCamera(hidden_probability=0.5)
 
@@ -82,7 +82,7 @@ def test_sensors_have_their_own_noise() -> None:
 
 def test_torques_are_off_by_a_constant_and_by_white_noise() -> None:
     system = SYSTEMS[1]
-    motion = random_multisine(system, TRUTH, seed=1)
+    motion = random_multisine_motion(system, TRUTH, seed=1)
     white = (0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.14)
 
     def joints(noise: ArmSensorNoise, seed: int = 1) -> JointGroup:
@@ -112,7 +112,7 @@ def test_torques_are_off_by_a_constant_and_by_white_noise() -> None:
 
 
 def test_experiments_that_do_not_fit_are_refused() -> None:
-    experiment = VirtualExperiment(random_multisine(SYSTEMS[1], seed=0), camera=PointCamera(("w_T9",)))
+    experiment = VirtualExperiment(random_multisine_motion(SYSTEMS[1], seed=0), camera=PointCamera(("w_T9",)))
     with pytest.raises(ConfigError, match="w_T9"):
         run_virtual_experiment(SYSTEMS[1], None, experiment)
     brief = SimulationOptions(0.1, time_step=1e-3)
@@ -142,7 +142,7 @@ def test_recordings_are_reproducible(kind: str, clean: Path) -> None:
     torques, system = getattr(made, kind), SYSTEMS[2]
     posture = grasping_joint_angles(system, made.TRUTH, offsets=made.OFFSETS[2])
     excitation = MultisineOptions(gripper_travel=torques.travel[2], shake_torque_rms=torques.shake)
-    motion = random_multisine(
+    motion = random_multisine_motion(
         system,
         made.TRUTH,
         seed=torques.motion_seeds[2, "estimate"],
@@ -161,4 +161,6 @@ def test_recordings_are_reproducible(kind: str, clean: Path) -> None:
     white, offset = np.array(2 * torques.white or (1e-6,)), np.array(2 * torques.offset or (1e-6,))
     assert np.all(error.std(axis=0) < 1.5 * white)
     assert np.all(np.abs(error.mean(axis=0)) < 4 * offset)
-    np.testing.assert_allclose(joints.position[:101], run.q[:, list(system.driven_indices)], rtol=0, atol=1.5e-3)
+    np.testing.assert_allclose(
+        joints.position[:101], run.q[:, list(system.driven_coordinate_indices)], rtol=0, atol=1.5e-3
+    )

@@ -14,18 +14,18 @@ from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import MidpointState
-from yid_ocp.virtual.experiment import VirtualExperiment, with_sensor_error
+from yid_ocp.virtual.experiment import VirtualExperiment, recording_with_sensor_error
 from yid_ocp.virtual.injected import (
     _FORCE_KINDS,
     _MUJOCO_MODEL_KINDS,
     _SENSOR_ERROR_KINDS,
-    INJECTABLE_KINDS,
+    INJECTABLE_EFFECT_KINDS,
     OUT_OF_LIBRARY_EFFECTS,
     InjectedEffect,
     _InjectedTerms,
-    run_injected_experiment,
+    run_experiment_with_effects,
 )
-from yid_ocp.virtual.joint_motion import random_multisine
+from yid_ocp.virtual.joint_motion import random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
@@ -150,14 +150,14 @@ def reading(duration=1.0) -> Recording:
 )
 def test_errors_of_joint_sensors_are_those_of_the_table(kind, values, channel, expected):
     true = reading()
-    wrong = getattr(with_sensor_error(true, SYSTEM, kind, "left_s1", values).joints, channel)
+    wrong = getattr(recording_with_sensor_error(true, SYSTEM, kind, "left_s1", values).joints, channel)
     assert wrong[:, 1] == pytest.approx(expected(true.joints.position[:, 1], true.joints.effort[:, 1]))
     assert wrong[:, 2] == pytest.approx(getattr(true.joints, channel)[:, 2])
 
 
 def test_what_is_recorded_late_acts_later():
     recording = reading()
-    wrong = with_sensor_error(recording, SYSTEM, "effort_delay", "left", {"delay": 0.05})
+    wrong = recording_with_sensor_error(recording, SYSTEM, "effort_delay", "left", {"delay": 0.05})
     assert wrong.joints.effort[:-6] == pytest.approx(recording.joints.effort[5:-1], abs=1e-9)
 
 
@@ -166,7 +166,7 @@ def test_errors_of_cameras_are_those_of_the_table():
     true = recording.points[0].position
 
     def seen(kind, **values):
-        return with_sensor_error(recording, SYSTEM, kind, "camera", values).points[0]
+        return recording_with_sensor_error(recording, SYSTEM, kind, "camera", values).points[0]
 
     assert seen("camera_translation", x=0.01, y=0.0, z=-0.01).position == pytest.approx(
         true + np.array([0.01, 0.0, -0.01])
@@ -181,25 +181,25 @@ def test_errors_of_cameras_are_those_of_the_table():
 
 
 def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():
-    motion = random_multisine(SYSTEM, TRUTH, seed=1)
+    motion = random_multisine_motion(SYSTEM, TRUTH, seed=1)
     experiment = VirtualExperiment(motion, simulation=SimulationOptions(0.3, time_step=2e-4), seed=2)
     hysteresis = InjectedEffect("hysteresis", "T1", {"stiffness": 9.0, "yield_angle": 0.1})
-    clean = run_injected_experiment(SYSTEM, TRUTH, (), experiment)
-    pushed = run_injected_experiment(SYSTEM, TRUTH, [hysteresis], experiment)
-    again = run_injected_experiment(SYSTEM, TRUTH, (), experiment)
+    clean = run_experiment_with_effects(SYSTEM, TRUTH, (), experiment)
+    pushed = run_experiment_with_effects(SYSTEM, TRUTH, [hysteresis], experiment)
+    again = run_experiment_with_effects(SYSTEM, TRUTH, (), experiment)
     assert np.abs(pushed.joints.effort - clean.joints.effort).max() > 1e-3
     assert again.joints.effort == pytest.approx(clean.joints.effort, abs=0)
 
 
 def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
-    assert len(set(INJECTABLE_KINDS)) == len(INJECTABLE_KINDS)
-    assert set(INJECTABLE_KINDS) <= set(EFFECTS)
+    assert len(set(INJECTABLE_EFFECT_KINDS)) == len(INJECTABLE_EFFECT_KINDS)
+    assert set(INJECTABLE_EFFECT_KINDS) <= set(EFFECTS)
     assert not set(OUT_OF_LIBRARY_EFFECTS) & set(EFFECTS)
     tested_elsewhere = {"rotor_inertia", "standard_linear_solid", "hysteresis", *TWINS}
     assert {label.partition("@")[0] for label in SIZES} | tested_elsewhere == {*_MUJOCO_MODEL_KINDS, *_FORCE_KINDS}
-    assert set(_SENSOR_ERROR_KINDS) <= set(INJECTABLE_KINDS)
+    assert set(_SENSOR_ERROR_KINDS) <= set(INJECTABLE_EFFECT_KINDS)
 
 
 def test_a_kind_that_cannot_be_done_is_refused():
     with pytest.raises(ConfigError, match="grasp_slip"):
-        run_injected_experiment(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])
+        run_experiment_with_effects(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])

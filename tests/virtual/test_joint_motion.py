@@ -8,8 +8,8 @@ import pytest
 from virtual_examples import SYSTEMS
 
 from yid_ocp.errors import ModelError
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 
 mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -32,7 +32,7 @@ def test_initial_posture_reaches_the_tubes_within_the_limits() -> None:
 
 
 def test_motion_starts_smoothly_and_is_drawn_from_the_seed() -> None:
-    motion = random_multisine(SYSTEMS[1], seed=3)
+    motion = random_multisine_motion(SYSTEMS[1], seed=3)
     assert all(np.abs(part).max() == 0.0 for part in motion.offset_and_derivatives(0.0))
     assert np.all((motion.frequency >= 0.2) & (motion.frequency <= 2.0))
     h = 1e-4
@@ -40,14 +40,14 @@ def test_motion_starts_smoothly_and_is_drawn_from_the_seed() -> None:
         before, now, after = (motion.offset_and_derivatives(t + shift) for shift in (-h, 0.0, h))
         np.testing.assert_allclose((after[0] - before[0]) / (2 * h), now[1], atol=1e-6)
         np.testing.assert_allclose((after[1] - before[1]) / (2 * h), now[2], atol=1e-4)
-    np.testing.assert_array_equal(random_multisine(SYSTEMS[1], seed=3).amplitude, motion.amplitude)
-    assert not np.array_equal(random_multisine(SYSTEMS[1], seed=4).amplitude, motion.amplitude)
+    np.testing.assert_array_equal(random_multisine_motion(SYSTEMS[1], seed=3).amplitude, motion.amplitude)
+    assert not np.array_equal(random_multisine_motion(SYSTEMS[1], seed=4).amplitude, motion.amplitude)
 
 
 def test_shaking_takes_the_torque_that_was_asked_for_and_leaves_the_travel_alone() -> None:
     system = SYSTEMS[1]
-    calm = random_multisine(system, seed=3)
-    rough = random_multisine(
+    calm = random_multisine_motion(system, seed=3)
+    rough = random_multisine_motion(
         system,
         seed=3,
         excitation=MultisineOptions(shake_torque_rms=0.5, shake_frequency_band=(5.0, 8.0), max_shake_speed=0.2),
@@ -58,10 +58,12 @@ def test_shaking_takes_the_torque_that_was_asked_for_and_leaves_the_travel_alone
     assert np.all((omega >= 2 * np.pi * 5.0) & (omega <= 2 * np.pi * 8.0))
     q = ca.SX.sym("q", system.n_coordinates)
     tree, zero = system.mechanism.with_numeric_values(), ca.SX(ca.DM.zeros(system.n_coordinates))
-    mass = mass_matrix(rigid_body_derivatives(forward_kinematics(tree, q), zero, zero[:3]), tree)
+    mass = mass_matrix(rigid_body_lagrangian_derivatives(forward_kinematics(tree, q), zero, zero[:3]), tree)
     posture = grasping_joint_angles(system)
     start = [posture.get(name, 0.0) for name in system.mechanism.joint_names]
-    inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass])(start))))[list(system.driven_indices)]
+    inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass])(start))))[
+        list(system.driven_coordinate_indices)
+    ]
     torque = inertia[:, None] * rough.amplitude[:, 3:] * omega**2
     np.testing.assert_allclose(np.sqrt((torque[:4] ** 2).sum(1) / 2), 0.5, rtol=1e-9)
     speed = rough.amplitude[:, 3:] * omega

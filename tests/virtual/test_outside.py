@@ -20,9 +20,9 @@ from yid_ocp.virtual.injected import (
     _WARM_UP_TIME,
     InjectedEffect,
     _InjectedTerms,
-    run_injected_experiment,
+    run_experiment_with_effects,
 )
-from yid_ocp.virtual.joint_motion import random_multisine
+from yid_ocp.virtual.joint_motion import random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
@@ -164,10 +164,10 @@ def test_one_way_damping_brakes_one_way_only():
 
 def test_one_way_damping_of_a_light_branch_asks_nothing_of_the_arm():
     """1 N m s/rad is some hundred times what an explicit step bears there: the arm would be told to hold 1000 N m."""
-    motion = random_multisine(SYSTEM, TRUTH, seed=1)
+    motion = random_multisine_motion(SYSTEM, TRUTH, seed=1)
     experiment = VirtualExperiment(motion, simulation=SimulationOptions(0.3, time_step=2e-4), seed=2)
     clean, braked = (
-        run_injected_experiment(SYSTEM, TRUTH, effects, experiment).joints.effort
+        run_experiment_with_effects(SYSTEM, TRUTH, effects, experiment).joints.effort
         for effects in ((), [InjectedEffect("one_way_damping", "T3", {"size": 1.0})])
     )
     assert 1e-4 < np.abs(braked - clean).max() < 5.0

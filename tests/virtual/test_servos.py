@@ -8,15 +8,15 @@ import pytest
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
-from yid_ocp.export.models import effect_support, parameter_support
+from yid_ocp.export.models import effect_format_support, parameter_format_support
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, PositionServoOptions
+from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, PositionServoOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
-from yid_ocp.virtual.injected import InjectedEffect, run_injected_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
+from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_replay import replay_in_mujoco
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
@@ -41,13 +41,13 @@ def arm() -> System:
 def played(arm: System, *effects: InjectedEffect) -> Recording:
     excitation = MultisineOptions(max_joint_speed=2.0, duration=1.0, frequency_band=(0.5, 2.0))
     experiment = VirtualExperiment(
-        motion=random_multisine(arm, VALUES, seed=4, initial_joint_angles=POSTURE, excitation=excitation),
+        motion=random_multisine_motion(arm, VALUES, seed=4, initial_joint_angles=POSTURE, excitation=excitation),
         initial_joint_angles=POSTURE,
         simulation=SimulationOptions(1.0, sample_rate=50.0, time_step=1e-4),
         arm_noise=ArmSensorNoise(position_std=1e-6, velocity_std=1e-6),
         camera=PointCamera(point_std=1e-6, frame_rate=50.0, has_dropouts=False, hidden_probability=0.0, pose=np.eye(4)),
     )
-    return run_injected_experiment(arm, VALUES, effects, experiment)
+    return run_experiment_with_effects(arm, VALUES, effects, experiment)
 
 
 @pytest.fixture(scope="module")
@@ -113,10 +113,10 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(arm: System) -> None:
     effects += [("servo_saturation", "lift", {"limit": 0.9}), ("backlash", "elbow", {"width": 0.01})]
     system = arm.with_effects([make_effect(kind, place, arm, values) for kind, place, values in effects])
     values = dict(zip(system.parameters.names, system.parameters.vector(VALUES), strict=True))
-    said = effect_support(system, values, "mjcf")
+    said = effect_format_support(system, values, "mjcf")
     assert [said[f"{kind}@{place}"].status for kind, place, _ in effects] == ["native"] * 3 + ["not representable"]
     for form, status in (("mjcf", "native"), ("urdf", "not representable"), ("sdf", "not representable")):
-        own = parameter_support(system, effect_support(system, values, form), form)
+        own = parameter_format_support(system, effect_format_support(system, values, form), form)
         assert {own[f"wrist_flex.servo_{name}"].status for name in ("gain", "damping", "delay", "torque_limit")} == {
             status
         }
@@ -125,7 +125,7 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(arm: System) -> None:
     pan, lift = model.actuator("pan"), model.actuator("lift")
     assert (pan.gainprm[0], pan.biasprm[1], pan.biasprm[2]) == pytest.approx((32.0, -32.0, -1.6))
     assert model.actuator_delay[pan.id] == pytest.approx(0.045)
-    limit = (3.0**-TORQUE_LIMIT_POWER + 0.9**-TORQUE_LIMIT_POWER) ** (-1 / TORQUE_LIMIT_POWER)
+    limit = (3.0**-TORQUE_SATURATION_EXPONENT + 0.9**-TORQUE_SATURATION_EXPONENT) ** (-1 / TORQUE_SATURATION_EXPONENT)
     assert lift.forcerange == pytest.approx([-limit, limit])
 
 

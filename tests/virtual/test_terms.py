@@ -12,10 +12,10 @@ from virtual_examples import assert_same_mechanics
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ModelError
-from yid_ocp.export.models import effect_support
+from yid_ocp.export.models import effect_format_support
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.virtual.mjcf import ParameterEvaluator, compile_mjcf, joint_dynamics, mujoco_xml
+from yid_ocp.virtual.mjcf import ParameterEvaluator, compile_mjcf, joint_dynamics_terms, mujoco_xml
 
 mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -103,16 +103,16 @@ def test_mechanics_equals_the_symbolic_one(system: System, kind: str) -> None:
 @pytest.mark.parametrize("kind", [*MECHANICAL, *OTHERS])
 def test_what_is_said_of_it(system: System, kind: str) -> None:
     location, values, *status = (*MECHANICAL[kind], "native") if kind in MECHANICAL else OTHERS[kind]
-    [said] = effect_support(with_effect(system, kind, location, values), {}, "mjcf").values()
+    [said] = effect_format_support(with_effect(system, kind, location, values), {}, "mjcf").values()
     assert [said.status] == status
     neutral = with_effect(system, kind, location, {})
-    assert effect_support(neutral, {}, "mjcf")[f"{kind}@{location}"].how.startswith("neutral")
+    assert effect_format_support(neutral, {}, "mjcf")[f"{kind}@{location}"].how.startswith("neutral")
 
 
 def test_what_has_no_term_is_refused(system: System) -> None:
     for kind, (location, values, status) in OTHERS.items():
         changed = with_effect(system, kind, location, values)
-        [said] = effect_support(changed, {}, "mjcf").values()
+        [said] = effect_format_support(changed, {}, "mjcf").values()
         motion = not said.how.startswith("what a sensor reads")
         if kind == "junction_compliance" or (status == "not representable" and motion):
             with pytest.raises(ModelError):
@@ -181,7 +181,7 @@ def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
 
 def test_dry_friction_is_friction_of_the_joint(system: System) -> None:
     changed = with_effect(system, "joint_coulomb", "elbow", {"tau_c": 0.4})
-    assert joint_dynamics(changed, ParameterEvaluator(changed))["elbow"].dry_friction == 0.4
+    assert joint_dynamics_terms(changed, ParameterEvaluator(changed))["elbow"].dry_friction == 0.4
     model = compile_mjcf(mujoco_xml(changed, emulate=True))
     assert model.dof_frictionloss[model.joint("elbow").id] == 0.4
 

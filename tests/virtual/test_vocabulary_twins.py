@@ -10,7 +10,7 @@ import pytest
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.diagnose import fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.refit import RefitModel, refit_with_effects
+from yid_ocp.diagnosis.refit import RefittedModel, refit_with_effects
 from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
@@ -21,7 +21,7 @@ from yid_ocp.model.rotations import homogeneous_transform
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment
-from yid_ocp.virtual.injected import InjectedEffect, _InjectedTerms, run_injected_experiment
+from yid_ocp.virtual.injected import InjectedEffect, _InjectedTerms, run_experiment_with_effects
 from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
@@ -46,7 +46,7 @@ def recorded(effects: list[InjectedEffect], seed: int = 1, duration: float = 1.6
     noise = ArmSensorNoise(position_std=5e-5, velocity_std=1e-3, effort_std=0.0)
     simulation = SimulationOptions(duration, time_step=2.5e-4)
     experiment = VirtualExperiment(None, POSTURE, simulation, noise, camera=None, seed=seed)
-    return run_injected_experiment(arm(), {}, effects, experiment)
+    return run_experiment_with_effects(arm(), {}, effects, experiment)
 
 
 def fitted(kind: str, place: str, recording: Recording, mode: str, **start: float) -> dict[str, tuple[float, float]]:
@@ -118,7 +118,7 @@ def test_a_sensor_that_follows_the_effort_late_is_found() -> None:
     assert abs(there[0]) < 3 * there[1] + 0.003
 
 
-def refitted(effect: InjectedEffect) -> tuple[RefitModel, RefitModel]:
+def refitted(effect: InjectedEffect) -> tuple[RefittedModel, RefittedModel]:
     """The nominal fit of an arm that is moved as measured, and a refit from where its screening leads."""
     system = arm("prescribed")
     runs = [recorded([effect], seed, 1.0) for seed in (1, 2)]

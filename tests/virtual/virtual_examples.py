@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.model.flexible import Segment, flexible_object
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.system import MidpointState, System, floating_clamp
 from yid_ocp.virtual.experiment import baxter_foam_y_system
@@ -37,7 +37,7 @@ def assert_same_mechanics(system: System, values: dict[str, float]) -> None:
     """Mass matrix, bias and passive forces, and places of points are in MuJoCo what they are in symbols."""
     q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
     kinematics, none = forward_kinematics(system.mechanism, q), ca.SX(0, 1)
-    rigid = rigid_body_derivatives(kinematics, v, system.gravity)
+    rigid = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
     mass = mass_matrix(rigid, system.mechanism)
     bias = ca.jtimes(rigid.lagrangian_by_v, q, v) - rigid.lagrangian_by_q
     passive = system.viscous_force(v) - ca.gradient(system.elastic_energy(q), q)

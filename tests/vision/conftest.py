@@ -14,7 +14,7 @@ import pytest
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import DataError
-from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import System
 from yid_ocp.vision import (
     CameraScene,
@@ -57,7 +57,7 @@ def system(single_arm):
 @pytest.fixture(scope="session")
 def alone():
     """The Y without a robot."""
-    return System.build(objects=[(y_object(), None, None)])
+    return System.build(objects=[(foam_y_object(), None, None)])
 
 
 @pytest.fixture(scope="session")
@@ -69,11 +69,11 @@ def shape(system):
 def run(system):
     """Three seconds in MuJoCo."""
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
-    from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+    from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
     posture = grasping_joint_angles(system, TRUTH)
-    motion = random_multisine(
+    motion = random_multisine_motion(
         system, TRUTH, seed=1, initial_joint_angles=posture, excitation=MultisineOptions(gripper_travel=0.15)
     )
     return simulate_in_mujoco(
@@ -84,7 +84,7 @@ def run(system):
 @pytest.fixture(scope="session")
 def recording(system, run):
     rng = np.random.default_rng(5)
-    position = run.q[:, list(system.driven_indices)]
+    position = run.q[:, list(system.driven_coordinate_indices)]
     noisy = position + 2e-4 * rng.standard_normal(position.shape)
     return Recording(JointGroup(system.driven, run.t, noisy, position_std=2e-4), source="test", name="virtual")
 
@@ -104,7 +104,7 @@ def tracked(system, run, recording, shape):
         scene = CameraScene(system, "package:baxter")
         camera = VirtualCamera(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
         made = render_virtual_frames(scene, run.t, run.q, camera)
-        seen = made.sequence if frames is None else made.sequence.select_frames(frames)
+        seen = made.sequence if frames is None else made.sequence._select_frames(frames)
         chosen = replace(options or TrackOptions(), tracked_points=system.point_frames)
         found = track_object(scene, recording, seen, chosen)
         were = np.array([shape.points_at(made.true_configuration_at(t)) for t in found.t])

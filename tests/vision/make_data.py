@@ -13,7 +13,7 @@ import numpy as np
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.virtual.experiment import baxter_foam_y_system
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.vision import (
     CameraScene,
@@ -26,7 +26,7 @@ from yid_ocp.vision import (
     write_frame_folder,
 )
 from yid_ocp.vision.fit import ShapeFitter
-from yid_ocp.vision.point_cloud import ObjectRegion, is_not_outlier, voxel_averages
+from yid_ocp.vision.point_cloud import ReachableObjectRegion, is_statistical_inlier, voxel_averages
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes, numeric_mechanism
 
 FOLDER = Path(__file__).parent / "data"
@@ -36,7 +36,7 @@ VOXEL = 0.011
 def main() -> None:
     system = baxter_foam_y_system(1)
     posture = grasping_joint_angles(system)
-    motion = random_multisine(
+    motion = random_multisine_motion(
         system, seed=1, initial_joint_angles=posture, excitation=MultisineOptions(gripper_travel=0.15)
     )
     run = simulate_in_mujoco(
@@ -46,13 +46,13 @@ def main() -> None:
     made = render_virtual_frames(CameraScene(system, "package:baxter"), run.t, run.q, camera)
     tree = numeric_mechanism(system)
     robot = ArticulatedSurfaces(tree, load_robot_meshes("package:baxter", tree))
-    region = ObjectRegion(system, CloudFilterOptions())
+    region = ReachableObjectRegion(system, CloudFilterOptions())
     pose, clouds = made.sequence.camera_pose, []
     for i, q in enumerate(made.true_configurations):
         points = made.sequence.load_world_cloud(i)
-        cloud = voxel_averages(points[region.membership_at(q, pose[:3, 3])(points)], VOXEL)
-        cloud = cloud.select(is_not_outlier(cloud, 12, 4.0))
-        cloud = cloud.select(~robot.is_within_distance(cloud.points, q, 0.03))
+        cloud = voxel_averages(points[region.membership_test_at(q, pose[:3, 3])(points)], VOXEL)
+        cloud = cloud.select(is_statistical_inlier(cloud, 12, 4.0))
+        cloud = cloud.select(~robot.is_within_surface_distance(cloud.points, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])
     write_frame_folder(FrameSequence.from_clouds(made.capture_times, clouds, pose), FOLDER / "frames")
     names = system.driven

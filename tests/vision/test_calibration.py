@@ -13,21 +13,21 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import CameraCalibrationOptions, CameraClockOptions, CameraIntrinsics, look_at_pose
 from yid_ocp.vision.calibration import (
     calibrate_camera,
-    calibration_as_given,
-    estimate_stamp_delay,
-    is_stamped_late,
+    calibration_without_estimation,
+    estimate_excess_stamp_delay,
+    is_stamp_delay_significant,
 )
 from yid_ocp.vision.camera_registration import (
+    CAMERA_STATE_SIZE,
     CLOCK_DRIFT_INDEX,
     CLOCK_OFFSET_INDEX,
     DEPTH_SCALE_INDEX,
-    STATE_SIZE,
     TRANSLATION_SLICE,
     ArmSurface,
     CalibrationFrame,
     CameraState,
     _CalibrationEquations,
-    evaluate_robust_cost,
+    quadratic_robust_cost,
 )
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
 
@@ -117,9 +117,9 @@ def clean(robot):
 
 def displaced(found, true):
     """By how much, and in how many standard deviations, points of the world are off, shape (N, 3)."""
-    error = found.camera_state.to_world(true.to_measured(POINTS)) - POINTS
+    error = found.camera_state.measured_to_world_points(true.world_to_measured_points(POINTS)) - POINTS
     nothing = np.zeros_like(POINTS)
-    return error, error / found.shared_point_std(
+    return error, error / found.point_std_from_calibration(
         POINTS, nothing, np.full(len(POINTS), found.camera_state.clock_reference_stamp)
     )
 
@@ -127,33 +127,37 @@ def displaced(found, true):
 def test_slopes_of_the_state_are_derivatives():
     rng = np.random.default_rng(0)
     state = CameraState(POSE, 1.03, 0.02, 0.1, 1e-3, 5.0)
-    seen = state.to_measured(POINTS)
-    assert np.allclose(state.to_world(seen), POINTS, atol=1e-12)
-    slopes = state.point_jacobian(POINTS)
+    seen = state.world_to_measured_points(POINTS)
+    assert np.allclose(state.measured_to_world_points(seen), POINTS, atol=1e-12)
+    slopes = state.world_point_jacobian(POINTS)
     for k in range(CLOCK_OFFSET_INDEX):
-        change = np.zeros(STATE_SIZE)
+        change = np.zeros(CAMERA_STATE_SIZE)
         change[k] = 1e-6
-        ahead, behind = state.with_change(change).to_world(seen), state.with_change(-change).to_world(seen)
+        ahead, behind = (
+            state.with_state_increment(change).measured_to_world_points(seen),
+            state.with_state_increment(-change).measured_to_world_points(seen),
+        )
         # the offset acts on measured depths, the factor on those with it: the same to first order in both
         assert np.allclose((ahead - behind) / 2e-6, slopes[:, :, k], atol=0.05 * np.abs(slopes[:, :, k]).max() + 1e-6)
-    change = 0.05 * rng.standard_normal(STATE_SIZE)
-    assert np.allclose(state.with_change(change).difference_from(state), change, atol=1e-12)
-    assert state.to_joint_time(7.0) == pytest.approx(7.0 - 0.1 - 2e-3)
+    change = 0.05 * rng.standard_normal(CAMERA_STATE_SIZE)
+    assert np.allclose(state.with_state_increment(change).difference_from(state), change, atol=1e-12)
+    assert state.stamps_to_joint_clock(7.0) == pytest.approx(7.0 - 0.1 - 2e-3)
 
 
 def test_slopes_of_the_rows_are_derivatives(robot):
     rng = np.random.default_rng(1)
     [cloud] = clouds(robot, [1.7], rng)
     state, arm = CameraState(POSE, clock_reference_stamp=1.2), arm_of(robot)
-    points = state.to_world(cloud)
-    glimpse = CalibrationFrame(1.7, cloud[arm.is_near_surface(points, 1.7, 0.02)][::7])
-    rows = arm.calibration_equations(state, glimpse, 0.1, along=True)
+    points = state.measured_to_world_points(cloud)
+    glimpse = CalibrationFrame(1.7, cloud[arm.is_near_moving_surface(points, 1.7, 0.02)][::7])
+    rows = arm.linearized_surface_distances(state, glimpse, 0.1, along=True)
     moved = {TRANSLATION_SLICE.start: 1e-4, TRANSLATION_SLICE.start + 2: 1e-4, 0: 1e-4, DEPTH_SCALE_INDEX: 1e-4}
     for k, step in {**moved, CLOCK_OFFSET_INDEX: 1e-3, CLOCK_DRIFT_INDEX: 1e-3}.items():
-        change = np.zeros(STATE_SIZE)
+        change = np.zeros(CAMERA_STATE_SIZE)
         change[k] = step
         ahead, behind = (
-            arm.calibration_equations(state.with_change(sign * change), glimpse, 0.1, along=True) for sign in (1, -1)
+            arm.linearized_surface_distances(state.with_state_increment(sign * change), glimpse, 0.1, along=True)
+            for sign in (1, -1)
         )
         if len(ahead.residuals) == len(behind.residuals) == len(rows.residuals):
             slope = (ahead.residuals - behind.residuals) / (2 * step)
@@ -190,7 +194,7 @@ def test_standard_deviations_are_honest(robot):
 
 def rows_of(errors, places):
     """Frames of points that all have the slope one by the first unknown."""
-    slope = np.eye(1, STATE_SIZE)
+    slope = np.eye(1, CAMERA_STATE_SIZE)
     return [
         _CalibrationEquations(
             np.repeat(slope, len(error), axis=0), error, np.column_stack([place, np.zeros((len(place), 3), int)])
@@ -209,7 +213,7 @@ def test_errors_alike_in_a_frame_or_on_a_patch_count_as_one_and_others_only_once
     by_patch = own * 0.1 + 1e-2 * rng.standard_normal(patches)[np.newaxis, places[0]]
 
     def variance(errors):
-        found = evaluate_robust_cost(rows_of(errors, places), 10.0)
+        found = quadratic_robust_cost(rows_of(errors, places), 10.0)
         return found.score_covariance[0, 0] / found.hessian[0, 0]
 
     alone = variance(own)
@@ -223,7 +227,7 @@ def test_one_frame_at_its_minimum_has_the_errors_of_its_patches():
     """The sum over a frame is zero at the minimum: without a least value its errors would seem to be none."""
     rng = np.random.default_rng(1)
     error = np.tile(1e-2 * rng.standard_normal(50), 2) * np.repeat([1.0, -1.0], 50)
-    found = evaluate_robust_cost(rows_of([error], [np.arange(100)]), 10.0)
+    found = quadratic_robust_cost(rows_of([error], [np.arange(100)]), 10.0)
     assert abs(found.gradient[0]) < 1e-9 * found.hessian[0, 0]
     assert found.score_covariance[0, 0] / found.hessian[0, 0] == pytest.approx(0.41, rel=0.3)
 
@@ -234,7 +238,7 @@ def test_drift_is_found_where_the_recording_is_long(robot, clean):
     assert std < 2.5e-4
     assert abs(found.camera_state.clock_drift - 1e-3) < 4 * std
     assert "drift" in found.message
-    assert np.abs(found.camera_state.to_joint_time(61.0 + 0.05 + 0.061) - 61.0) < 0.02
+    assert np.abs(found.camera_state.stamps_to_joint_clock(61.0 + 0.05 + 0.061) - 61.0) < 0.02
     short, _ = clean  # four seconds tell little of it
     assert math.sqrt(short.state_covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX]) > 2 * std
     assert "drift" not in short.message
@@ -251,10 +255,12 @@ def test_frames_stamped_late_do_not_pull(robot):
     [cloud] = clouds(robot, [2.6], rng)
     for by, expected in ((0.0, False), (0.15, True)):
         stamp = 2.6 + found.camera_state.clock_offset + by
-        points = found.camera_state.to_world(cloud)
-        own = estimate_stamp_delay(arm_of(robot), found.camera_state, stamp, points, rng, found.usual_square_distance)
+        points = found.camera_state.measured_to_world_points(cloud)
+        own = estimate_excess_stamp_delay(
+            arm_of(robot), found.camera_state, stamp, points, rng, found.usual_square_distance
+        )
         assert own.delay == pytest.approx(by, abs=max(4 * own.std, 0.01))
-        assert is_stamped_late(own, CameraClockOptions()) is expected
+        assert is_stamp_delay_significant(own, CameraClockOptions()) is expected
 
 
 def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):
@@ -265,7 +271,7 @@ def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):
         assert found.camera_state.depth_scale == 1.0
         assert ("contradicts" in found.message) == (shift > 0)
         assert np.abs(displaced(found, true)[1]).max() < 3
-        std = np.linalg.norm(found.shared_point_std(POINTS, np.zeros((3, 3)), np.zeros(3)), axis=1)
+        std = np.linalg.norm(found.point_std_from_calibration(POINTS, np.zeros((3, 3)), np.zeros(3)), axis=1)
         assert (std > before).all(), "a worse pose never gives smaller standard deviations"
         before = std
         assert abs(found.camera_state.clock_offset - true.clock_offset) < 0.02, "the clock is found all the same"
@@ -274,14 +280,14 @@ def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):
 def test_speed_and_time_enter_the_standard_deviation(clean):
     found, _ = clean
     about = found.camera_state.clock_reference_stamp
-    rest, fast = (found.shared_point_std(POINTS, np.full((3, 3), v), np.full(3, about)) for v in (0.0, 2.0))
+    rest, fast = (found.point_std_from_calibration(POINTS, np.full((3, 3), v), np.full(3, about)) for v in (0.0, 2.0))
     clock = math.sqrt(found.state_covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
     assert (fast > 0.8 * 2.0 * clock).all()
-    assert (found.shared_point_std(POINTS, np.full((3, 3), 2.0), np.full(3, about + 100)) > fast).all()
+    assert (found.point_std_from_calibration(POINTS, np.full((3, 3), 2.0), np.full(3, about + 100)) > fast).all()
     assert (rest > 0).all()
-    nothing = calibration_as_given(POSE, CameraClockOptions(initial_offset=0.1))
-    assert nothing.shared_point_std(POINTS, np.ones((3, 3)), np.zeros(3)) == pytest.approx(0.0)
-    assert nothing.camera_state.to_joint_time(1.0) == pytest.approx(0.9)
+    nothing = calibration_without_estimation(POSE, CameraClockOptions(initial_offset=0.1))
+    assert nothing.point_std_from_calibration(POINTS, np.ones((3, 3)), np.zeros(3)) == pytest.approx(0.0)
+    assert nothing.camera_state.stamps_to_joint_clock(1.0) == pytest.approx(0.9)
 
 
 def test_refused_where_the_arm_does_not_tell(robot):

@@ -30,7 +30,7 @@ def inner(image):
 @pytest.mark.parametrize("distance", [1.0, 2.0, 3.0])
 def test_noise_grows_with_the_square_of_distance(distance):
     camera = DepthCamera()
-    seen = inner(camera.simulate_depth_image(*wall(distance), np.random.default_rng(0)))
+    seen = inner(camera._simulate_depth_image(*wall(distance), np.random.default_rng(0)))
     disparity_std = np.hypot(camera.disparity_std, camera.disparity_step / np.sqrt(12.0))
     expected = distance**2 / (camera.intrinsics.fx * camera.baseline) * disparity_std
     assert np.nanstd(seen) == pytest.approx(expected, rel=0.15)
@@ -39,26 +39,26 @@ def test_noise_grows_with_the_square_of_distance(distance):
 
 def test_the_figures_at_two_metres():
     camera = replace(DepthCamera(), disparity_step=0.0)
-    assert np.nanstd(inner(camera.simulate_depth_image(*wall(2.0), np.random.default_rng(0)))) == pytest.approx(
+    assert np.nanstd(inner(camera._simulate_depth_image(*wall(2.0), np.random.default_rng(0)))) == pytest.approx(
         0.0058, rel=0.05
     )
-    steps = np.unique(DepthCamera().simulate_depth_image(*wall(2.0), np.random.default_rng(0)))
+    steps = np.unique(DepthCamera()._simulate_depth_image(*wall(2.0), np.random.default_rng(0)))
     assert np.diff(steps[np.isfinite(steps)]).mean() == pytest.approx(0.0115, rel=0.1)
 
 
 def test_what_is_out_of_range_or_seen_at_a_grazing_angle_is_lost():
     camera, rng = DepthCamera(), np.random.default_rng(0)
-    assert np.isnan(camera.simulate_depth_image(*wall(0.5), rng)).all()
-    assert np.isnan(camera.simulate_depth_image(*wall(np.inf), rng)).all()
-    assert np.isnan(camera.simulate_depth_image(np.full(SHAPE, 2.0), np.full(SHAPE, 0.05), rng)).all()
-    assert np.isfinite(inner(camera.simulate_depth_image(*wall(2.0), rng))).mean() > 0.97
+    assert np.isnan(camera._simulate_depth_image(*wall(0.5), rng)).all()
+    assert np.isnan(camera._simulate_depth_image(*wall(np.inf), rng)).all()
+    assert np.isnan(camera._simulate_depth_image(np.full(SHAPE, 2.0), np.full(SHAPE, 0.05), rng)).all()
+    assert np.isfinite(inner(camera._simulate_depth_image(*wall(2.0), rng))).mean() > 0.97
 
 
 def test_edges_have_holes_and_a_shadow_on_one_side():
     depth, cosine = wall(3.0)
     depth[:, 300:340] = 1.5
     camera = replace(DepthCamera(), loss_probability=0.0)
-    lost = np.isnan(camera.simulate_depth_image(depth, cosine, np.random.default_rng(1))).mean(axis=0)
+    lost = np.isnan(camera._simulate_depth_image(depth, cosine, np.random.default_rng(1))).mean(axis=0)
     shift = round(camera.intrinsics.fx * camera.baseline * (1 / 1.5 - 1 / 3.0))
     assert (lost[342 : 338 + shift] == 1).all(), "the projector's shadow"
     assert lost[345 + shift] == 0
@@ -69,7 +69,7 @@ def test_edges_have_holes_and_a_shadow_on_one_side():
 
 def test_outliers_are_as_many_as_asked_for():
     camera = replace(DepthCamera(), outlier_probability=0.2)
-    seen = inner(camera.simulate_depth_image(*wall(2.0), np.random.default_rng(0)))
+    seen = inner(camera._simulate_depth_image(*wall(2.0), np.random.default_rng(0)))
     assert (np.abs(seen - 2.0) > 0.04).mean() == pytest.approx(0.2 * 0.9, abs=0.02)
 
 
@@ -84,13 +84,13 @@ def test_frame_timing():
         late_fraction=0.1,
         late_stamp_delay=0.2,
     )
-    taken, stamps = when.sample_times_and_stamps(0.0, 300.0, rng)
+    taken, stamps = when._sample_times_and_stamps(0.0, 300.0, rng)
     assert len(taken) == pytest.approx(2000, rel=0.05)
     delay = stamps - taken - 0.05
     assert (delay > 0.15).mean() == pytest.approx(0.1, abs=0.03)
     assert np.std(delay[delay < 0.1]) == pytest.approx(0.002, rel=0.1)
     with pytest.raises(ConfigError, match="rate"):
-        FrameTiming(mean_rate=0.0).sample_times_and_stamps(0.0, 1.0, rng)
+        FrameTiming(mean_rate=0.0)._sample_times_and_stamps(0.0, 1.0, rng)
 
 
 def test_virtual_frames_are_the_same_every_time(system, run):

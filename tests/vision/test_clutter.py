@@ -13,8 +13,8 @@ from yid_ocp.vision import (
     FrameSequence,
     look_at_pose,
 )
-from yid_ocp.vision.point_cloud import has_any_colour
-from yid_ocp.vision.sequence_calibration import BackgroundPoints, group_foreign_objects
+from yid_ocp.vision.point_cloud import has_wanted_colour
+from yid_ocp.vision.sequence_calibration import BackgroundPoints, group_foreign_clusters
 from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
 from yid_ocp.vision.surface_meshes import extra_meshes_by_joint, numeric_mechanism
 
@@ -72,9 +72,9 @@ def test_an_empty_scene_is_a_background():
     wall = np.column_stack([rng.uniform(0, 1, (20000, 2)), 0.003 * rng.standard_normal(20000)])
     background = BackgroundPoints.from_static_points([wall[::2], wall[1::2]], 0.008, 0.006)
     asked = np.array([[0.5, 0.5, 0.01], [0.5, 0.5, 0.06], [2.0, 0.5, 0.0]])
-    assert background.contains(asked).tolist() == [True, False, False]
-    assert background.contains(asked, 0.05).tolist() == [True, True, False]
-    assert not BackgroundPoints().contains(asked).any()
+    assert background.is_near_background(asked).tolist() == [True, False, False]
+    assert background.is_near_background(asked, 0.05).tolist() == [True, True, False]
+    assert not BackgroundPoints().is_near_background(asked).any()
 
 
 def test_what_stands_still_is_a_background_but_for_the_object():
@@ -85,9 +85,9 @@ def test_what_stands_still_is_a_background_but_for_the_object():
     clouds = [np.concatenate([heap, rod, other]) for other in elsewhere]
     shape = TubeLinks(np.array([[[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]]]), np.array([0.02]), (0,), np.array([0.3]))
     background = BackgroundPoints.from_static_points(clouds, 0.016, 0.006, [shape] * 4, 0.045)
-    assert background.contains(heap).mean() > 0.95
-    assert not background.contains(rod).any()
-    assert not background.contains(elsewhere[0]).any()
+    assert background.is_near_background(heap).mean() > 0.95
+    assert not background.is_near_background(rod).any()
+    assert not background.is_near_background(elsewhere[0]).any()
 
 
 def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
@@ -104,14 +104,14 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
         (lambda t: [0.5, 0.3 * t, 0.5], True, "", "take it out of view"),
         (lambda t: [3.0, 0.3 * t, 0.5], True, "", "box_lower and box_upper"),
     ):
-        [thing] = group_foreign_objects(looked(place), 0.006, box_, links.__getitem__, False)
+        [thing] = group_foreign_clusters(looked(place), 0.006, box_, links.__getitem__, False)
         assert (thing.moving, thing.link, thing.frames) == (moving, link, 6)
         assert help_ in thing.text
-    [thing] = group_foreign_objects(looked(lambda t: [0.5, 0.3 * t, 0.5]), 0.006, box_, links.__getitem__, True)
+    [thing] = group_foreign_clusters(looked(lambda t: [0.5, 0.3 * t, 0.5]), 0.006, box_, links.__getitem__, True)
     assert "colour" in thing.text
     still = looked(lambda t: [0.5, 0.5, 0.5])
     for left_out in (False, True):  # what is done already is no advice
-        [thing] = group_foreign_objects(still, 0.006, box_, links.__getitem__, False, left_out)
+        [thing] = group_foreign_clusters(still, 0.006, box_, links.__getitem__, False, left_out)
         assert ("background_estimation: frames" in thing.text) != left_out
         assert "film the scene without object and robot" in thing.text
 
@@ -134,8 +134,8 @@ def test_extra_meshes_hang_on_links(system):
 def test_colours_in_light_and_shade():
     red = [200, 40, 30]
     seen = np.array([[200, 40, 30], [100, 18, 13], [40, 200, 30], [120, 120, 120], [0, 0, 0]])
-    assert has_any_colour(seen, [red], 0.2).tolist() == [True, True, False, False, False]
-    assert has_any_colour(seen, [red, [128, 128, 128]], 0.2).tolist() == [True, True, False, True, True]
+    assert has_wanted_colour(seen, [red], 0.2).tolist() == [True, True, False, False, False]
+    assert has_wanted_colour(seen, [red, [128, 128, 128]], 0.2).tolist() == [True, True, False, True, True]
 
 
 def test_a_colour_mask_needs_colours(alone):

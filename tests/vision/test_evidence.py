@@ -7,12 +7,12 @@ import pytest
 
 from yid_ocp.vision.frames import OcclusionMap
 from yid_ocp.vision.shape_evidence import (
-    CloudObservation,
+    ProcessedFrameCloud,
     TubeLinks,
-    assess_shape,
+    assess_shape_against_cloud,
     line_of_sight_residuals,
     nearest_surface_residuals,
-    tube_like_nodes_and_points,
+    tube_like_node_point_masks,
 )
 
 CAMERA = np.zeros(3)
@@ -41,8 +41,8 @@ def wall(x, y, z, step=0.006):
 def asked(points, behind=None, removed=None):
     everything = points if behind is None else np.concatenate([points, behind])
     view = OcclusionMap(everything, np.eye(4))
-    return assess_shape(
-        TUBES, CloudObservation(points, np.ones(len(points)), points[::50], CAMERA, view, removed), NEAR
+    return assess_shape_against_cloud(
+        TUBES, ProcessedFrameCloud(points, np.ones(len(points)), points[::50], CAMERA, view, removed), NEAR
     )
 
 
@@ -61,10 +61,10 @@ def test_a_gap_is_empty_unless_something_hides_it():
     points = np.concatenate([tube(high=-0.25), tube(low=-0.05)])
     bare = asked(points)
     assert bare.visibly_empty_fraction[0] == pytest.approx(0.6, abs=0.11)
-    assert bare.coverage(np.array([1.0, 0.0])) <= 0.5
+    assert bare.length_weighted_coverage(np.array([1.0, 0.0])) <= 0.5
     before = asked(points, wall((-0.2, 0.0), (-0.05, 0.05), 1.2))
     assert before.visibly_empty_fraction[0] == 0.0
-    assert before.coverage(np.array([1.0, 0.0])) == 1.0
+    assert before.length_weighted_coverage(np.array([1.0, 0.0])) == 1.0
     assert before.covered_fraction[0] <= 0.5
     left_out = asked(points, removed=lambda places: places[:, 0] < 0.0)
     assert left_out.visibly_empty_fraction[0] == 0.0
@@ -108,7 +108,7 @@ def test_points_on_a_swath_are_wider_than_the_tube():
 def test_tubes_are_slender_and_walls_are_not():
     points = np.concatenate([tube(), wall((-0.3, 0.3), (0.3, 0.6), 2.0)])
     nodes = np.array([[-0.1, 0.0, 1.985], [0.1, 0.0, 1.985], [0.0, 0.45, 2.0]])
-    thin, mine = tube_like_nodes_and_points(CloudObservation(points, np.ones(len(points)), nodes, CAMERA), RADIUS)
+    thin, mine = tube_like_node_point_masks(ProcessedFrameCloud(points, np.ones(len(points)), nodes, CAMERA), RADIUS)
     assert thin.tolist() == [True, True, False]
     assert mine.sum() == len(tube())
 

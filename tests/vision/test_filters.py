@@ -6,8 +6,8 @@ import pytest
 from yid_ocp.errors import ConfigError
 from yid_ocp.vision import CloudFilterOptions, ShapeFitOptions, SkeletonOptions, TrackOptions
 from yid_ocp.vision.point_cloud import (
-    ObjectRegion,
-    is_not_outlier,
+    ReachableObjectRegion,
+    is_statistical_inlier,
     voxel_averages,
     weighted_median,
 )
@@ -40,10 +40,10 @@ def test_outliers_go_and_the_surface_stays(share):
     wrong = rng.uniform(-0.6, 0.6, (round(count * share / (1 - share)), 3))
     cloud = voxel_averages(np.concatenate([plane, wrong]), 0.008)
     far = np.abs(cloud.points[:, 2]) > 0.05
-    stays = is_not_outlier(cloud, 12, 4.0)
+    stays = is_statistical_inlier(cloud, 12, 4.0)
     assert stays[~far].mean() > 0.85
     assert share == 0 or stays[far].mean() < 0.05
-    assert not is_not_outlier(cloud.select(np.arange(5)), 12, 4.0).any()
+    assert not is_statistical_inlier(cloud.select(np.arange(5)), 12, 4.0).any()
 
 
 def test_the_robot_goes_with_its_padding(system, run):
@@ -54,14 +54,14 @@ def test_the_robot_goes_with_its_padding(system, run):
     for q in (run.q[0], run.q[-1]):
         pose = robot.part_poses_at(q)[robot.part_joints.index(wrist)]
         surface = meshes[wrist].transformed(pose).vertices[::20]
-        assert robot.is_within_distance(surface, q, 0.01).all()
-        assert not robot.is_within_distance(surface + np.array([0.0, 0.0, 3.0]), q, 0.01).any()
+        assert robot.is_within_surface_distance(surface, q, 0.01).all()
+        assert not robot.is_within_surface_distance(surface + np.array([0.0, 0.0, 3.0]), q, 0.01).any()
     tip = run.point_positions[0][system.point_frames.index("w_T1")][None]
-    assert not robot.is_within_distance(tip, run.q[0], 0.03).any()
+    assert not robot.is_within_surface_distance(tip, run.q[0], 0.03).any()
 
 
 def test_where_the_object_can_be(system, run):
-    region = ObjectRegion(system, CloudFilterOptions()).membership_at(run.q[0], CAMERA)
+    region = ReachableObjectRegion(system, CloudFilterOptions()).membership_test_at(run.q[0], CAMERA)
     foot = np.array([0.85, 0.0, -0.93])
     inside = {
         "floor": foot + np.array([0.3, 0.0, 0.02]),
@@ -75,7 +75,7 @@ def test_where_the_object_can_be(system, run):
     box = CloudFilterOptions(
         box_lower=(0.5, -2.0, -2.0), box_upper=(2.0, 2.0, 0.0), floor_height=-0.9, max_depth_behind_base=None
     )
-    region = ObjectRegion(system, box).membership_at(run.q[0], CAMERA)
+    region = ReachableObjectRegion(system, box).membership_test_at(run.q[0], CAMERA)
     points = np.array([[0.85, 0.0, -0.1], [0.4, 0.0, -0.1], [0.85, 0.0, 0.1], [0.85, 0.0, -0.91]])
     assert region(points).tolist() == [True, False, False, False]
 

@@ -10,8 +10,8 @@ from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import ShapeFitOptions, ShapeFitter
 from yid_ocp.vision.fit import _NODE_RADIUS_FRACTION, _Task
-from yid_ocp.vision.initial_shapes import EndAnchor
-from yid_ocp.vision.shape_evidence import CloudObservation
+from yid_ocp.vision.initial_shapes import ObservedObjectEnd
+from yid_ocp.vision.shape_evidence import ProcessedFrameCloud
 
 CAMERA = np.array([2.6, 0.0, 0.45])
 NODES = 4  # of every link
@@ -27,7 +27,7 @@ def seen(shape, q, count=250, noise=0.0, seed=0):
     """Points on the visible side of every link, and nodes where the visible half's mean is."""
     rng = np.random.default_rng(seed)
     points, nodes = [], []
-    for (start, end), radius in zip(shape.tubes_at(q).link_ends, shape.link_radii, strict=True):
+    for (start, end), radius in zip(shape.tube_links_at(q).link_ends, shape.link_radii, strict=True):
         axis = (end - start) / np.linalg.norm(end - start)
         middle = 0.5 * (start + end)
         front = CAMERA - middle
@@ -42,7 +42,7 @@ def seen(shape, q, count=250, noise=0.0, seed=0):
     cloud = np.concatenate(points)
     sight = cloud - CAMERA
     cloud = cloud + noise * rng.standard_normal(len(cloud))[:, None] * sight / np.linalg.norm(sight, axis=1)[:, None]
-    return CloudObservation(cloud, np.ones(len(cloud)), np.array(nodes), CAMERA)
+    return ProcessedFrameCloud(cloud, np.ones(len(cloud)), np.array(nodes), CAMERA)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_a_shape_is_found_again(whole, seed):
     assert off(fit, whole, q) < 0.002
     assert fit.mean_distance < 0.001
     assert (fit.covered_fraction > 0.9).all()
-    assert fit.visible_coverage > 0.98
+    assert fit.visible_length_coverage > 0.98
     assert fit.is_point_seen.all()
     assert not fit.foreign_clusters
 
@@ -104,7 +104,7 @@ def test_wrong_points_hardly_matter(whole):
     fit = whole.fit_frame(mixed, 0 * q)
     assert off(fit, whole, q) < 0.006
     assert fit.mean_distance < 0.012
-    assert fit.visible_coverage > 0.95
+    assert fit.visible_length_coverage > 0.95
 
 
 def test_a_heap_beside_it_does_not_count_against_the_fit(alone, whole):
@@ -153,7 +153,7 @@ def test_it_starts_from_where_it_was(whole):
 def test_derivatives_agree_with_differences(system, shape, run):
     q = run.q[200].copy()
     sight = seen(shape, q, 20, noise=0.005)
-    seen_end = EndAnchor(3, np.array([0.6, 0.0, 0.8]), np.array([0.1, 0.2, 0.3]), 0.05)
+    seen_end = ObservedObjectEnd(3, np.array([0.6, 0.0, 0.8]), np.array([0.1, 0.2, 0.3]), 0.05)
     task = _Task(sight.points, sight.point_weights / 0.006**2, 1.0, 0.03, CAMERA, (seen_end,))
     q[list(shape.free_joints)] += 0.01 * np.random.default_rng(0).standard_normal(len(shape.free_joints))
     model = shape._quadratic(q, task)
@@ -178,7 +178,7 @@ def test_without_points_near_it_a_shape_has_its_priors_alone(shape, run):
 
 def test_what_cannot_be_fitted_is_said(whole, urdf_folder):
     nothing = np.empty((0, 3))
-    sight = CloudObservation(nothing, np.empty(0), nothing, CAMERA)
+    sight = ProcessedFrameCloud(nothing, np.empty(0), nothing, CAMERA)
     for error, message, ask in (
         (DataError, "no object", lambda: ShapeFitter(System.build(read_urdf(urdf_folder / "double_pendulum.urdf")))),
         (DataError, "no point", lambda: whole.fit_frame(sight, whole.rest_configuration)),

@@ -22,7 +22,7 @@ LENSES = {
 @pytest.mark.parametrize("name", LENSES)
 def test_a_ray_appears_at_its_pixel(name):
     lens = LENSES[name]
-    pixels = lens.project_to_pixels(lens.pixel_rays.reshape(-1, 3)).reshape(48, 64, 2)
+    pixels = lens._project_to_pixels(lens.pixel_rays.reshape(-1, 3)).reshape(48, 64, 2)
     u, v = np.meshgrid(np.arange(64), np.arange(48))
     assert np.abs(pixels - np.stack([u, v], axis=-1)).max() < 2e-3
 
@@ -34,11 +34,11 @@ def test_the_formula_of_ros():
     factor = 1 + k1 * square + k2 * square**2 + k3 * square**3
     u = 60 * (x * factor + 2 * p1 * x * y + p2 * (square + 2 * x**2)) + 31.0
     v = 61 * (y * factor + p1 * (square + 2 * y**2) + 2 * p2 * x * y) + 24.5
-    assert np.allclose(LENSES["plumb_bob"].project_to_pixels([[0.4, 0.2, 2.0]]), [[u, v]])
+    assert np.allclose(LENSES["plumb_bob"]._project_to_pixels([[0.4, 0.2, 2.0]]), [[u, v]])
     angle = np.arctan(np.sqrt(square))
     bent = angle + 0.02 * angle**3 - 0.01 * angle**5 + 0.003 * angle**7
     assert np.allclose(
-        LENSES["equidistant"].project_to_pixels([[0.4, 0.2, 2.0]]),
+        LENSES["equidistant"]._project_to_pixels([[0.4, 0.2, 2.0]]),
         [[30 * x * bent / np.sqrt(square) + 31.0, 30 * y * bent / np.sqrt(square) + 24.5]],
     )
 

@@ -42,10 +42,10 @@ def test_distances_follow_the_joints(ball):
         found = ball.nearest_moving_surface(points, q, 0.15)[0]
         assert np.allclose(found[expected < 0.145], expected[expected < 0.145], atol=6e-4)
         assert np.isinf(found[expected > 0.155]).all()
-        assert np.array_equal(ball.is_within_distance(points, q, 0.15, moving_only=True), np.isfinite(found))
+        assert np.array_equal(ball.is_within_surface_distance(points, q, 0.15, moving_only=True), np.isfinite(found))
     beside = np.array([[0.0, 5.0, 0.6]])
-    assert ball.is_within_distance(beside, [0, 0], 0.2).all()
-    assert not ball.is_within_distance(beside, [0, 0], 0.2, moving_only=True).any()
+    assert ball.is_within_surface_distance(beside, [0, 0], 0.2).all()
+    assert not ball.is_within_surface_distance(beside, [0, 0], 0.2, moving_only=True).any()
 
 
 def test_closest_points_give_the_way_out(ball):
@@ -82,7 +82,7 @@ def test_rays_meet_a_ball_where_it_is(ball):
 def test_baxters_meshes_are_found_and_move(system):
     tree = numeric_mechanism(system)
     meshes = load_robot_meshes("package:baxter", tree)
-    assert set(meshes) == {-1, *system.driven_indices}
+    assert set(meshes) == {-1, *system.driven_coordinate_indices}
     finger = meshes[system.mechanism.joint_index("left_w2")].vertices
     assert 0.1 < finger[:, 2].max() < 0.5
     assert set(load_robot_meshes("package:baxter", tree, "collision")) <= set(meshes)

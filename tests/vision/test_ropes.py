@@ -22,7 +22,7 @@ from yid_ocp.vision import (
     track_object,
     write_frame_folder,
 )
-from yid_ocp.vision.frame_selection import is_self_touching
+from yid_ocp.vision.frame_selection import is_shape_self_touching
 
 MILLIMETRE = 1e-3
 RADIUS = 0.006
@@ -108,7 +108,7 @@ def test_a_rope_on_a_table(rope):
     there = replace(OPTIONS, approximate_root_position=(0.5, 0.0, 0.0))
     other = track_object(CameraScene(rope), None, film(lines[:1], TABLE), there)
     assert np.linalg.norm(other.position[0, 0] - lines[0][-1]) < 4 * MILLIMETRE
-    assert found.to_recording(None).points[0].names == ("rope:0%", "rope:50%", "w_rope")
+    assert found.recording_with_points(None).points[0].names == ("rope:0%", "rope:50%", "w_rope")
 
 
 @pytest.mark.parametrize(("root", "word"), [("fixed", "stays in its place"), ("free", "higher")])
@@ -191,11 +191,11 @@ def test_shapes_that_touch_themselves():
         return np.stack([places[:-1], places[1:]], axis=1)
 
     radius = np.full(40, RADIUS)
-    assert not is_self_touching(links(snake(2)[::50]), radius[:39])
+    assert not is_shape_self_touching(links(snake(2)[::50]), radius[:39])
     cross = line(crossing, 1.0)[::50]
-    assert is_self_touching(links(cross), radius[:39])
+    assert is_shape_self_touching(links(cross), radius[:39])
     cross[:, 2] = np.linspace(0.0, 0.3, 40)  # a coil crosses nothing
-    assert not is_self_touching(links(cross), radius[:39])
+    assert not is_shape_self_touching(links(cross), radius[:39])
 
 
 def test_a_robot_says_where_the_root_is(rope):

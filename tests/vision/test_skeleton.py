@@ -35,8 +35,8 @@ def test_nodes_lie_on_the_centre_lines():
     nodes, label = found.nodes, found.node_of_point
     assert np.median(from_bones(nodes)) < 0.005
     assert from_bones(nodes).max() < 0.02
-    assert found.node_weights.sum() == found.has_node.sum()
-    assert found.has_node.mean() > 0.9
+    assert found.node_weights.sum() == found.has_skeleton_node.sum()
+    assert found.has_skeleton_node.mean() > 0.9
     for i in range(len(nodes)):
         mine = cloud.points[label == i]
         assert len(mine) <= 50
@@ -72,7 +72,7 @@ def test_two_parts_and_a_stray_heap():
     points = np.concatenate([cloud.points[near], far])
     found = extract_skeleton(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0))
     assert set(found.component_of_node.tolist()) == {0, 1}
-    assert not found.has_node[-60:].any()
+    assert not found.has_skeleton_node[-60:].any()
     weights = [found.node_weights[found.component_of_node == part].sum() for part in (0, 1)]
     assert weights[0] > weights[1]
 
@@ -88,7 +88,7 @@ def test_points_at_one_place_do_not_hang_it():
     cloud = WeightedCloud(np.zeros((500, 3)), np.ones(500))
     found = extract_skeleton(cloud, np.random.default_rng(0))
     assert len(found.nodes) == 10
-    assert found.has_node.all()
+    assert found.has_skeleton_node.all()
     ring = WeightedCloud(
         0.069 * np.column_stack([np.cos(np.arange(40)), np.sin(np.arange(40)), np.zeros(40)]), np.ones(40)
     )

@@ -99,7 +99,7 @@ def test_late_stamps_are_dropped(tracked):
 
 
 def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
-    sequence = clean.made.sequence.select_frames([1, 4, 6, 9])
+    sequence = clean.made.sequence._select_frames([1, 4, 6, 9])
     pose = sequence.camera_pose.copy()
     pose[:3, 3] += [0.03, -0.025, 0.02]
     pose[:3, :3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ pose[:3, :3]
@@ -124,7 +124,7 @@ def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
 def test_without_motion_the_clock_has_to_be_given(system, clean, small):
     joints = small.recording.joints
     still = Recording(replace(joints, position=np.tile(joints.position[:1], (len(joints.t), 1))))
-    sequence = clean.made.sequence.select_frames([0, 1, 2])
+    sequence = clean.made.sequence._select_frames([0, 1, 2])
     with pytest.raises(DataError, match="cannot be calibrated by the arm"):
         track_object(CameraScene(system, "package:baxter"), still, sequence)
 
@@ -133,7 +133,7 @@ def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
     joints = recording.joints
     old = PointGroup("points_camera", ("w_T1",), [0.0], np.zeros((1, 1, 3)), 0.01)
     arm = PointGroup("points_arm", ("w_T2",), joints.t, np.zeros((len(joints.t), 1, 3)), 0.001)
-    made = clean.track.to_recording(replace(recording, points=(old, arm), description="Before."))
+    made = clean.track.recording_with_points(replace(recording, points=(old, arm), description="Before."))
     write_recording(made, tmp_path / "tracked.h5")
     again = read_recording(tmp_path / "tracked.h5")
     assert [group.name for group in again.points] == ["points_arm", "points_camera"]
@@ -152,11 +152,11 @@ def test_positions_of_a_straight_object_stay_with_their_points(clean, recording)
     straight = np.ones((1, 3))
     for name, kept in (("points_arm", True), ("points_camera", False)):
         before = replace(recording, points=(groups[name],), marker_reference_pose=straight)
-        assert (clean.track.to_recording(before).marker_reference_pose is not None) is kept
-    assert clean.track.to_recording(recording).marker_reference_pose is None
+        assert (clean.track.recording_with_points(before).marker_reference_pose is not None) is kept
+    assert clean.track.recording_with_points(recording).marker_reference_pose is None
     mocap = replace(groups["points_arm"], name="points_mocap")
     before = replace(recording, points=(mocap,), marker_reference_pose=straight)
-    assert clean.track.to_recording(before).marker_reference_pose is None
+    assert clean.track.recording_with_points(before).marker_reference_pose is None
 
 
 def test_the_points_are_those_that_no_arm_holds(system, small):
@@ -225,7 +225,7 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
     assert "a duplicate" in duplicate
     assert "not a number" in missing
     assert late == "there are no joint angles at its time"
-    assert sum(found.drop_reason_counts.values()) == len(bad) + 3
+    assert sum(found.frame_drop_reason_counts.values()) == len(bad) + 3
 
 
 def spoilt(small, clouds=None, t=None):
@@ -283,7 +283,7 @@ def test_solve_finds_the_truth_from_tracked_points(tracked, system, run, truth):
     import yid_ocp as yid
 
     rng = np.random.default_rng(1)
-    driven = list(system.driven_indices)
+    driven = list(system.driven_coordinate_indices)
     joints = JointGroup(
         system.driven,
         run.t,

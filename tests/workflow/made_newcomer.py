@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment, run_virtual_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build import build_system
 
@@ -74,7 +74,7 @@ class Newcomer:
         start = {"initial_joint_angles": self.posture, "seed": seed}
         seen = {"point_std": 5e-4, "frame_rate": 50.0, "has_dropouts": False, "hidden_probability": 0.0}
         experiment = VirtualExperiment(
-            motion=random_multisine(system, None, excitation=excitation, **start),
+            motion=random_multisine_motion(system, None, excitation=excitation, **start),
             simulation=SimulationOptions(duration, time_step=2e-4),
             arm_noise=ArmSensorNoise(position_std=1e-4),
             camera=PointCamera(pose=np.eye(4), **seen),

@@ -10,10 +10,10 @@ from here import Here
 from PIL import Image
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.diagnosis.blind import CaseScore, score_ensemble
+from yid_ocp.diagnosis.blind import BlindCaseScore, ensemble_success_rates
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import to_json_types
-from yid_ocp.report.diagnosis_summaries import blind_markdown
+from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
 from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
@@ -103,12 +103,12 @@ def test_an_experiment_is_varied_as_far_as_its_configuration_allows(repository, 
 
 def made(
     category: str, gap: bool, right: bool, size: float = float("nan"), experiment: str = "one", **more
-) -> CaseScore:
+) -> BlindCaseScore:
     answer = "kelvin_voigt@T1" if gap else "-"
     verdict = "effect" if gap else "no_gap"
     truth = "-" if category == "null" else "kelvin_voigt@T1"
     told = ("case_000", category, truth, verdict, answer, size)
-    return CaseScore(*told, gap, gap, gap, gap, (), right, 0.9, 1.0, experiment=experiment, **more)
+    return BlindCaseScore(*told, gap, gap, gap, gap, (), right, 0.9, 1.0, experiment=experiment, **more)
 
 
 MARKS = [
@@ -119,7 +119,7 @@ MARKS = [
 
 @pytest.mark.parametrize(("marks", "plots"), [(MARKS, 3), (MARKS[8:], None), ([], 0)], ids=["all", "clean", "none"])
 def test_pictures_and_page_show_whatever_there_is(tmp_path, marks, plots):
-    result = to_json_types(score_ensemble(marks)) | {"seed": 1, "purpose": "report", "versions": {}}
+    result = to_json_types(ensemble_success_rates(marks)) | {"seed": 1, "purpose": "report", "versions": {}}
     draw_blind_results(tmp_path, result)
     for name in ("detection", "confusion", "calibration"):
         with Image.open(tmp_path / f"{name}.png") as picture:
@@ -135,7 +135,7 @@ def test_pictures_and_page_show_whatever_there_is(tmp_path, marks, plots):
 
 
 def test_the_table_has_rates_with_intervals_by_size_and_by_experiment():
-    lines = blind_markdown(to_json_types(score_ensemble(MARKS)))
+    lines = blind_tables_markdown(to_json_types(ensemble_success_rates(MARKS)))
     assert "| false alarms on clean data | 0 % (0 of 5, 0 % to 52 %) |" in lines
     assert f"| 3 | 8 | {' | '.join([*2 * ['75 % (6 of 8, 35 % to 97 %)'], '50 % (4 of 8, 16 % to 84 %)'])} |" in lines
     assert "| two | 5 | 0 % (0 of 5, 0 % to 52 %) | - |" in lines

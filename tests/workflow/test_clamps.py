@@ -21,7 +21,7 @@ from yid_ocp.workflow.run_history import (
     baseline_estimates,
     load_reference_recordings,
     read_estimates,
-    with_baseline_effects,
+    settings_with_baseline_effects,
 )
 from yid_ocp.workflow.run_inputs import read_recordings
 from yid_ocp.workflow.simulate import run_simulate
@@ -150,7 +150,7 @@ def test_a_baseline_is_a_joint_prior_about_its_values(tmp_path):
     assert problem.initial_unknowns[at] == pytest.approx([0.018, 4e-5])
     moved = problem.initial_unknowns.copy()
     moved[at] += [3e-4, -1e-6]
-    residual, rows = problem.prior_residual(moved)
+    residual, rows = problem.prior_residual_and_jacobian(moved)
     apart = moved[at] - problem.initial_unknowns[at]
     expected = apart @ np.linalg.solve(known.covariance, apart)
     assert residual @ residual == pytest.approx(expected, rel=1e-9)
@@ -165,7 +165,7 @@ def test_the_baselines_effects_stay_in_the_model(tmp_path):
     )  # fmt: skip
     with pytest.raises(ConfigError, match="the effect kelvin_voigt@beam"):
         with_baseline_prior(build_problem(run), known)
-    problem = with_baseline_prior(build_problem(with_baseline_effects(run, (known,))), known)
+    problem = with_baseline_prior(build_problem(settings_with_baseline_effects(run, (known,))), known)
     assert "kelvin_voigt@beam.tau" in problem.free
     assert problem.named_values(problem.initial_unknowns)["kelvin_voigt@beam.tau"] == pytest.approx(0.01)
 

@@ -17,9 +17,9 @@ from yid_ocp.workflow.command_runner import (
     EXIT_DONE,
     EXIT_FAILED,
     CommandResult,
-    LineProgress,
-    run_and_print,
-    show_progress,
+    StderrLineProgress,
+    run_command_and_print,
+    stderr_progress_display,
 )
 
 ENTRY = Iterate(3, 12.5, np.zeros(1), 0.1, 4, 1.25, "first 2 s")
@@ -38,7 +38,7 @@ def clock(monkeypatch):
 
 
 def test_lines_for_stages_iterates_and_tenths(capsys, clock):
-    progress = LineProgress()
+    progress = StderrLineProgress()
     progress.begin_stage("solving")
     progress.report_iterate(ENTRY)
     for _ in range(2):  # the tenths begin again with every stage
@@ -55,7 +55,7 @@ def test_lines_for_stages_iterates_and_tenths(capsys, clock):
                        (3000.0, ["about 6.7 h", "about 50 min"])]
 )  # fmt: skip
 def test_the_time_left_counts_what_this_run_did(capsys, clock, pace, left):
-    progress = LineProgress()
+    progress = StderrLineProgress()
     progress.begin_stage("diagnosing")
     for done in (10, 12, 19, 20):  # ten were done before and took nothing
         clock[0] = 100.0 + pace * (done - 10)
@@ -66,7 +66,7 @@ def test_the_time_left_counts_what_this_run_did(capsys, clock, pace, left):
 
 
 def test_slow_parts_have_a_line_each_and_quick_ones_one_in_ten(capsys, clock):
-    progress = LineProgress()
+    progress = StderrLineProgress()
     progress.begin_stage("diagnosing")
     for done in range(4):
         clock[0] += 30.0
@@ -88,7 +88,7 @@ def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(monkeypat
     monkeypatch.setenv("COLUMNS", "200")
     update = Bars.update
     monkeypatch.setattr(Bars, "update", lambda self, task, **what: update(self, task, refresh=True, **what))
-    with show_progress(asked(program=True)) as progress:
+    with stderr_progress_display(asked(program=True)) as progress:
         progress.report_parts_done(1, 2, "before any stage")
         progress.begin_stage("solving")
         progress.report_iterate(ENTRY)
@@ -101,8 +101,8 @@ def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(monkeypat
 
 
 def test_who_does_not_look_is_shown_nothing_or_lines():
-    for arguments, kind in ((asked(quiet=True), None), (asked(program=True), None), (asked(), LineProgress)):
-        with show_progress(arguments) as progress:
+    for arguments, kind in ((asked(quiet=True), None), (asked(program=True), None), (asked(), StderrLineProgress)):
+        with stderr_progress_display(arguments) as progress:
             assert progress is NULL_PROGRESS if kind is None else isinstance(progress, kind)
 
 
@@ -116,7 +116,7 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 
     folder = tmp_path / "runs" / "x"
     said = [SummaryStatement("a = 1"), SummaryStatement("done")]
-    code = run_and_print(asked(quiet=quiet), work, lambda result: said if result == {"a": 1} else [])
+    code = run_command_and_print(asked(quiet=quiet), work, lambda result: said if result == {"a": 1} else [])
     captured = capsys.readouterr()
     assert code == (EXIT_DONE if reached else EXIT_FAILED)
     expected = (f"{folder}\n", "") if quiet else ("a = 1\ndone\nrun folder: runs/x\n", "working ...\n")
@@ -126,5 +126,7 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    run_and_print(asked(), lambda progress: CommandResult(tmp_path / "there", {"a": 1}, None), lambda result: [])
+    run_command_and_print(
+        asked(), lambda progress: CommandResult(tmp_path / "there", {"a": 1}, None), lambda result: []
+    )
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")

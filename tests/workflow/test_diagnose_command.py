@@ -17,14 +17,14 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import StoredFit
 from yid_ocp.diagnosis.refit import REFIT_SOLVER
 from yid_ocp.errors import ConfigError
-from yid_ocp.inference.whitening import estimate_torque_biases, whitened_at
+from yid_ocp.inference.whitening import estimate_recording_torque_biases, problem_whitened_at
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.workflow.diagnose import JsonRefitStore, _with_noise_only_stds, run_diagnose
-from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
 def without_times(folder) -> dict:
@@ -131,8 +131,8 @@ def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
     changed = load_config(rubbing, ["diagnosis.significance_level=0.02"])
     embedded = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG)
     for settings, command in ((changed, "yid-ocp diagnose 'runs/a b/config.yaml'"), (embedded, "yid-ocp diagnose")):
-        with new_run_folder(settings, tmp_path / "runs" / "a b") as folder:
-            folder.begin_run(settings, "diagnose")
+        with atomic_run_folder(settings, tmp_path / "runs" / "a b") as folder:
+            folder.record_run_start(settings, "diagnose")
             assert folder.write_result({})["command"] == command
         shutil.rmtree(folder.path)
 
@@ -141,7 +141,7 @@ def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
 def test_kept_refits_count_only_for_what_they_were_made_from(spoil, rubbing, tmp_path, caplog):
     made_from = [{"a.h5": "12"}, "a: 1", {"yid-ocp": "1.0"}]
     refitted = StoredFit({"b": 0.1 + 0.2}, {"b": float("inf")}, {"b": 0.1}, "done")
-    with new_run_folder(load_config(rubbing), tmp_path / "run") as folder:
+    with atomic_run_folder(load_config(rubbing), tmp_path / "run") as folder:
         first = JsonRefitStore(folder, *made_from)
         first.put("joint_coulomb@elbow", refitted)
         if spoil == "inputs":
@@ -214,13 +214,16 @@ def test_errors_of_torques_shrink_like_all_other_noise(problem_of, encoders):
     problem = problem_of("driven", STATED | {"joints.position": position})
     shrunk = _with_noise_only_stds(problem, settings())
     x = problem.initial_unknowns * 1.1
-    one, other = (whitened_at(made, x, rounds=2) for made in (problem, shrunk))
+    one, other = (problem_whitened_at(made, x, rounds=2) for made in (problem, shrunk))
     before, after = one.evaluate(x), other.evaluate(x)
     assert one.whitening_filters[0] is not None
     assert other.whitening_filters[0] is not None
     np.testing.assert_allclose(after.residual, before.residual / SHARE, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(after.jacobian, before.jacobian / SHARE, rtol=1e-6, atol=1e-6)
-    (value, std), (smaller_value, smaller_std) = estimate_torque_biases(one, x)[0], estimate_torque_biases(other, x)[0]
+    (value, std), (smaller_value, smaller_std) = (
+        estimate_recording_torque_biases(one, x)[0],
+        estimate_recording_torque_biases(other, x)[0],
+    )
     np.testing.assert_allclose(smaller_value, value, rtol=1e-6)
     np.testing.assert_allclose(smaller_std, SHARE * std, rtol=1e-6)
 

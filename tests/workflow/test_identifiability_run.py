@@ -38,7 +38,7 @@ def test_workers_find_what_one_process_does(repository, tmp_path, name):
 def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
     run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
     asked = IdentifiabilityOptions(interval_parameters="all")
-    names, done = [], identifiability_command.profile_parameter
+    names, done = [], identifiability_command.profile_likelihood_task
 
     def twice(name, **arguments):
         if len(names) == 1:
@@ -47,11 +47,11 @@ def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
         return done(name=name, **arguments)
 
     twice.__module__, twice.__qualname__ = done.__module__, done.__qualname__
-    monkeypatch.setattr(identifiability_command, "profile_parameter", twice)
+    monkeypatch.setattr(identifiability_command, "profile_likelihood_task", twice)
     with pytest.raises(KeyboardInterrupt):
         run_identifiability(run, tmp_path / "run", options=asked, workers=Here())
     assert len(list((tmp_path / "run.partial" / "tasks").glob("*.json"))) == 1
-    monkeypatch.setattr(identifiability_command, "profile_parameter", done)
+    monkeypatch.setattr(identifiability_command, "profile_likelihood_task", done)
     outcome = run_identifiability(run, tmp_path / "run", options=asked, workers=Here())
     assert set(outcome.result["profiles"]) == {"spring_1.stiffness", "spring_2.stiffness"}
     assert not (tmp_path / "run.partial").exists()
@@ -62,7 +62,7 @@ def test_a_part_that_fails_is_said(repository, tmp_path, monkeypatch):
         raise SolverError(f"no {name}", hint="mend it")
 
     failing.__module__, failing.__qualname__ = "yid_ocp.workflow.identifiability", "profiled"
-    monkeypatch.setattr(identifiability_command, "profile_parameter", failing)
+    monkeypatch.setattr(identifiability_command, "profile_likelihood_task", failing)
     run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
     words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
     with pytest.raises(WorkerError, match=words):

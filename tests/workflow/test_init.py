@@ -17,7 +17,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_recording, write_recording
-from yid_ocp.workflow.build import build_system, parameter_settings
+from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 
 RATE = 125.0
 LENGTH = 0.5
@@ -159,7 +159,7 @@ def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: py
     assert run.model.arms.servo.command_interpolation == "held"
     system = build_system(run)
     assert set(system.servos) == set(system.driven) == {"roll", "pitch"}
-    free = {name for name, said in parameter_settings(run, system.parameters).items() if said.free}
+    free = {name for name, said in settings_by_parameter_name(run, system.parameters).items() if said.free}
     own = ("{}.servo_gain", "{}.servo_damping", "{}.servo_delay", "rotor_inertia@{}.armature")
     assert free == {"cable.bend", "cable.damping", *(name.format(joint) for joint in ("roll", "pitch") for name in own)}
     # a copy of the measured angles is no command, and efforts say more than commands

@@ -67,7 +67,7 @@ def test_a_recording_whose_start_is_fitted(hanging):
     assert "to first order" in found["T1.bend"].words
     at = inspect._columns_at(problem.step, point)
     symbols = StepSymbols.from_equations(problem.step.equations)
-    assert at[symbols.column_index("q0[T1_0_y]")] == point.state[1]
+    assert at[symbols._column_index("q0[T1_0_y]")] == point.state[1]
     # the step is taken: its equation holds
     left = symbols.equation_entry("del[T1_0_y]").numeric_value(symbols.column_symbols, at)
     assert left == pytest.approx(0.0, abs=1e-10)

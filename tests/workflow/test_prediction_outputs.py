@@ -14,7 +14,7 @@ from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.errors import OutputError
-from yid_ocp.inference.whitening import whitened_at, without_input_errors
+from yid_ocp.inference.whitening import problem_whitened_at, problem_without_input_errors
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import RobotJointSpring
@@ -22,7 +22,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.synthetic_recording import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
-from yid_ocp.report.terminal import torque_offset_rows
+from yid_ocp.report.terminal import torque_offset_table_rows
 from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.workflow.build_problem import load_problem
 from yid_ocp.workflow.check import _input_noise
@@ -139,7 +139,7 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
 def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
     problem = problem_of(step)
     assert estimated_torque_offsets(problem, problem.initial_unknowns) == {}
-    weighted = whitened_at(problem, problem.initial_unknowns, rounds=2)
+    weighted = problem_whitened_at(problem, problem.initial_unknowns, rounds=2)
     found = estimated_torque_offsets(weighted, problem.initial_unknowns)
     assert list(found) == ["first", "second"]
     for entry in found.values():
@@ -147,13 +147,15 @@ def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
         assert own["prior_std"] == OFFSET
         assert own["std"] < 0.1 * OFFSET
         assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
-    alone = whitened_at(problem_of(step, held_out=False), problem.initial_unknowns)
+    alone = problem_whitened_at(problem_of(step, held_out=False), problem.initial_unknowns)
     assert list(estimated_torque_offsets(alone, problem.initial_unknowns)) == ["first"]
 
 
 def test_where_offsets_are_no_part_of_the_model_nothing_is_said(step):
     problem = problem_of(step, bias=0.0)
-    assert estimated_torque_offsets(whitened_at(problem, problem.initial_unknowns), problem.initial_unknowns) == {}
+    assert (
+        estimated_torque_offsets(problem_whitened_at(problem, problem.initial_unknowns), problem.initial_unknowns) == {}
+    )
 
 
 def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
@@ -161,14 +163,16 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
         return {"value": value, "std": 0.012, "prior_std": prior}
 
     offsets = {"a": {"s0": offset(0.4), "e0": offset(-0.1)}, "b": {"s0": offset(0.2, 0.1)}}
-    assert torque_offset_rows({"torque_offsets": offsets}) == [
+    assert torque_offset_table_rows({"torque_offsets": offsets}) == [
         ("torque offset [N m]", "a", "b", "expected"),
         ("s0", "0.40 ± 0.01", "0.20 ± 0.01", "± 0.3, ± 0.1"),
         ("e0", "-0.10 ± 0.01", "", "± 0.3"),
     ]
     many = {f"run {i}": {"s0": offset(0.1)} for i in range(6)}
-    assert torque_offset_rows({"torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
-    assert len(torque_offset_rows({"torque_offsets": {}})) == len(torque_offset_rows({})) == 1, "a head alone"
+    assert torque_offset_table_rows({"torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
+    assert len(torque_offset_table_rows({"torque_offsets": {}})) == len(torque_offset_table_rows({})) == 1, (
+        "a head alone"
+    )
 
 
 def simulated(problem, seeds):
@@ -205,7 +209,7 @@ def test_check_lists_noise_that_drives_the_motion_and_whether_anybody_stated_it(
     assert ("(estimated)" in words) is estimated
     assert words.endswith("; 0.0001 rad")
     assert ", offset 0.2" in words
-    calm = without_input_errors(problem)
+    calm = problem_without_input_errors(problem)
     assert _input_noise(calm, calm.episodes[0]) == {}
 
 

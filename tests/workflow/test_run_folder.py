@@ -12,7 +12,7 @@ import pytest
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import OutputError
 from yid_ocp.files import file_sha256
-from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def settings(pendulum):
 
 def test_a_folder_appears_when_the_block_ends_and_not_when_it_is_left_by_an_error(settings, tmp_path):
     def write(out, error=None) -> None:
-        with new_run_folder(settings, out) as folder:
+        with atomic_run_folder(settings, out) as folder:
             folder.write_text_file("a.txt", "a")
             assert not out.exists()
             assert folder.path != folder.final_path
@@ -38,8 +38,8 @@ def test_a_folder_appears_when_the_block_ends_and_not_when_it_is_left_by_an_erro
 
 
 def test_begin_and_finish_say_what_a_result_was_made_from(settings, pendulum_data, tmp_path):
-    with new_run_folder(settings, tmp_path / "run") as folder:
-        folder.begin_run(settings, "test")
+    with atomic_run_folder(settings, tmp_path / "run") as folder:
+        folder.record_run_start(settings, "test")
         written = folder.write_result({"format": "x", "value": math.inf, "deep": {"list": [1.0, math.nan]}})
     assert load_config(tmp_path / "run" / "config.yaml").solver == settings.solver
     assert json.loads((tmp_path / "run" / "result.json").read_text(), parse_constant=pytest.fail) == written
@@ -54,14 +54,14 @@ def test_begin_and_finish_say_what_a_result_was_made_from(settings, pendulum_dat
 
 
 def test_many_notes_on_one_key_are_one(settings, tmp_path):
-    with new_run_folder(settings, tmp_path / "run") as folder:
+    with atomic_run_folder(settings, tmp_path / "run") as folder:
         written = folder.write_result({name: {"std": math.inf} for name in "abcd"} | {"z": {"std": math.nan}})
     assert written["notes"] == ["std is infinite (4 times)", "z.std is not known"]
 
 
 def test_messages_of_the_library_are_logged_while_the_folder_is_made(settings, tmp_path):
     logger = logging.getLogger("yid_ocp.test")
-    with new_run_folder(settings, tmp_path / "run") as folder:
+    with atomic_run_folder(settings, tmp_path / "run") as folder:
         logger.info("inside")
     logger.warning("outside")
     lines = [json.loads(text) for text in (folder.path / "log.jsonl").read_text().splitlines()]
@@ -72,7 +72,7 @@ def test_messages_of_the_library_are_logged_while_the_folder_is_made(settings, t
 def test_a_folder_in_use_is_refused(settings, tmp_path, name, message):
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "file").write_text("")
-    with pytest.raises(OutputError, match=message), new_run_folder(settings, tmp_path / name):
+    with pytest.raises(OutputError, match=message), atomic_run_folder(settings, tmp_path / name):
         pass
 
 
@@ -80,20 +80,20 @@ def test_an_unnamed_one_is_numbered_and_its_name_reserved_from_the_start(setting
     monkeypatch.setattr("yid_ocp.workflow.run_folder.time.strftime", lambda _: "now")
     monkeypatch.chdir(tmp_path)
     with contextlib.ExitStack() as runs:
-        folders = [runs.enter_context(new_run_folder(settings, None, "check")) for _ in range(3)]
+        folders = [runs.enter_context(atomic_run_folder(settings, None, "check")) for _ in range(3)]
         for i, folder in enumerate(folders):
             folder.write_text_file("number.txt", str(i))
     names = ["pendulum-check-now", "pendulum-check-now-2", "pendulum-check-now-3"]
     assert [(tmp_path / "runs" / name / "number.txt").read_text() for name in names] == ["0", "1", "2"]
-    with new_run_folder(settings, None, "check") as folder:
+    with atomic_run_folder(settings, None, "check") as folder:
         assert folder.final_path.name == "pendulum-check-now-4"
 
 
 def test_a_name_that_another_run_has_is_refused_before_the_work(settings, tmp_path):
     with (
-        new_run_folder(settings, tmp_path / "run"),
+        atomic_run_folder(settings, tmp_path / "run"),
         pytest.raises(OutputError, match="another run"),
-        new_run_folder(settings, tmp_path / "run"),
+        atomic_run_folder(settings, tmp_path / "run"),
     ):
         pass
     assert (tmp_path / "run" / "log.jsonl").is_file()
@@ -101,7 +101,7 @@ def test_a_name_that_another_run_has_is_refused_before_the_work(settings, tmp_pa
 
 @pytest.mark.parametrize("kind", ["folder", "file"])
 def test_a_result_is_not_lost_because_its_name_was_taken(settings, tmp_path, caplog, kind):
-    with new_run_folder(settings, tmp_path / "run") as folder:
+    with atomic_run_folder(settings, tmp_path / "run") as folder:
         folder.write_text_file("a.txt", "mine")
         taken = tmp_path / "run" / "theirs" if kind == "folder" else tmp_path / "run"
         taken.parent.mkdir(exist_ok=True)
@@ -119,9 +119,9 @@ def test_what_a_killed_run_left_is_cleared_away_and_what_lives_stays(settings, t
     (left / "big").write_text("x")
     foreign = tmp_path / ".foreign.partial"
     foreign.mkdir()
-    with new_run_folder(settings, tmp_path / "lives") as alive:
+    with atomic_run_folder(settings, tmp_path / "lives") as alive:
         alive.write_text_file("a.txt", "a")
-        with new_run_folder(settings, tmp_path / "other"):
+        with atomic_run_folder(settings, tmp_path / "other"):
             assert (alive.path / "a.txt").is_file()
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} >= {"lives", "other", ".foreign.partial"}
     assert not left.exists()
@@ -132,7 +132,7 @@ def test_impossible_names_are_refused(settings, tmp_path, monkeypatch, name):
     empty = tmp_path / "empty"
     empty.mkdir()
     monkeypatch.chdir(empty)
-    with pytest.raises(OutputError), new_run_folder(settings, name):
+    with pytest.raises(OutputError), atomic_run_folder(settings, name):
         pass
     assert list(empty.iterdir()) == []
 
@@ -144,7 +144,7 @@ def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, mon
     monkeypatch.setattr("yid_ocp.files.os.replace", full)
     with (
         pytest.raises(OutputError, match="No space left") as caught,
-        new_run_folder(settings, tmp_path / "runs" / "run") as folder,
+        atomic_run_folder(settings, tmp_path / "runs" / "run") as folder,
     ):
         folder.write_text_file("a.txt", "a")
     assert caught.value.where == str(tmp_path / "runs" / "run" / "a.txt")

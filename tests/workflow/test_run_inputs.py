@@ -16,10 +16,10 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.files import file_sha256
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.run_folder import software_versions
+from yid_ocp.workflow.run_folder import software_and_plugin_versions
 
 EFFECT = """
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, force_on_joint, robot_joints
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, generalized_force_at_joint, arm_joint_names
 from yid_ocp.model.system import StepTerms
 
 
@@ -30,14 +30,14 @@ class Constant(EffectBase):
 
     @classmethod
     def possible_locations(cls, system):
-        return robot_joints(system)
+        return arm_joint_names(system)
 
     @classmethod
     def parameter_definitions(cls, location, system):
         return (ParameterDefinition("push", "N m", 0.0, -5.0, 5.0, (-1.0, 1.0), "constant torque"),)
 
     def step_terms(self, state):
-        return StepTerms(generalized_force=force_on_joint(state.system, self.location, self["push"]))
+        return StepTerms(generalized_force=generalized_force_at_joint(state.system, self.location, self["push"]))
 """
 
 
@@ -104,7 +104,7 @@ def test_distributions_are_found_by_their_entry_point(kinds, pendulum, monkeypat
     entry = metadata.EntryPoint("constant", "constant_effect", run_inputs._ENTRY_POINT_GROUP)
     found = replace_dist(entry, SimpleNamespace(name="my-effects", version="1.2"))
     monkeypatch.setattr(run_inputs, "_installed", lambda: [found])
-    assert software_versions()["entry point constant"] == "my-effects 1.2"
+    assert software_and_plugin_versions()["entry point constant"] == "my-effects 1.2"
     build_system(load_config(pendulum))
     assert "constant" in EFFECTS
     run_inputs._loaded.clear()  # as if a script had imported it before

@@ -17,11 +17,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.optimize
 
-from yid_ocp.analysis.joint_checks import effect_setting_line
+from yid_ocp.analysis.joint_checks import known_effect_config_line
 from yid_ocp.arrays import Array
-from yid_ocp.data.issues import MIN_NOISE_DIFFERENCES, QUALITY_LIMITS, Issue, Severity, median_sample_period
+from yid_ocp.data.issues import MIN_DIFFERENCES_FOR_NOISE_STD, QUALITY_LIMITS, Issue, Severity, median_sample_period
 from yid_ocp.data.recording import JointGroup, PointGroup
-from yid_ocp.inference.null_test import residual_channels
+from yid_ocp.inference.null_test import residual_channel_samples
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
@@ -107,7 +107,7 @@ def _by_clock(t: Array, speed: Array, span: tuple[float, float]) -> Array:
     return np.stack([speed, speed * (t - 0.5 * sum(span)) / max(span[1] - span[0], 1e-9)], axis=1)
 
 
-def check_held_point_clock(
+def check_robot_held_point_clock(
     joints: JointGroup, group: PointGroup, t: Array, seen: Array, by_angle: Array, std: float, path: PositionFunction
 ) -> Iterator[Issue]:
     """Issues of clock offset or drift of points whose positions follow from the joint angles.
@@ -149,7 +149,7 @@ def check_held_point_clock(
         camera = "camera" in f"{group.name} {group.sensor}".lower() or group.pose is not None
         setting = f"sensors.{group.name}.use: false"
         if camera and late > 0:
-            setting = effect_setting_line("camera_latency", "camera", "delay", late)
+            setting = known_effect_config_line("camera_latency", "camera", "delay", late)
         advice = f"subtract {late:.3g} s from their times"
         yield Issue("clock_offset", words, severity, abs(late) / limit, advice, "", group.name, "t", setting=setting)
 
@@ -161,11 +161,11 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: Severit
         f"{1e3 * (late + 0.5 * whole):+.3g} ms at its end: its clock runs {1e3 * abs(drift):.2g} ± "
         f"{1e3 * found.drift_std:.1g} parts per thousand too {'fast' if drift > 0 else 'slowly'}"
     )
-    advice, setting = timestamp_correction(late, drift, 0.5 * sum(found.span)), f"sensors.{group}.use: false"
+    advice, setting = timestamp_correction_advice(late, drift, 0.5 * sum(found.span)), f"sensors.{group}.use: false"
     return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
 
 
-def timestamp_correction(late: float, drift: float, middle: float) -> str:
+def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:
     """Advice on how to correct time stamps with an offset and a drift."""
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
@@ -173,7 +173,7 @@ def timestamp_correction(late: float, drift: float, middle: float) -> str:
 # -- clocks that are far apart ----------------------------------------------------------------------------------------
 
 
-def search_clock_error(
+def search_clock_offset_and_drift(
     path: PositionFunction, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float]:
     """Clock offset [s] and relative drift that bring points nearest to a path, by a coarse-to-fine search.
@@ -216,7 +216,7 @@ def check_fit_residuals(problem: EstimationProblem, x: Array, evaluation: Evalua
     A constant offset of a camera's clock looks like damping that the model lacks; to tell the two is a diagnosis's task
     (effect `camera_latency`). One that grows over a recording is a clock's.
     """
-    if not evaluation.ok or evaluation.jacobian is None or problem.data_noise_unit != 1.0:
+    if not evaluation.ok or evaluation.jacobian is None or problem.data_residual_noise_std != 1.0:
         return []
     known = {(issue.cause, issue.recording, issue.group) for issue in problem.options.data_issues}
     found = [*_drifts(problem, x, evaluation), *_overstated(problem, evaluation)]
@@ -226,7 +226,7 @@ def check_fit_residuals(problem: EstimationProblem, x: Array, evaluation: Evalua
 def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
     assert evaluation.jacobian is not None
     times = np.zeros(len(evaluation.residual))
-    for series in residual_channels(problem):
+    for series in residual_channel_samples(problem):
         times[series.residual_indices] = series.t
     size = np.ones(len(problem.initial_unknowns))
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
@@ -234,14 +234,14 @@ def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Ite
         groups = {group.name: group for group in episode.recording.points}
         for k, samples in enumerate(episode.measurements):
             group = groups.get(samples.sensor.group_name)
-            few = samples.n_residuals < MIN_NOISE_DIFFERENCES
+            few = samples.n_residuals < MIN_DIFFERENCES_FOR_NOISE_STD
             if joints is None or group is None or few or not samples.sensor.point_names:
                 continue
             own = slice(slices[0].start, slices[-1].stop)
             at, t = slice(slices[k].start - own.start, slices[k].stop - own.start), times[own]
             span = float(np.min(t[at])), float(np.max(t[at]))
             columns = np.zeros((len(t), 3))  # the first is for what a filter expects, which is no derivative
-            speed = _by_lateness(problem, x, i, samples, result)[samples.is_used]
+            speed = _by_lateness(problem, x, i, samples, result)[samples.used_output_mask]
             columns[at, 1:] = _by_clock(t[at], speed, span)
             whitening = problem.whitening_filters[i]
             if whitening is not None:
@@ -257,12 +257,12 @@ def _by_lateness(
     problem: EstimationProblem, x: Array, i: int, samples: Measurements, result: EpisodePrediction
 ) -> Array:
     """Whitened prediction less measurement per second that the stamps are late, shape (M, k)."""
-    theta = problem.predictor.episode_theta(problem.episodes[i], problem.split(x, i)[0])
+    theta = problem.predictor.theta_with_episode_values(problem.episodes[i], problem.split(x, i)[0])
     state = result.rollout.state
     none = np.zeros((*state.shape, len(problem.unknowns.free_parameters)))
     steps = np.ones(samples.value.shape[1])
     ahead, behind = (
-        problem.predictor.readings_along_trajectory(samples.delayed_by(s * steps), state, none, theta)[0]
+        problem.predictor.readings_along_trajectory(samples.shifted_earlier_by(s * steps), state, none, theta)[0]
         for s in (-1.0, 1.0)
     )
     return np.asarray(samples.weight * (ahead - behind) / (2 * problem.step.time_step))
@@ -272,9 +272,9 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
     """Groups whose residuals, also summed over blocks of time as what lasts for long sums up, are far below noise."""
     by_group: dict[str, list[tuple[float, float, int]]] = {}
     units = {}
-    for series in residual_channels(problem):
+    for series in residual_channel_samples(problem):
         r = evaluation.residual[series.residual_indices]
-        if len(r) >= MIN_NOISE_DIFFERENCES:
+        if len(r) >= MIN_DIFFERENCES_FOR_NOISE_STD:
             sums = np.array([part.sum() / math.sqrt(len(part)) for part in np.array_split(r, _N_TIME_BLOCKS)])
             entry = float(r @ r), float(sums @ sums) / _N_TIME_BLOCKS * len(r), len(r)
             by_group.setdefault(series.group, []).append(entry)
@@ -287,7 +287,9 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         seen = math.sqrt(max(squares) / free)
         if not seen < 1 / QUALITY_LIMITS.max_overstatement_ratio:
             continue
-        stated = [s.std[s.is_used] for e in problem.episodes for s in e.measurements if s.sensor.group_name == group]
+        stated = [
+            s.std[s.used_output_mask] for e in problem.episodes for s in e.measurements if s.sensor.group_name == group
+        ]
         usual = float(np.median(np.concatenate(stated)))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
         words = (

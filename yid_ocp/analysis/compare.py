@@ -16,17 +16,17 @@ import numpy as np
 
 from yid_ocp.analysis.profile import with_profile_intervals
 from yid_ocp.arrays import Array
-from yid_ocp.inference.linearized_residual import bounded_least_squares_step
-from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
+from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
+from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
     VERDICT_PREDICATES,
-    VERDICT_WORDS,
+    VERDICT_TABLE_TEXTS,
     ParameterEstimate,
     interval_text,
 )
-from yid_ocp.inference.whitening import without_input_errors
-from yid_ocp.model.objects.cable import START_SPEED_PARAMETER, START_SPEED_SCALE_PARAMETER
+from yid_ocp.inference.whitening import problem_without_input_errors
+from yid_ocp.model.objects.cable import START_SPEED_PARAMETER_NAME, START_SPEED_SCALE_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
@@ -43,7 +43,7 @@ _MIN_MOVING_RECORDINGS = 2  # that start in motion, of which one is left out at 
 
 
 @dataclass(frozen=True)
-class MethodResult:
+class _MethodResult:
     """Solution, its cost in the problem's own weighting, time and largest resident memory of one estimation method."""
 
     method: str
@@ -76,7 +76,7 @@ class MethodComparison:
         steepest descent left far from it.
     """
 
-    method_results: tuple[MethodResult, ...]
+    method_results: tuple[_MethodResult, ...]
     reference_method: str
     has_process_noise: bool
     verdict_solution: Solution
@@ -95,7 +95,7 @@ def compare_methods(
     solvers: Sequence[Solver],
     truth: Mapping[str, float] | None = None,
     callback: Callable[[str, Iterate], None] | None = None,
-    limits: GapCriteria = DEFAULT_GAP_CRITERIA,
+    limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> MethodComparison:
     """Run several methods from the same initial values and compare their estimates.
 
@@ -106,7 +106,7 @@ def compare_methods(
     `truth` are known parameter values; `callback` is called with the method's name and every `Iterate`; `limits` say
     when a residual is more than noise.
     """
-    runs, whole, problem = [], problem, without_input_errors(problem)
+    runs, whole, problem = [], problem, problem_without_input_errors(problem)
 
     def listener(name: str) -> Callable[[Iterate], None] | None:
         return None if callback is None else lambda entry: callback(name, entry)
@@ -121,7 +121,9 @@ def compare_methods(
             solution = solve(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         cost = problem.evaluate(solution.x, derivatives=False).cost
-        runs.append(MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), wall, cpu, memory.peak))
+        runs.append(
+            _MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), wall, cpu, memory.peak)
+        )
     best = min(runs, key=lambda run: run.whitened_cost)
     if best.method != "steepest_descent":
         shown = replace(best, solution=with_profile_intervals(problem, best.solution))
@@ -137,7 +139,7 @@ def compare_methods(
     return MethodComparison(tuple(runs), best.method, whole.has_process_noise, judged, held_out, agreement, explained)
 
 
-def _differences(run: MethodResult, best: MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
+def _differences(run: _MethodResult, best: _MethodResult, judged: Mapping[str, ParameterEstimate]) -> list[str]:
     """Where a method is not where the best one is, of the parameters that are found."""
     sentences = []
     for name, reference in best.solution.parameters.items():
@@ -159,7 +161,7 @@ def _differences(run: MethodResult, best: MethodResult, judged: Mapping[str, Par
 
 
 def _explanations(
-    runs: Sequence[MethodResult], judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
+    runs: Sequence[_MethodResult], judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
 ) -> list[str]:
     """Where methods sent the parameters that are not found, and where the paper's method went wrong."""
     sentences = []
@@ -175,14 +177,14 @@ def _explanations(
 
 
 def _descent_errors(
-    run: MethodResult, judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
+    run: _MethodResult, judged: Mapping[str, ParameterEstimate], truth: Mapping[str, float], disturbed: bool
 ) -> str:
     """Which parameters a method left far from the truth, and whether these are the ones that the data do not tell."""
     known = {name: entry for name, entry in judged.items() if entry.free and name in truth}
     found = {name: run.solution.parameters[name].value for name in known}
     # the same limit makes a standard deviation too large for an identifiable parameter
     wrong = [name for name in known if not _near(found[name], truth[name])]
-    verdicts = {name: VERDICT_WORDS[entry.verdict] for name, entry in known.items()}
+    verdicts = {name: VERDICT_TABLE_TEXTS[entry.verdict] for name, entry in known.items()}
     hidden = [name for name in known if known[name].verdict != "identifiable"]
     within = f"within {100 * MAX_IDENTIFIABLE_RELATIVE_STD:.0f} % of the truth"
     if not wrong:
@@ -246,7 +248,10 @@ class CableMemoryDecision:
 
 
 def decide_cable_memory(
-    problem: EstimationProblem, solver: Solver, solution: Solution, limits: GapCriteria = DEFAULT_GAP_CRITERIA
+    problem: EstimationProblem,
+    solver: Solver,
+    solution: Solution,
+    limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> CableMemoryDecision:
     """The solution, refitted without cable memory where recordings that start in motion do not support it.
 
@@ -257,7 +262,7 @@ def decide_cable_memory(
     memory, moving = _memory_parameters(problem), _moving(problem)
     if not memory or not moving or solution.evaluation is None:
         return CableMemoryDecision(problem, solution)
-    without = without_cable_memory(problem)
+    without = problem_without_cable_memory(problem)
     known = dict(zip(solution.unknown_names, solution.x, strict=True))
     other = solve(without, solver, without.vector(known).tolist(), limits=limits)
     if other.evaluation is None:
@@ -275,10 +280,10 @@ def decide_cable_memory(
     return CableMemoryDecision(without, other, f"memory is not kept: {errors}")
 
 
-def without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
+def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
     """The problem with the cable's memory parameters fixed at zero."""
     memory = _memory_parameters(problem)
-    free = tuple(name for name in problem.free if name not in (*memory, START_SPEED_SCALE_PARAMETER))
+    free = tuple(name for name in problem.free if name not in (*memory, START_SPEED_SCALE_PARAMETER_NAME))
     return problem.with_free_subset(free).with_parameter_values(dict.fromkeys(memory, 0.0))
 
 
@@ -292,7 +297,7 @@ def _moving(problem: EstimationProblem) -> list[int]:
         i
         for i, episode in enumerate(problem.episodes)
         if episode.fixed_initial_state is not None
-        and episode.fixed_initial_state.fitted_parameters.get(START_SPEED_PARAMETER, 0.0) > _MAX_REST_SPEED
+        and episode.fixed_initial_state.fitted_parameters.get(START_SPEED_PARAMETER_NAME, 0.0) > _MAX_REST_SPEED
     ]
 
 
@@ -320,7 +325,7 @@ def _stepped(problem: EstimationProblem, x: Array, residual: Array, jacobian: Ar
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
-    step = bounded_least_squares_step(jacobian * size, residual, 1e-10, low, high)
+    step = bounded_levenberg_marquardt_step(jacobian * size, residual, 1e-10, low, high)
     return np.asarray(np.clip(x + step * size, lower, upper))
 
 
@@ -401,13 +406,13 @@ def _discrepancy(experiment: str, name: str, value: float, entry: ParameterEstim
         )
     many = f"{min(offsets):.3g} to {max(offsets):.3g} in {len(offsets)} twins"
     led = f"constant torque errors of {_TORQUE_BIAS_STD:g} N m lead the paper's method to {many}"
-    if is_within_ensemble(value, offsets):
+    if is_within_ensemble_range(value, offsets):
         return f"torque error; {led}"
     open_interval = "" if interval is None else f"leave {interval_text(*interval)} open and not this"
     return f"unexplained; such recordings {open_interval or 'inform it'}, it is not slow, and {led}"
 
 
-def is_within_ensemble(published: float, values: Sequence[float]) -> bool:
+def is_within_ensemble_range(published: float, values: Sequence[float]) -> bool:
     """Whether a published estimate lies in the range of an ensemble's estimates, with a margin at a zero bound."""
     return min(values) - _ZERO_BOUND_FRACTION * max(values) <= published <= max(values)
 

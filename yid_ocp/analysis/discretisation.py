@@ -11,9 +11,9 @@ import numpy as np
 import scipy.optimize
 
 from yid_ocp.arrays import Array
-from yid_ocp.inference.linearized_residual import bounded_least_squares_step
+from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
-from yid_ocp.inference.whitening import whitened_at
+from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
@@ -33,7 +33,7 @@ m + m/2 + m/4 + ... What falls faster has less to go."""
 
 
 @dataclass(frozen=True)
-class DiscretisationShift:
+class DiscretisationEstimateShift:
     """Shift of one estimate with every link divided in two, and with half the time step, in its own unit.
 
     None where not tried or where the finer model could not be rolled out.
@@ -42,14 +42,14 @@ class DiscretisationShift:
     links: float | None = None
     time_step: float | None = None
 
-    def inflated_std(self, std: float) -> float:
+    def _inflated_std(self, std: float) -> float:
         """Standard deviation combined, in quadrature, with `_EXTRAPOLATION_FACTOR` times the shifts that exceed it."""
         found = [move for move in (self.links, self.time_step) if move is not None and abs(move) > std]
         return math.hypot(std, *(_EXTRAPOLATION_FACTOR * move for move in found)) if found else std
 
 
 @dataclass(frozen=True)
-class RefinedProblem:
+class FinerDiscretisationProblem:
     """An estimation problem with a finer discretisation, and how its unknowns map to the coarse ones.
 
     Attributes
@@ -92,7 +92,7 @@ class RefinedProblem:
         return fine
 
 
-def joint_subdivision(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
+def fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tuple[str, ...]]:
     """For each divided joint of the coarse model, the names of the fine joints that replace it."""
     found = {}
     for segment in coarse.segment_layouts:
@@ -104,8 +104,8 @@ def joint_subdivision(coarse: System, fine: System) -> dict[str, tuple[str, ...]
     return found
 
 
-def discretisation_shifts(
-    refined: RefinedProblem,
+def discretisation_estimate_shifts(
+    refined: FinerDiscretisationProblem,
     coarse: EstimationProblem,
     x: Array,
     at_x: Evaluation,
@@ -121,7 +121,7 @@ def discretisation_shifts(
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
     weighted = any(own is not None for own in coarse.whitening_filters)
-    problem = whitened_at(refined.problem, point, warm, rounds=2) if weighted else refined.problem
+    problem = problem_whitened_at(refined.problem, point, warm, rounds=2) if weighted else refined.problem
     evaluation = problem.evaluate(point, equilibrium_guesses=warm)
     if not evaluation.ok or evaluation.jacobian is None:
         return evaluation.message
@@ -132,13 +132,15 @@ def discretisation_shifts(
         residual = residual - at_x.residual
     scale = problem.unknown_scales
     low, high = ((bound - point) / scale for bound in problem.bounds)
-    step = scale * bounded_least_squares_step(evaluation.jacobian * scale, residual, 0.0, low, high)
+    step = scale * bounded_levenberg_marquardt_step(evaluation.jacobian * scale, residual, 0.0, low, high)
     moved = dict(zip(problem.unknown_names, map(float, step), strict=True))
     return {name: moved[name] / refined._factor(name) for name in problem.shared_parameters}
 
 
-def inflate_estimates(
-    estimates: Mapping[str, ParameterEstimate], found: Mapping[str, DiscretisationShift], sizes: Mapping[str, float]
+def inflate_estimates_by_discretisation(
+    estimates: Mapping[str, ParameterEstimate],
+    found: Mapping[str, DiscretisationEstimateShift],
+    sizes: Mapping[str, float],
 ) -> dict[str, ParameterEstimate]:
     """Estimates whose standard deviation, interval and verdict include their discretisation shift.
 
@@ -147,7 +149,7 @@ def inflate_estimates(
     counted, ranks = dict(estimates), ("identifiable", "weak", "not_identifiable")
     for name, own in found.items():
         entry = counted[name]
-        std = own.inflated_std(entry.std)
+        std = own._inflated_std(entry.std)
         if not entry.free or not std > entry.std:
             continue
         verdict, said = entry.verdict, verdict_by_relative_std(entry.value, std, sizes.get(name, 0.0))
@@ -180,7 +182,7 @@ class NaturalFrequencies:
     message: str = ""
 
 
-def natural_frequencies(
+def step_map_natural_frequencies(
     system: System,
     posture: Mapping[str, float],
     theta: Array,
@@ -195,7 +197,7 @@ def natural_frequencies(
     midpoint rule lowers a frequency f to atan(pi f h)/(pi h); the force split (`compile_step`) affects growth alone.
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
-    if not still.free_indices:
+    if not still.unprescribed_coordinate_indices:
         return NaturalFrequencies(np.zeros(0), message="every coordinate is prescribed, nothing can swing")
     step = compile_step(still, time_step, force_split, constraint_force, use_compiler=False)
     known = np.array([posture[name] for name in still.prescribed])
@@ -215,13 +217,13 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
     n = step.system.n_coordinates
     q, p, z = rest.state[:n], rest.state[n : 2 * n], rest.state[2 * n :]
     a, _, _ = step.jacobians(q, p, np.zeros(0), theta, (known, known), z, names=())
-    free = np.array(step.system.free_indices)
+    free = np.array(step.system.unprescribed_coordinate_indices)
     rows = np.concatenate([free, n + free])
     values: Array = np.linalg.eigvals(a[np.ix_(rows, rows)])
     return values[np.abs(values) > 0.2]
 
 
-def min_grasp_gaps(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
+def min_grasp_closure_errors(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Smallest remaining gap of each grasp [m], by name: the robot's joints are fixed, the object may bend.
 
     `posture` are driven and prescribed coordinates [rad or m]; lengths are taken from `theta`.
@@ -272,7 +274,7 @@ _MAX_GROWTH_DECADES = 6.0
 
 
 @dataclass(frozen=True)
-class StepErrorGrowth:
+class AlternatingErrorGrowth:
     """Growth of errors that alternate in sign from step to step along one motion.
 
     What a body does by itself goes on in one direction for several steps; a mode of the linearised step whose
@@ -309,7 +311,7 @@ class StepErrorGrowth:
 
 def _error_growth_along(
     step: Step, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, name: str, looks: int
-) -> StepErrorGrowth:
+) -> AlternatingErrorGrowth:
     """Growth of alternating errors along a rollout, up to its first failed step or singular derivatives.
 
     The eigenvalues of A_k - B_k K_k are taken at some nodes (A_k by the implicit function theorem, so that the
@@ -326,19 +328,19 @@ def _error_growth_along(
         at.append(int(node))
         magnitudes.append(found)
     if not at:
-        return StepErrorGrowth(name, 0.0, 0.0, 0.0, step.time_step)
+        return AlternatingErrorGrowth(name, 0.0, 0.0, 0.0, step.time_step)
     worst, decades, running = int(np.argmax(magnitudes)), 0.0, 0.0
     for rate in np.log10(np.maximum(np.interp(np.arange(at[-1] + 1), at, magnitudes), 1e-3)):
         running = max(0.0, running + float(rate))  # largest sum over a stretch, zero where all shrink (Kadane)
         decades = max(decades, running)
-    return StepErrorGrowth(name, decades, magnitudes[worst], at[worst] * step.time_step, step.time_step)
+    return AlternatingErrorGrowth(name, decades, magnitudes[worst], at[worst] * step.time_step, step.time_step)
 
 
 def _alternating_mode_magnitude(
     step: Step, theta: Array, rollout: Rollout, node: int, feedback: TrackingFeedback | None
 ) -> float | None:
     """Largest magnitude of the eigenvalues of A - B K with negative real part at a node; None where A is not finite."""
-    n, fixed = step.system.n_coordinates, list(step.system.prescribed_indices)
+    n, fixed = step.system.n_coordinates, list(step.system.prescribed_coordinate_indices)
     state, after = rollout.state[node], rollout.state[node + 1]
     a, by_torque, _ = step.jacobians(
         state[:n], state[n : 2 * n], rollout.torque[node], theta, (state[fixed], after[fixed]), state[2 * n :], names=()
@@ -352,7 +354,7 @@ def _alternating_mode_magnitude(
     return float(np.max(np.abs(values[values.real < 0]), initial=0.0))
 
 
-def largest_error_growth(problem: EstimationProblem, x: Array) -> StepErrorGrowth | None:
+def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
     """The largest error growth among a problem's recordings, at unknowns x (nx,); None where none has an initial state.
 
     Of a failed rollout it is that along the part before the failure.
@@ -362,13 +364,13 @@ def largest_error_growth(problem: EstimationProblem, x: Array) -> StepErrorGrowt
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)
     for i, episode in enumerate(problem.episodes):
         shared, offset = problem.split(x, i)
-        theta = predictor.episode_theta(episode, shared)
+        theta = predictor.theta_with_episode_values(episode, shared)
         begin = predictor.initial_state(episode, theta, offset, ())
         if begin.failure_message:
             continue
-        inputs = predictor.tracking_inputs(episode, theta, (), begin.state)
+        inputs = predictor.corrected_inputs_with_momentum_shift(episode, theta, (), begin.state)
         feedback = inputs.corrected_feedback(
-            episode.tracking_feedback, system.driven_indices, episode.measured_driven_angles
+            episode.tracking_feedback, system.driven_coordinate_indices, episode.measured_driven_angles
         )
         rollout = simulate(
             problem.step, theta, begin.state, episode.grid.steps, inputs.torque, inputs.prescribed_path, feedback

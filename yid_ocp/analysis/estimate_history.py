@@ -67,7 +67,7 @@ class RunEstimates(ReprMixin):
 
 
 @dataclass(frozen=True)
-class ParameterDrift:
+class _ParameterDrift:
     """Test whether one parameter has the same value in all runs that have it: pooled mean, chi2 of the differences.
 
     It has drifted where p is below the requested level, Bonferroni-corrected for the number of parameters.
@@ -106,7 +106,7 @@ class EstimateHistory:
     """Drift of parameters and consistency of several runs of one model; chi2 is of all differences together."""
 
     run_names: tuple[str, ...]
-    parameter_drifts: tuple[ParameterDrift, ...]
+    parameter_drifts: tuple[_ParameterDrift, ...]
     run_consistencies: tuple[RunConsistency, ...]
     chi2: float
     degrees_of_freedom: int
@@ -114,7 +114,7 @@ class EstimateHistory:
     significance_level: float
 
 
-def nearest_positive_definite(covariance: Array) -> Array:
+def nearby_positive_definite_covariance(covariance: Array) -> Array:
     """A nearby invertible covariance with the same standard deviations: small correlation eigenvalues are raised."""
     std = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
@@ -137,7 +137,7 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
     parts = []
     for run in runs:
         at = [names.index(name) for name in run.parameter_names]
-        inverse = np.linalg.inv(nearest_positive_definite(run.covariance) / np.outer(unit[at], unit[at]))
+        inverse = np.linalg.inv(nearby_positive_definite_covariance(run.covariance) / np.outer(unit[at], unit[at]))
         parts.append((at, inverse, run.values / unit[at]))
         information[np.ix_(at, at)] += inverse
         sums[at] += inverse @ parts[-1][2]
@@ -167,7 +167,7 @@ def assess_drift(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateH
     return EstimateHistory(names, drifts, against, chi2, degrees, p, level)
 
 
-def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> ParameterDrift:
+def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterDrift:
     own = [run._only((name,)) for run in runs if name in run.parameter_names]
     mean, chi2, degrees = pool_estimates(own)
     p = chi2_p_value(chi2, degrees)
@@ -175,7 +175,7 @@ def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> ParameterDr
         tuple(float(x[0]) for x in part) for part in zip(*((run.values, run.std) for run in own), strict=True)
     )
     pooled, places = (float(mean.values[0]), float(mean.std[0])), tuple(run.run_name for run in own)
-    return ParameterDrift(name, mean.units.get(name, ""), places, values, std, *pooled, chi2, p, p < level)
+    return _ParameterDrift(name, mean.units.get(name, ""), places, values, std, *pooled, chi2, p, p < level)
 
 
 def _against(i: int, runs: Sequence[RunEstimates], level: float) -> RunConsistency:
@@ -196,7 +196,7 @@ def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, in
     if not shared:
         return 0.0, 0, ""
     own, rest = run._only(shared), mean._only(shared)
-    apart, covariance = own.values - rest.values, nearest_positive_definite(own.covariance + rest.covariance)
+    apart, covariance = own.values - rest.values, nearby_positive_definite_covariance(own.covariance + rest.covariance)
     std = np.sqrt(np.diag(covariance))
     unit = apart / std
     chi2 = float(unit @ np.linalg.solve(covariance / np.outer(std, std), unit))

@@ -12,12 +12,12 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import ArrayLike
 
-from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unknowns, with_nuisance_unknowns
-from yid_ocp.analysis.torque_error_propagation import episode_sensitivities
+from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unknowns_by_name, with_nuisance_unknowns
+from yid_ocp.analysis.torque_error_propagation import episode_sensitivities_and_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError, YidError
-from yid_ocp.inference.whitening import whitened_at
+from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Placement
@@ -27,8 +27,13 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.sensors import recorded_camera_pose
-from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, PositionSensor, is_measured_by_arm
-from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+from yid_ocp.sensors.joints import (
+    JOINT_EFFORT_GROUP_NAME,
+    JOINT_POSITION_GROUP_NAME,
+    PositionSensor,
+    is_measured_by_arm,
+)
+from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
 CAMERA_GROUP, ARM_GROUP = "points_camera", "points_arm"
@@ -42,7 +47,7 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 
 @dataclass(frozen=True)
-class FrameObservation:
+class FrameObservationSchedule:
     """Times (M,) since a recording's start [s] and standard deviations (M, 3) [m] of one frame measured by a group."""
 
     point_group: str
@@ -52,7 +57,7 @@ class FrameObservation:
 
 
 @dataclass(frozen=True)
-class BaseExperiment:
+class RecordedExperiment:
     """The recorded experiment, and what its variants may use.
 
     The information is evaluated at the unknowns `x` (nx,); `two_arm_system` has a second arm and its grasp.
@@ -70,12 +75,12 @@ class BaseExperiment:
         theta, _ = self.problem.split(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
-    def camera_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def camera_sample_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """The camera's point group, its frame times since the start [s] and its typical standard deviation [m]."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
-    def arm_sampling(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def arm_sample_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Point group, sample times [s] and standard deviation [m] of points that the arms measure."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
@@ -87,7 +92,7 @@ class BaseExperiment:
             return group, group.t - episode.grid.start_time, float(np.nanmedian(self._std(group)))
         return None, times, std
 
-    def recorded_observations(self, episode: Episode) -> list[FrameObservation]:
+    def existing_sensor_observations(self, episode: Episode) -> list[FrameObservationSchedule]:
         """Observations of the recording's sensors, one entry for each point."""
         found = []
         for group in _used_point_groups(self.problem, episode):
@@ -98,7 +103,7 @@ class BaseExperiment:
                 if self.problem.system.mechanism.has_frame(frame):
                     at = group.names.index(point)
                     seen = np.all(np.isfinite(group.position[:, at]), axis=1)
-                    found.append(FrameObservation(group.name, frame, t[seen], std[seen, at]))
+                    found.append(FrameObservationSchedule(group.name, frame, t[seen], std[seen, at]))
         return found
 
     def _std(self, group: PointGroup) -> Array:
@@ -125,7 +130,7 @@ def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
 
 
 @dataclass(frozen=True)
-class ObservableFrame:
+class _ObservableFrame:
     """A frame that a camera, or also an arm, could measure; `added_frame` where it must be added to the mechanism."""
 
     name: str
@@ -134,21 +139,21 @@ class ObservableFrame:
     added_frame: Frame | None = None
 
 
-def observable_frames(system: System) -> list[ObservableFrame]:
+def observable_frames(system: System) -> list[_ObservableFrame]:
     """Measurable frames: tips and middles of segments and markers beside them; without segments, links and markers."""
     tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
-    found: list[ObservableFrame] = []
+    found: list[_ObservableFrame] = []
     for segment in system.segment_layouts:
         name, count, tip = segment.name, len(segment.link_joints), f"w_{segment.name}"
-        found.append(ObservableFrame(tip, f"the end of {name}", False))
+        found.append(_ObservableFrame(tip, f"the end of {name}", False))
         if count > 1:
-            found.append(ObservableFrame(f"{name}_{(count - 1) // 2}_tip", f"the middle of {name}", False))
+            found.append(_ObservableFrame(f"{name}_{(count - 1) // 2}_tip", f"the middle of {name}", False))
         beside = _displaced(tree.frame(tip), (_MARKER_AXIS_DISTANCE, 0.0, 0.0))
-        found.append(ObservableFrame(f"{name}_marker", f"{off_axis} at the end of {name}", tip in held, beside))
+        found.append(_ObservableFrame(f"{name}_marker", f"{off_axis} at the end of {name}", tip in held, beside))
     if system.segment_layouts:
         return found
-    found = [ObservableFrame(name, name, False) for name, frame in tree.frames.items() if frame.joint_index >= 0]
+    found = [_ObservableFrame(name, name, False) for name, frame in tree.frames.items() if frame.joint_index >= 0]
     for spring in system.elastic_joints:
         index, name = tree.joint_index(spring.joint_name), spring.joint_name
         if tree.joints[index].kind == "revolute":
@@ -157,7 +162,7 @@ def observable_frames(system: System) -> list[ObservableFrame]:
             across -= axis * float(across @ axis)
             across *= _MARKER_AXIS_DISTANCE / float(np.linalg.norm(across))
             frame = _displaced(Frame(index, Placement.identity()), across)
-            found.append(ObservableFrame(f"{name}_marker", f"{off_axis} of {name}", False, frame))
+            found.append(_ObservableFrame(f"{name}_marker", f"{off_axis} of {name}", False, frame))
     return found
 
 
@@ -166,7 +171,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
     return Frame(frame.joint_index, frame.placement @ shift)
 
 
-def with_observable_frames(step: Step) -> tuple[Step, list[ObservableFrame]]:
+def add_observable_frames_to_step(step: Step) -> tuple[Step, list[_ObservableFrame]]:
     """The step with all measurable frames in its mechanism, and these; the equations of motion stay the same."""
     mechanism, seen = step.system.mechanism, observable_frames(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
@@ -187,7 +192,7 @@ class CandidateExperiment:
         With nuisances, and with every measurable frame observed at every node.
     position_sensitivities : mapping of (episode, group, frame) to ndarray, shape (N + 1, 3, nx + q)
         Sensitivity of a frame's position at every node by the unknowns, then by what stands for the errors of the
-        torques that drive this episode (`episode_sensitivities`).
+        torques that drive this episode (`episode_sensitivities_and_information`).
     prior_information : ndarray, shape (nx, nx)
         Fisher information of the priors of nuisances.
     joint_information : mapping of episode to ndarray, shape (nx + q, nx + q)
@@ -205,7 +210,7 @@ class CandidateExperiment:
     feasibility_notes: tuple[str, ...] = ()
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
-    def fisher_information(self, views: Sequence[Sequence[FrameObservation]]) -> Array:
+    def fisher_information(self, views: Sequence[Sequence[FrameObservationSchedule]]) -> Array:
         """Fisher information of observations, one list for each recording, plus the prior information, (nx, nx)."""
         total = self.prior_information.copy()
         nx = len(total)
@@ -219,7 +224,7 @@ class CandidateExperiment:
                 total -= own[:nx, nx:] @ scipy.linalg.solve(own[nx:, nx:], own[nx:, :nx], assume_a="pos")
         return total
 
-    def _of(self, episode: int, grid: TimeGrid, view: FrameObservation) -> Array:
+    def _of(self, episode: int, grid: TimeGrid, view: FrameObservationSchedule) -> Array:
         key = (episode, view.point_group, view.frame, view.times.tobytes(), view.std.tobytes())
         if key not in self._known:
             inside = (view.times >= -1e-9) & (view.times <= grid.steps * grid.time_step + 1e-9)
@@ -232,7 +237,7 @@ class CandidateExperiment:
         return self._known[key]
 
 
-MECHANICAL_CHANGES: Mapping[str, str] = {
+MECHANICAL_EXPERIMENT_CHANGES: Mapping[str, str] = {
     "weld": "weld grasps in place of points",
     "second_arm": "a second arm",
     "motion": "another motion",
@@ -244,7 +249,7 @@ MECHANICAL_CHANGES: Mapping[str, str] = {
 class CandidateExperimentBuilder:
     """Builds and caches variants of an experiment by their mechanical changes."""
 
-    def __init__(self, setting: BaseExperiment, progress: Progress = NULL_PROGRESS) -> None:
+    def __init__(self, setting: RecordedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
         self._progress = progress
         self._layouts: dict[frozenset[str], CandidateExperiment | str] = {}
@@ -254,7 +259,7 @@ class CandidateExperimentBuilder:
         if mechanics in self._layouts:
             return self._layouts[mechanics]
         if mechanics:
-            words = " and ".join(MECHANICAL_CHANGES[name] for name in sorted(mechanics))
+            words = " and ".join(MECHANICAL_EXPERIMENT_CHANGES[name] for name in sorted(mechanics))
             self._progress.begin_stage(f"working out {words}")
         try:
             self._layouts[mechanics] = self._build(mechanics)
@@ -262,7 +267,7 @@ class CandidateExperimentBuilder:
             self._layouts[mechanics] = error.what
         return self._layouts[mechanics]
 
-    def applicable_changes(self) -> list[str]:
+    def applicable_mechanical_changes(self) -> list[str]:
         """Names of the mechanical changes that apply to the system."""
         setting, system, episodes = self.setting, self.setting.problem.system, self.setting.problem.episodes
         moves = bool(system.driven) and not system.servos
@@ -284,7 +289,7 @@ class CandidateExperimentBuilder:
             system = replace(system, driven=(), servos={}, prescribed=(*system.prescribed, *system.driven))
         other = mechanics - {"motion", "travel"} or system is not base.system
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
-        step, seen = with_observable_frames(step)
+        step, seen = add_observable_frames_to_step(step)
         wide = with_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
         options = replace(
             wide.options,
@@ -298,7 +303,7 @@ class CandidateExperimentBuilder:
         values = {name: v for name, v in setting.parameter_values.items() if name in step.system.parameters}
         nuisances = [name for name in wide.free if name not in base.free]
         problem = EstimationProblem(step, dense, (*base.free, *nuisances), options, values)
-        x = transfer_unknowns(setting.x, base.unknown_names, problem)
+        x = transfer_unknowns_by_name(setting.x, base.unknown_names, problem)
         evaluation = problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be rolled out: {evaluation.message}")
@@ -307,7 +312,7 @@ class CandidateExperimentBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = episode_sensitivities(problem, evaluation, x, i, finest, encoders)
+            points, by_joints[i] = episode_sensitivities_and_information(problem, evaluation, x, i, finest, encoders)
             slopes |= {(i, *key): value for key, value in points.items()}
         names = tuple(name for name in problem.unknown_names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
@@ -325,17 +330,20 @@ class CandidateExperimentBuilder:
             joints = self.setting.problem.episodes[0].recording.joints
             said = None if joints is None else joints.effort_std
             stated = said is not None and bool(np.all(np.asarray(said) > 0))
-            sensors[EFFORT_GROUP] = SensorOptions(std=None if stated else DEFAULT_TORQUE_STD)
+            sensors[JOINT_EFFORT_GROUP_NAME] = SensorOptions(std=None if stated else DEFAULT_TORQUE_STD)
         return sensors
 
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Least standard deviation that each group's points can have in a recording [m]."""
         finest = {}
-        samplings = (CAMERA_GROUP, self.setting.camera_sampling), (ARM_GROUP, self.setting.arm_sampling)
+        samplings = (
+            (CAMERA_GROUP, self.setting.camera_sample_times_and_std),
+            (ARM_GROUP, self.setting.arm_sample_times_and_std),
+        )
         for default, sampling in samplings:
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
-        for view in self.setting.recorded_observations(episode):
+        for view in self.setting.existing_sensor_observations(episode):
             finest[view.point_group] = min(finest.get(view.point_group, math.inf), float(view.std.min()))
         return finest
 
@@ -346,7 +354,7 @@ class CandidateExperimentBuilder:
         if not used or not problem.system.driven:
             return None
         sensors = dict(problem.options.sensors)
-        sensors[POSITION_GROUP] = replace(sensors.get(POSITION_GROUP, SensorOptions()), use=True)
+        sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
         recordings = [
             replace(e.recording, points=tuple(group for group in e.recording.points if not is_measured_by_arm(group)))
             for e in problem.episodes
@@ -384,7 +392,7 @@ class CandidateExperimentBuilder:
     @cached_property
     def _corrected(self) -> EstimationProblem:
         """The problem with the errors of torques known that its measurements tell of."""
-        return whitened_at(self.setting.problem, self.setting.x, rounds=2)
+        return problem_whitened_at(self.setting.problem, self.setting.x, rounds=2)
 
     def _cut(self, episode: Episode) -> Recording:
         """The part of a recording that the problem uses, its torques without the errors that are known."""
@@ -428,9 +436,9 @@ class CandidateExperimentBuilder:
         duration = episode.grid.steps * episode.grid.time_step
         travel, speed = (factor * (2.0 if twice else 1.0) for factor in (_travel(base.system, given, episode), 1.4))
         excitation = MultisineOptions(gripper_travel=travel, max_joint_speed=speed, duration=duration)
-        motion = random_multisine(system, values, seed=seed, initial_joint_angles=posture, excitation=excitation)
+        motion = random_multisine_motion(system, values, seed=seed, initial_joint_angles=posture, excitation=excitation)
         run = simulate_in_mujoco(system, values, motion, SimulationOptions(duration), initial_joint_angles=posture)
-        driven = list(system.driven_indices)
+        driven = list(system.driven_coordinate_indices)
         q, noise = run.q[:, driven], _noise_as_recorded(base.system, system, episode)
         joints = JointGroup(system.driven, run.t, q, effort=run.effort, effort_kind="command")
         joints = replace(joints, position_std=noise[0], effort_std=noise[1], effort_bias_std=noise[2])
@@ -446,7 +454,7 @@ class CandidateExperimentBuilder:
         ]
         return Recording(joints, source="what if", name=episode.name), notes
 
-    def _dense(self, recording: Recording, index: int, seen: Sequence[ObservableFrame], torque: bool) -> Recording:
+    def _dense(self, recording: Recording, index: int, seen: Sequence[_ObservableFrame], torque: bool) -> Recording:
         """The recording with every sight in view at every node, of unit standard deviation, and efforts to predict."""
         setting, base = self.setting, self.setting.problem
         episode, joints = base.episodes[index % len(base.episodes)], recording.joints
@@ -457,9 +465,9 @@ class CandidateExperimentBuilder:
         for group in _used_point_groups(base, episode):
             poses[group.name], sensors[group.name] = group.pose, group.sensor
         wanted: dict[str, dict[str, None]] = {}
-        for view in setting.recorded_observations(episode):
+        for view in setting.existing_sensor_observations(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
-        camera, arm = setting.camera_sampling(episode)[0], setting.arm_sampling(episode)[0]
+        camera, arm = setting.camera_sample_times_and_std(episode)[0], setting.arm_sample_times_and_std(episode)[0]
         look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
         look |= dict.fromkeys(sight.name for sight in seen)
         feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, {})
@@ -491,7 +499,7 @@ def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequen
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:
     """Largest distance of a gripper from where it starts [m]."""
     whole = np.zeros((len(episode.measured_driven_angles), system.n_coordinates))
-    whole[:, list(system.driven_indices)] = episode.measured_driven_angles
+    whole[:, list(system.driven_coordinate_indices)] = episode.measured_driven_angles
     paths = _frame_positions(system, values, [grasp.holder_frame for grasp in system.grasps], whole)
     return float(np.linalg.norm(paths - paths[0], axis=2).max(initial=0.0)) or 0.11
 

@@ -11,32 +11,37 @@ import numpy as np
 import threadpoolctl
 from numpy.typing import ArrayLike
 
-from yid_ocp.analysis.profile import ParameterProfile, check_small_estimate, map_at_optimum, profile_likelihood
+from yid_ocp.analysis.profile import (
+    ParameterProfileLikelihood,
+    compute_profile_likelihood_interval,
+    map_parameters_at_optimum,
+    reject_undetermined_small_estimate,
+)
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
-from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
     MAX_WEAK_RELATIVE_STD,
     MIN_UNINFORMED_RELATIVE_STD,
-    VERDICT_WORDS,
+    VERDICT_TABLE_TEXTS,
     ParameterEstimate,
     assess_goodness_of_fit,
-    covariance_and_chi2,
-    covariance_of_fit,
     finite_or_none,
+    misfit_widened_covariance,
     parameter_estimates,
-    parameter_text,
     parameter_unknown_names,
+    parameter_value_text,
     parameter_verdict,
     percent_text,
-    typical_parameter_sizes,
+    typical_parameter_magnitudes,
+    unknowns_covariance_and_reduced_chi2,
     with_profile_interval,
 )
-from yid_ocp.inference.whitening import whitened_at
+from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -57,7 +62,7 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # by which a combination may move the data, of 
 
 
 @dataclass(frozen=True)
-class ParameterInformation:
+class ParameterIdentifiability:
     """Uncertainty and verdict of one parameter, in `unit`.
 
     Attributes
@@ -85,7 +90,7 @@ class ParameterInformation:
 
 
 @dataclass(frozen=True)
-class ParameterDirection:
+class _ParameterDirection:
     """A direction of relative parameter changes and its uncertainty, with limits of the verdict as for a parameter.
 
     Attributes
@@ -116,7 +121,7 @@ class IdentifiabilityResult(ReprMixin):
         NaN in rows of parameters that nothing informs.
     fisher_information : ndarray, shape (p, p)
         Of relative changes, nuisances eliminated.
-    directions : tuple of ParameterDirection
+    directions : tuple of _ParameterDirection
         Least observable first.
     nuisance_names : tuple of str
         Further unknowns, estimated together with the parameters.
@@ -124,25 +129,25 @@ class IdentifiabilityResult(ReprMixin):
         At the evaluated point; at a fit, standard deviations are scaled by its square root where it exceeds one.
     """
 
-    parameters: Mapping[str, ParameterInformation]
+    parameters: Mapping[str, ParameterIdentifiability]
     parameter_names: tuple[str, ...]
     correlations: Array
     fisher_information: Array
-    directions: tuple[ParameterDirection, ...]
+    directions: tuple[_ParameterDirection, ...]
     nuisance_names: tuple[str, ...]
     chi2_per_dof: float
-    profiles: Mapping[str, ParameterProfile] = field(default_factory=dict)
+    profiles: Mapping[str, ParameterProfileLikelihood] = field(default_factory=dict)
 
     def _summary(self) -> ReprSummary:
         rows = [("parameter", "value", "unit", "")]
         for name, entry in self.parameters.items():
-            value = parameter_text(entry.value, finite_or_none(entry.std), None)
-            rows.append((name, value, entry.unit, VERDICT_WORDS[entry.verdict]))
+            value = parameter_value_text(entry.value, finite_or_none(entry.std), None)
+            rows.append((name, value, entry.unit, VERDICT_TABLE_TEXTS[entry.verdict]))
         found = sum(entry.verdict == "identifiable" for entry in self.parameters.values())
         return ReprSummary(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)
 
     @property
-    def unidentifiable_directions(self) -> tuple[ParameterDirection, ...]:
+    def unidentifiable_directions(self) -> tuple[_ParameterDirection, ...]:
         """Directions whose verdict is `not_identifiable`."""
         return tuple(entry for entry in self.directions if entry.verdict == "not_identifiable")
 
@@ -154,7 +159,7 @@ def identifiability(
     start: InitialStateKnowledge = "assumed",
     grasp_std: float | None = None,
     intervals: Iterable[str] | Literal["all"] = (),
-    limits: GapCriteria = DEFAULT_GAP_CRITERIA,
+    limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     progress: Progress = NULL_PROGRESS,
 ) -> IdentifiabilityResult:
     """Fisher-information analysis of which free parameters the problem's recordings determine.
@@ -174,7 +179,7 @@ def identifiability(
         `with_grasp_offset_effects`), which are estimated along [m]; None for grasps that are known.
     intervals : iterable of str, or "all"
         Parameters whose interval by profile likelihood is wanted.
-    limits : GapCriteria, optional
+    limits : ExcessResidualCriteria, optional
         What makes a residual at a solution more than noise.
 
     Raises
@@ -197,23 +202,23 @@ def identifiability(
             raise ConfigError(f"'{name}' is not a free parameter", hint=hint, where="intervals")
     given = unknowns_from_solution(problem, solution)
     wide = with_nuisance_unknowns(problem, start, grasp_std)
-    x = transfer_unknowns(given, problem.unknown_names, wide)
+    x = transfer_unknowns_by_name(given, problem.unknown_names, wide)
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        as_solved, wide = wide is problem, whitened_at(wide, x, rounds=2)
+        as_solved, wide = wide is problem, problem_whitened_at(wide, x, rounds=2)
         evaluation = wide.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             message = f"the model cannot be rolled out where its information is asked for: {evaluation.message}"
             raise SolverError(message, hint="solve first, or choose other initial values")
-        covariance, chi2 = covariance_and_chi2(wide, evaluation)
+        covariance, chi2 = unknowns_covariance_and_reduced_chi2(wide, evaluation)
         inflation, fit = math.sqrt(max(1.0, chi2)), None
         if solution is None:
             # far from the data chi2 says nothing of the noise
             covariance, inflation = covariance / inflation**2, 1.0
         else:
-            own = wide if as_solved else whitened_at(problem, given, rounds=2)
+            own = wide if as_solved else problem_whitened_at(problem, given, rounds=2)
             fit = assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
-            covariance = covariance_of_fit(wide, evaluation, fit)
+            covariance = misfit_widened_covariance(wide, evaluation, fit)
         view = _Sensitivities.of(wide, x, evaluation, names, inflation)
         judged = parameter_estimates(wide, x, evaluation, covariance, fit)
         std = np.array([judged[name].std for name in names])
@@ -224,7 +229,7 @@ def identifiability(
     parameters = {}
     for name, value, scale, alone in zip(names, x[view.chosen], view.scale, view.alone, strict=True):
         entry, relative = judged[name], 1.0 / float(alone) if alone > 0 else math.inf
-        parameters[name] = ParameterInformation(
+        parameters[name] = ParameterIdentifiability(
             float(value), view.unit(name), entry.std, entry.std / float(scale), relative, entry.verdict, entry.interval
         )
     return IdentifiabilityResult(parameters, names, correlations, information, directions, nuisances, chi2, profiles)
@@ -232,18 +237,18 @@ def identifiability(
 
 def _profiles(
     view: _Sensitivities, wanted: Sequence[str], judged: dict[str, ParameterEstimate], progress: Progress
-) -> dict[str, ParameterProfile]:
+) -> dict[str, ParameterProfileLikelihood]:
     """Profile likelihoods of the wanted parameters about the best fit of all unknowns; updates what is judged."""
-    problem, sizes = view.problem, typical_parameter_sizes(view.problem, view.x)
+    problem, sizes = view.problem, typical_parameter_magnitudes(view.problem, view.x)
 
-    def one(name: str, best: Array, there: Evaluation) -> tuple[ParameterProfile, ParameterEstimate]:
+    def one(name: str, best: Array, there: Evaluation) -> tuple[ParameterProfileLikelihood, ParameterEstimate]:
         index, size, entry = problem.unknown_names.index(name), sizes[name.split("[")[0]], judged[name]
-        found = profile_likelihood(problem, best, index, float(entry.std), there)
-        said = check_small_estimate(problem, best, index, entry, size, there)
+        found = compute_profile_likelihood_interval(problem, best, index, float(entry.std), there)
+        said = reject_undetermined_small_estimate(problem, best, index, entry, size, there)
         return found, with_profile_interval(entry, found.interval, size) if said.verdict == entry.verdict else said
 
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    pairs = map_at_optimum(one, problem, view.x, wanted, progress)
+    pairs = map_parameters_at_optimum(one, problem, view.x, wanted, progress)
     judged.update({name: said for name, (_, said) in pairs.items()})
     return {name: profile for name, (profile, _) in pairs.items()}
 
@@ -266,7 +271,7 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
     if solution is None:
         return problem.initial_unknowns
     if isinstance(solution, Solution):
-        return transfer_unknowns(solution.x, solution.unknown_names, problem)
+        return transfer_unknowns_by_name(solution.x, solution.unknown_names, problem)
     x = np.array(solution, float)
     if x.shape != (len(problem.unknown_names),):
         shape = f"({len(problem.unknown_names)},), as problem.unknown_names"
@@ -306,7 +311,7 @@ def with_nuisance_unknowns(
     return EstimationProblem(problem.step, recordings, (*problem.free, *grasps), changed, nominal)
 
 
-def transfer_unknowns(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
+def transfer_unknowns_by_name(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
     """Unknown vector of another problem: values of the same names, its own initial values for the rest."""
     known = dict(zip(names, x, strict=True))
     own = zip(other.unknown_names, other.initial_unknowns, strict=True)
@@ -339,7 +344,7 @@ class _Sensitivities:
     def of(
         problem: EstimationProblem, x: Array, evaluation: Evaluation, names: tuple[str, ...], inflation: float
     ) -> _Sensitivities:
-        jacobian = residual_without_weak_priors(problem, evaluation)[1].copy()
+        jacobian = linearization_without_weak_priors(problem, evaluation)[1].copy()
         chosen = np.array([problem.unknown_names.index(name) for name in names], int)
         others = np.setdiff1d(np.arange(jacobian.shape[1]), chosen)
         # what is known beforehand of the parameters themselves is not something that a sensor sees
@@ -377,7 +382,7 @@ def _orthogonal_part(columns: Array, explained: Array) -> Array:
     return np.asarray(columns - basis @ (basis.T @ columns))
 
 
-def _directions(view: _Sensitivities, std: Array) -> tuple[ParameterDirection, ...]:
+def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, ...]:
     """Unseen parameters, plain unseen combinations, and what is seen; least seen first.
 
     `std`: relative standard deviations of the parameters, which count a misfit in time where directions count its size.
@@ -409,11 +414,11 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[ParameterDirection, .
     return tuple(sorted(found, key=lambda entry: entry.singular_value))
 
 
-def _direction(view: _Sensitivities, size: float, vector: Array, words: str) -> ParameterDirection:
+def _direction(view: _Sensitivities, size: float, vector: Array, words: str) -> _ParameterDirection:
     vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
     std = 1.0 / size if size > 0 else math.inf
     components = dict(zip(view.names, map(float, vector), strict=True))
-    return ParameterDirection(size, std, components, parameter_verdict(1.0, std), words)
+    return _ParameterDirection(size, std, components, parameter_verdict(1.0, std), words)
 
 
 def _sparse_basis(vectors: Array) -> list[Array]:
@@ -509,7 +514,7 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
         return math.inf
     rows = problem.residual_rows.data
     change = np.zeros((len(view.nuisance), 1))
-    change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.data_noise_unit
+    change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.data_residual_noise_std
     return float(np.linalg.norm(_orthogonal_part(change, view.nuisance))) / view.inflation
 
 

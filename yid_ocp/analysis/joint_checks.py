@@ -15,15 +15,15 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.channel_checks import white_noise_std
 from yid_ocp.data.issues import DEGREES_PER_RADIAN, QUALITY_LIMITS, Issue, median_sample_period
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.effects.base import joints_by_arm
-from yid_ocp.model.kinematics import forward_kinematics, rigid_body_derivatives
+from yid_ocp.effects.base import joint_names_by_arm
+from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Joint
 from yid_ocp.model.system import System
-from yid_ocp.parallel import LockedCache
+from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import SensorOptions
-from yid_ocp.sensors.base import values_by_joint
-from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
+from yid_ocp.sensors.base import expand_to_joint_values
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 
 _ANGLE_LIMIT_MARGIN = 0.1
 """How far angles may be beyond a joint's limits, where a robot's own model differs from its URDF [rad or m]."""
@@ -53,7 +53,7 @@ class RecordedJointsModel:
         names = (*system.driven, *system.prescribed)
         return RecordedJointsModel(system, theta, names) if names else None
 
-    def is_recorded_in(self, recording: Recording) -> bool:
+    def has_all_angles_recorded(self, recording: Recording) -> bool:
         """Whether a recording has the angles of all joints; those of clamps that follow points are not recorded."""
         return all(name in recording.joint_names for name in self.joint_names)
 
@@ -64,38 +64,40 @@ class RecordedJointsModel:
         return tuple(mechanism.joints[mechanism.joint_index(name)] for name in self.joint_names)
 
     @property
-    def joint_indices(self) -> tuple[int, ...]:
+    def joint_configuration_indices(self) -> tuple[int, ...]:
         """Indices of the joints in the configuration."""
         return tuple(self.system.mechanism.joint_index(name) for name in self.joint_names)
 
-    def is_frame_determined(self, frame: str) -> bool:
+    def is_frame_determined_by_angles(self, frame: str) -> bool:
         """Whether a frame's position follows from the recorded angles alone."""
         mechanism = self.system.mechanism
-        return set(mechanism.ancestor_joints(mechanism.frame(frame).joint_index)) <= set(self.joint_indices)
+        return set(mechanism.ancestor_joint_indices(mechanism.frame(frame).joint_index)) <= set(
+            self.joint_configuration_indices
+        )
 
     @cached_property
     def _has_no_unknown_descendants(self) -> bool:
         """Whether no joint of unknown angle depends on the recorded joints."""
-        ancestors, known = self.system.mechanism.ancestor_joints, set(self.joint_indices)
+        ancestors, known = self.system.mechanism.ancestor_joint_indices, set(self.joint_configuration_indices)
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
-    def frame_positions(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
+    def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
         """Positions (N, nf, 3) [m] of frames and their Jacobian (N, nf, 3, k) by the recorded angles (N, k).
 
-        The frames are such that `is_frame_determined`.
+        The frames are such that `is_frame_determined_by_angles`.
         """
         place, slope = (np.array(ca.densify(x)) for x in self._places(frames).map(len(q)).call([q.T]))
         count, width = len(frames), len(self.joint_names)
         by_angle = slope.reshape(3 * count, len(q), width).transpose(1, 0, 2)
         return place.T.reshape(len(q), count, 3), by_angle.reshape(len(q), count, 3, width)
 
-    def inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
+    def _inverse_dynamics(self, q: Array, v: Array, a: Array) -> Array:
         """Joint efforts by rigid-body inverse dynamics, without dampers, springs and grasps, shape (N, k) [N m]."""
         return np.array(self._effort.map(len(q)).call([q.T, v.T, a.T])[0]).T
 
     @cached_property
-    def _places(self) -> LockedCache[tuple[str, ...], ca.Function]:
-        return LockedCache(self._place_function)
+    def _places(self) -> CasadiLockedCache[tuple[str, ...], ca.Function]:
+        return CasadiLockedCache(self._place_function)
 
     def _place_function(self, frames: tuple[str, ...]) -> ca.Function:
         known = ca.SX.sym("q", len(self.joint_names))
@@ -108,16 +110,18 @@ class RecordedJointsModel:
         size = self.system.n_coordinates
         full = [ca.SX.sym(name, size) for name in ("q", "v", "a")]
         known = [ca.SX.sym(name, len(self.joint_names)) for name in ("q", "v", "a")]
-        rigid = rigid_body_derivatives(forward_kinematics(self.system.mechanism, full[0]), full[1], self.system.gravity)
+        rigid = rigid_body_lagrangian_derivatives(
+            forward_kinematics(self.system.mechanism, full[0]), full[1], self.system.gravity
+        )
         by_v = rigid.lagrangian_by_v
         effort = ca.jtimes(by_v, full[0], full[1]) + ca.jtimes(by_v, full[1], full[2]) - rigid.lagrangian_by_q
         placed = ca.vertcat(*(self._placed(x) for x in known))
-        effort = ca.substitute(effort[list(self.joint_indices)], ca.vertcat(*full), placed)
+        effort = ca.substitute(effort[list(self.joint_configuration_indices)], ca.vertcat(*full), placed)
         return ca.Function("effort", known, [ca.densify(self._numbers(effort))])
 
     def _placed(self, known: ca.SX) -> ca.SX:
         full = ca.SX.zeros(self.system.n_coordinates)
-        for row, i in enumerate(self.joint_indices):
+        for row, i in enumerate(self.joint_configuration_indices):
             full[i] = known[row]
         return full
 
@@ -203,7 +207,7 @@ def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterat
         yield Issue("speed_limits", words, "not_trusted", depth, advice, "", channel="t")
 
 
-def effect_setting_line(kind: str, location: str, quantity: str, value: float) -> str:
+def known_effect_config_line(kind: str, location: str, quantity: str, value: float) -> str:
     """The configuration line that models an error as a known effect."""
     return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"
 
@@ -211,11 +215,13 @@ def effect_setting_line(kind: str, location: str, quantity: str, value: float) -
 # -- excitation --------------------------------------------------------------------------------------------------------
 
 
-def check_dynamic_excitation(arm: RecordedJointsModel, recording: Recording, effort: SensorOptions) -> Iterator[Issue]:
+def check_inertial_effort_excitation(
+    arm: RecordedJointsModel, recording: Recording, effort: SensorOptions
+) -> Iterator[Issue]:
     """Issue where efforts due to speed and acceleration do not exceed the noise of measured efforts.
 
     Weight and stiffness can be found from static configurations; damping, friction and inertia only from these efforts,
-    taken from inverse dynamics and friction of a typical size. The recording is one that the arm `is_recorded_in`.
+    taken from inverse dynamics and friction of a typical size. The arm `has_all_angles_recorded` in it.
     """
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
@@ -227,7 +233,7 @@ def check_dynamic_excitation(arm: RecordedJointsModel, recording: Recording, eff
     if not np.all(noise > 0):
         return
     still = np.zeros_like(motion.q)
-    moving = arm.inverse_dynamics(motion.q, motion.v, motion.a) - arm.inverse_dynamics(motion.q, still, still)
+    moving = arm._inverse_dynamics(motion.q, motion.v, motion.a) - arm._inverse_dynamics(motion.q, still, still)
     limit = np.array([joint.effort_limit for joint in arm.joints])
     friction = np.where(np.isfinite(limit), _VISCOUS_FRICTION_FRACTION * limit, 0.0) * motion.v
     # noise beyond the band of motion is smoothed away, so that so many samples count as one
@@ -251,7 +257,7 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> A
     """White noise of efforts, as stated, else as seen, shape (k,) [N m]."""
     given = effort.std if effort.std is not None else joints.effort_std
     if given is not None:
-        return values_by_joint(given, joints.names, names, f"sensors.{EFFORT_GROUP}.std")
+        return expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
     assert joints.effort is not None
     return np.array([white_noise_std(joints.t, joints.effort[:, joints.names.index(name)]) for name in names])
 
@@ -272,7 +278,7 @@ def check_joint_excitation(
                 joints.position_std if position.std is None else position.std,
             )
             if given is not None:
-                std = values_by_joint(given, joints.names, (joint,), f"sensors.{POSITION_GROUP}.std")
+                std = expand_to_joint_values(given, joints.names, (joint,), f"sensors.{JOINT_POSITION_GROUP_NAME}.std")
                 noise = max(noise, float(std[0]))
             limit, width = max(limit, 6 * noise), float(np.ptp(angle))
             if not name or width > widest:
@@ -335,7 +341,7 @@ class _Data:
     def holders(self) -> tuple[str, ...]:
         """Frames of the grasps that the arm moves."""
         frames = (grasp.holder_frame for grasp in self.arm.system.grasps)
-        return tuple(frame for frame in frames if self.arm.is_frame_determined(frame))
+        return tuple(frame for frame in frames if self.arm.is_frame_determined_by_angles(frame))
 
 
 @dataclass(frozen=True)
@@ -356,13 +362,13 @@ class _Fit:
     cost: float
 
 
-def check_efforts(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
+def check_efforts_by_inverse_dynamics(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
     """Issues of recorded efforts that disagree with the inverse dynamics of the recorded motion."""
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or len(motion.t) < 10:
         return []
-    needed = arm.inverse_dynamics(motion.q, motion.v, motion.a)
+    needed = arm._inverse_dynamics(motion.q, motion.v, motion.a)
     largest = np.array([joint.effort_limit for joint in arm.joints])
     size = np.where(np.isfinite(largest), largest, np.maximum(np.max(np.abs(needed), axis=0), 1e-9))
     found = list(_limits(arm, motion.effort, largest))
@@ -468,7 +474,7 @@ def _offsets(data: _Data, fit: _Fit, told: BoolArray) -> Iterator[Issue]:
             name, value = data.arm.joint_names[j], float(offset[j])
             words = f"the zero of the effort of {name} is off by {value:+.3g} N m"
             depth = abs(value) / (3 * _OFFSET_FRACTION * float(size[j]))
-            setting = effect_setting_line("effort_offset", name, "offset", value)
+            setting = known_effect_config_line("effort_offset", name, "offset", value)
             yield _issue("effort_offset", words, depth, "let it be estimated, or set the sensor's zero", name, setting)
 
 
@@ -490,7 +496,9 @@ def _late(data: _Data) -> Iterator[Issue]:
         words = (
             f"efforts fit the motion best {abs(lag):.2g} s {'earlier' if lag > 0 else 'later'} than they were recorded"
         )
-        lines = [effect_setting_line("effort_delay", name, "delay", lag) for name in joints_by_arm(data.arm.system)]
+        lines = [
+            known_effect_config_line("effort_delay", name, "delay", lag) for name in joint_names_by_arm(data.arm.system)
+        ]
         setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
         yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift their times", setting=setting)
 
@@ -543,7 +551,7 @@ def _loaded(data: _Data) -> BoolArray:
     if not data.holders:
         return np.zeros(len(data.size), bool)
     q = data.motion.q
-    _, by_angle = data.arm.frame_positions(data.holders, q[:: max(1, len(q) // 20)])
+    _, by_angle = data.arm.frame_positions_and_jacobians(data.holders, q[:: max(1, len(q) // 20)])
     lever = np.max(np.linalg.norm(by_angle, axis=2), axis=(0, 1))
     return np.asarray(_GRASP_FORCE_STD * lever > 3 * _OFFSET_FRACTION * data.size)
 
@@ -552,7 +560,7 @@ def _loads(data: _Data) -> tuple[Array, Array]:
     """Columns of the force at every grasp, shape (N, k, 33 per grasp), and their usual sizes."""
     if not data.holders:
         return np.zeros((*data.needed.shape, 0)), np.zeros(0)
-    place, by_angle = data.arm.frame_positions(data.holders, data.motion.q)
+    place, by_angle = data.arm.frame_positions_and_jacobians(data.holders, data.motion.q)
     columns = []
     for g in range(len(data.holders)):
         moved = place[:, g] - place[:, g].mean(axis=0)

@@ -16,13 +16,13 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from yid_ocp.analysis.step_diagnostics import with_numeric_parameters
+from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.arrays import Array
 from yid_ocp.model.kinematics import (
     forward_kinematics,
     lagrangian_second_derivatives,
     mass_matrix,
-    rigid_body_derivatives,
+    rigid_body_lagrangian_derivatives,
 )
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System
@@ -32,7 +32,7 @@ _N_RANDOM_CONFIGURATIONS = 3  # at which both are compared, besides the one that
 
 
 @dataclass(frozen=True)
-class PinocchioComparison:
+class _PinocchioComparison:
     """Relative differences between a model and Pinocchio's model of the same bodies.
 
     `mass`, `weight` and `motion` are the largest difference of mass matrix, gravity forces and inverse dynamics, each
@@ -45,14 +45,14 @@ class PinocchioComparison:
     motion: float
 
     @property
-    def agrees(self) -> bool:
+    def agrees_within_rounding(self) -> bool:
         """Whether all three agree within rounding."""
         return all(size <= _RELATIVE_TOLERANCE for size in (self.mass, self.weight, self.motion))
 
     @property
     def words(self) -> str:
         """A sentence on the agreement or on each difference."""
-        if self.agrees:
+        if self.agrees_within_rounding:
             largest = max(self.mass, self.weight, self.motion)
             said = f"{self.of}: mass matrix, weight and inverse dynamics are Pinocchio's"
             return f"{said} within {largest:.1g} of the largest entry"
@@ -61,12 +61,12 @@ class PinocchioComparison:
         return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} of the largest entry"
 
 
-def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> PinocchioComparison:
+def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:
     """Compare the built system, its parameters at `theta`, with Pinocchio's model of the same joints and bodies.
 
     The posture (n,) [rad or m] is compared besides `_N_RANDOM_CONFIGURATIONS` drawn ones.
     """
-    built = with_numeric_parameters(system, theta)
+    built = system_with_numeric_parameters(system, theta)
     gravity = np.array(ca.DM(built.gravity)).ravel()
     inert, heavy = (_assembled(built.mechanism, gravity, weight) for weight in (False, True))
     return _compared("the built model", built.mechanism, gravity, inert, heavy, posture)
@@ -79,7 +79,7 @@ def compare_urdf_with_pinocchio(
     joints: Sequence[str] | None = None,
     locked: Mapping[str, float] | None = None,
     exclude_links: Sequence[str] = (),
-) -> PinocchioComparison:
+) -> _PinocchioComparison:
     """Compare a robot as this package read it from URDF with Pinocchio's reading of the same file.
 
     `mechanism` is what `read_urdf` made of it with the same `joints` (all movable ones when absent), values `locked` of
@@ -137,7 +137,7 @@ def _assembled(mechanism: Mechanism, gravity: Array, weight: bool) -> Any:
     model.gravity.linear = gravity if weight else np.zeros(3)
     # Pinocchio's mass matrix needs all that hangs on a joint to follow it at once
     placed: dict[int, int] = {-1: 0}
-    for j in sorted(range(len(mechanism.joints)), key=mechanism.ancestor_joints):
+    for j in sorted(range(len(mechanism.joints)), key=mechanism.ancestor_joint_indices):
         joint = mechanism.joints[j]
         placement = pin.SE3(_number(joint.placement.rotation), _number(joint.placement.translation).ravel())
         kind = pin.JointModelRevoluteUnaligned if joint.kind == "revolute" else pin.JointModelPrismaticUnaligned
@@ -158,13 +158,13 @@ def _number(expression: ca.SX) -> Array:
 
 def _compared(
     of: str, mechanism: Mechanism, gravity: Array, inert: Any, heavy: Any, posture: Array
-) -> PinocchioComparison:
+) -> _PinocchioComparison:
     """Largest differences from `inert` (mass matrix, inverse dynamics) and `heavy` (gravity), in random motion."""
     n = len(mechanism.joints)
     q, v, a = (ca.SX.sym(name, n) for name in "qva")
     kinematics = forward_kinematics(mechanism, q)
-    rigid = rigid_body_derivatives(kinematics, v, ca.SX(ca.DM(gravity)))
-    still = rigid_body_derivatives(kinematics, ca.SX.zeros(n), ca.SX(ca.DM(gravity))).lagrangian_by_q
+    rigid = rigid_body_lagrangian_derivatives(kinematics, v, ca.SX(ca.DM(gravity)))
+    still = rigid_body_lagrangian_derivatives(kinematics, ca.SX.zeros(n), ca.SX(ca.DM(gravity))).lagrangian_by_q
     mass, by_qv = mass_matrix(rigid, mechanism), lagrangian_second_derivatives(rigid, mechanism)[1]
     ours = ca.Function("ours", [q, v, a], [mass, -still, mass @ a + by_qv.T @ v - rigid.lagrangian_by_q])
     rng = np.random.default_rng(0)
@@ -188,4 +188,4 @@ def _compared(
             size = float(np.max(np.abs(expected), initial=0.0))
             difference = float(np.max(np.abs(np.array(ca.densify(found)) - expected), initial=0.0))
             worst[i] = max(worst[i], difference / size if size > 0 else difference)
-    return PinocchioComparison(of, *map(float, worst))
+    return _PinocchioComparison(of, *map(float, worst))

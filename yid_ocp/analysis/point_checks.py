@@ -13,11 +13,11 @@ import scipy.interpolate
 
 from yid_ocp.analysis.clock_checks import (
     PositionFunction,
-    check_held_point_clock,
-    search_clock_error,
-    timestamp_correction,
+    check_robot_held_point_clock,
+    search_clock_offset_and_drift,
+    timestamp_correction_advice,
 )
-from yid_ocp.analysis.joint_checks import RecordedJointsModel, effect_setting_line
+from yid_ocp.analysis.joint_checks import RecordedJointsModel, known_effect_config_line
 from yid_ocp.arrays import Array
 from yid_ocp.data.issues import Issue, median_sample_period
 from yid_ocp.data.recording import PointGroup, Recording
@@ -62,7 +62,7 @@ def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> d
 # -- points that the arm holds ----------------------------------------------------------------------------------------
 
 
-def check_held_points(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
+def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
     """Issues of points whose positions disagree with the forward kinematics of the recorded angles."""
     joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
@@ -77,7 +77,7 @@ def check_held_points(arm: RecordedJointsModel, recording: Recording, choice: _S
         frames = {
             name: frame
             for name, frame in frames.items()
-            if arm.is_frame_determined(frame) and tree.ancestor_joints(tree.frame(frame).joint_index)
+            if arm.is_frame_determined_by_angles(frame) and tree.ancestor_joint_indices(tree.frame(frame).joint_index)
         }
         inside = (group.t >= joints.t[0]) & (group.t <= joints.t[-1])
         if not frames or inside.sum() < 3:
@@ -87,15 +87,15 @@ def check_held_points(arm: RecordedJointsModel, recording: Recording, choice: _S
         seen, t = group.position[rows][:, columns], group.t[rows]
         angles = joints.position[:, [joints.names.index(name) for name in arm.joint_names]]
         course, places = scipy.interpolate.CubicSpline(joints.t, angles, axis=0), tuple(frames.values())
-        place, by_angle = arm.frame_positions(places, course(t))
+        place, by_angle = arm.frame_positions_and_jacobians(places, course(t))
         error = _rms(seen - place)
         noise = _noise(group)
         knots = float(joints.t[0]), float(joints.t[-1])
         dense = np.linspace(*knots, int(np.clip(_PATH_SAMPLE_RATE * (knots[1] - knots[0]), 400, 20_000)))
-        path = scipy.interpolate.CubicSpline(dense, arm.frame_positions(places, course(dense))[0], axis=0)
+        path = scipy.interpolate.CubicSpline(dense, arm.frame_positions_and_jacobians(places, course(dense))[0], axis=0)
         allowed = max(_HELD_POINT_TOLERANCE, 5 * noise)
         if not error > allowed:
-            found = check_held_point_clock(joints, group, t, seen, by_angle, noise, path)
+            found = check_robot_held_point_clock(joints, group, t, seen, by_angle, noise, path)
             yield from (replace(issue, recording=recording.name) for issue in found)
             continue
         changes = [
@@ -171,18 +171,18 @@ def _changed_times(path: PositionFunction, knots: tuple[float, float], t: Array,
         inside = (at >= knots[0]) & (at <= knots[1])
         return _rms(seen[inside] - path(at[inside]))
 
-    late, _ = search_clock_error(path, knots, t, seen)
+    late, _ = search_clock_offset_and_drift(path, knots, t, seen)
     error = left(late, 0.0)
     # of a search over so many times some always fits better
     if abs(late) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words, advice = f"taken {late:+.3g} s from the joints", f"subtract {late:.3g} s from their times"
         yield _Change("clock_offset", words, advice, error)
         return
-    late, drift = search_clock_error(path, knots, t, seen, drifts=True)
+    late, drift = search_clock_offset_and_drift(path, knots, t, seen, drifts=True)
     error = left(late, drift)
     if abs(drift) * (t[-1] - t[0]) >= _MIN_CLOCK_OFFSET and error < 0.5 * _MAX_REMAINING_FRACTION * before:
         words = f"taken {late:+.3g} s from the joints, by a clock that runs {1e3 * drift:+.3g} parts per thousand fast,"
-        yield _Change("clock_drift", words, timestamp_correction(late, drift, middle), error)
+        yield _Change("clock_drift", words, timestamp_correction_advice(late, drift, middle), error)
 
 
 def _changed_zeros(
@@ -201,9 +201,9 @@ def _changed_zeros(
             offset += float(np.sum(slope[good] * left[good])) / power
             moved = q.copy()
             moved[:, j] += offset
-            place, by_angle = arm.frame_positions(frames, moved)
+            place, by_angle = arm.frame_positions_and_jacobians(frames, moved)
         else:
-            setting = effect_setting_line("encoder_offset", name, "offset", -offset)
+            setting = known_effect_config_line("encoder_offset", name, "offset", -offset)
             words, advice = f"with {offset:+.3g} rad more at {name}", f"set the zero of {name}, or let it be estimated"
             found.append(_Change("encoder_offset", words, advice, _rms(seen - place), setting, f"position.{name}"))
     yield from sorted(found, key=lambda change: change.error)[:1]
@@ -235,9 +235,9 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
     The first is the root, whose origin is fixed in the world, or on the arm. None for a frame that is fixed or known,
     or that slides.
     """
-    mechanism, known = system.mechanism, set() if arm is None else set(arm.joint_indices)
+    mechanism, known = system.mechanism, set() if arm is None else set(arm.joint_configuration_indices)
     entry = mechanism.frame(frame)
-    chain = [i for i in mechanism.ancestor_joints(entry.joint_index) if i not in known]
+    chain = [i for i in mechanism.ancestor_joint_indices(entry.joint_index) if i not in known]
     if not chain or any(mechanism.joints[i].kind == "prismatic" for i in chain):
         return None
     steps = [entry.placement.translation, *(mechanism.joints[i].placement.translation for i in reversed(chain[1:]))]
@@ -293,7 +293,7 @@ def check_point_distances(
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
 
 
-def check_object_points(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
+def check_object_points_by_rollout(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
     """Issues of object points that disagree grossly with a rollout at the parameters' initial values.
 
     Gross errors, such as a mirror image, show even where the stiffnesses are wrong. `size` is that of the object [m].
@@ -338,7 +338,7 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
 # -- a cable's points -------------------------------------------------------------------------------------------------
 
 
-def check_cable_points(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
+def check_cable_point_geometry(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
     """Issues of cable points whose edge lengths differ from the undeformed shape, or that lie above the clamps."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertices if name in group.names}
@@ -389,7 +389,7 @@ def _upside_down(
 ) -> Issue | None:
     """A cable that rises between its clamps by more than its own shape does: gravity points the other way."""
     pull = float(np.linalg.norm(gravity))
-    free = [name for name in cable.free_vertices if name in at]
+    free = [name for name in cable.free_vertex_names if name in at]
     ends = [name for name in (cable.parent_vertices[0], cable.parent_vertices[-1]) if name in at]
     if pull == 0 or len(ends) < 2 or not free:
         return None

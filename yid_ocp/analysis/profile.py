@@ -11,14 +11,14 @@ from typing import TypeVar
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.inference.linearized_residual import bounded_least_squares_step, residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, linearization_without_weak_priors
 from yid_ocp.inference.uncertainty import (
     ConfidenceInterval,
     ParameterEstimate,
-    covariance_and_chi2,
     is_std_sufficient,
     parameter_unknown_names,
-    typical_parameter_sizes,
+    typical_parameter_magnitudes,
+    unknowns_covariance_and_reduced_chi2,
     with_profile_interval,
 )
 from yid_ocp.parallel import map_with_batched_calls
@@ -48,7 +48,7 @@ _MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 
 
 @dataclass(frozen=True)
-class ParameterProfile:
+class ParameterProfileLikelihood:
     """Profile likelihood of one unknown, whose best fit is at `value`.
 
     Attributes
@@ -76,9 +76,9 @@ class ParameterProfile:
         return self.lower, self.upper
 
 
-def profile_likelihood(
+def compute_profile_likelihood_interval(
     problem: EstimationProblem, x: Array, index: int, std: float, evaluation: Evaluation
-) -> ParameterProfile:
+) -> ParameterProfileLikelihood:
     """Profile-likelihood interval of one unknown: min over all others of chi2(x) - chi2(best) = 3.84.
 
     Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
@@ -100,7 +100,7 @@ def profile_likelihood(
     if walk.base < -0.1 * CHI2_QUANTILE_95:
         walk.notes.append(f"a fit better by {-walk.base:.2g} in chi2 was met; the point was not the best one")
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
-    return ParameterProfile(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
+    return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
 
 
 def with_profile_intervals(
@@ -109,12 +109,12 @@ def with_profile_intervals(
     """The solution with profile-likelihood intervals, and the verdicts they allow, for weakly determined parameters.
 
     There the cost is not a parabola; nor is it for stiffnesses that are small compared with their typical size
-    (`check_small_estimate`). The solution is unchanged where the problem is too large, as profiles then take long.
+    (`reject_undetermined_small_estimate`). Unchanged where the problem is too large for profiles.
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
-    if not usable or not is_small_problem(problem):
+    if not usable or not is_small_enough_for_profiles(problem):
         return solution
-    sizes = typical_parameter_sizes(problem, solution.x)
+    sizes = typical_parameter_magnitudes(problem, solution.x)
     asked = {}
     for name, entry in solution.parameters.items():
         size = sizes.get(name.split("[")[0], math.nan)
@@ -126,18 +126,18 @@ def with_profile_intervals(
 
     def judged(name: str, best: Array, there: Evaluation) -> ParameterEstimate:
         index, size = problem.unknown_names.index(name), asked[name]
-        entry = check_small_estimate(problem, best, index, solution.parameters[name], size, there)
+        entry = reject_undetermined_small_estimate(problem, best, index, solution.parameters[name], size, there)
         if entry.verdict != "not_identifiable" and not is_std_sufficient(entry):
-            profile = profile_likelihood(problem, best, index, entry.std, there)
+            profile = compute_profile_likelihood_interval(problem, best, index, entry.std, there)
             entry = with_profile_interval(entry, profile.interval, size)
         return entry
 
     progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood")
-    found = map_at_optimum(judged, problem, solution.x, tuple(asked), progress)
+    found = map_parameters_at_optimum(judged, problem, solution.x, tuple(asked), progress)
     return replace(solution, parameters={**solution.parameters, **found})
 
 
-def map_at_optimum(
+def map_parameters_at_optimum(
     judged: Callable[[str, Array, Evaluation], _Found],
     problem: EstimationProblem,
     x: Array,
@@ -156,14 +156,14 @@ def map_at_optimum(
     return dict(zip(names, map_with_batched_calls(one, names), strict=True))
 
 
-def check_small_estimate(
+def reject_undetermined_small_estimate(
     problem: EstimationProblem, x: Array, index: int, entry: ParameterEstimate, size: float, evaluation: Evaluation
 ) -> ParameterEstimate:
     """The estimate, or `not_identifiable` where it is small and the data do not rule out its typical size at 99.9 %.
 
     A branch's twist that no sensor sees swings only where its stiffness is near zero. There it follows the noise: the
     cost has a narrow minimum, below what it is for all large values by what one more parameter takes from the noise.
-    `x` (nx,) is the best fit, `evaluation` that at it, `size` as in `inference.uncertainty.typical_parameter_sizes`.
+    `x` (nx,) is the best fit, `evaluation` that at it, `size` the `typical_parameter_magnitudes`.
     """
     if entry.verdict not in ("identifiable", "weak") or not 0 <= entry.value < _SMALL_VALUE_FRACTION * size:
         return entry
@@ -174,7 +174,7 @@ def check_small_estimate(
     return replace(entry, verdict="not_identifiable", std=math.inf, interval=None)
 
 
-def is_small_problem(problem: EstimationProblem) -> bool:
+def is_small_enough_for_profiles(problem: EstimationProblem) -> bool:
     """Whether a problem is small enough for its profile intervals to be computed by default."""
     few = len(parameter_unknown_names(problem)) <= _MAX_AUTOMATIC_INTERVALS
     return few and len(problem.unknown_names) <= _MAX_UNKNOWNS
@@ -197,7 +197,7 @@ class _Walk:
     def __init__(self, problem: EstimationProblem, x: Array, index: int, best: Evaluation) -> None:
         self.problem, self.index = problem, index
         lower, upper = problem.bounds
-        self.positive = problem.is_positive & (x > 0)
+        self.positive = problem.positive_unknowns_mask & (x > 0)
         self.logarithmic = bool(self.positive[index])
         # infinite bounds and bounds at zero become infinite ones of the coordinates
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -206,7 +206,7 @@ class _Walk:
         self.others = np.setdiff1d(np.arange(len(x)), index)
         self.anchored = self.others[self.positive[self.others]]
         self.centre = self._coordinates(x)
-        self.scale = max(1.0, covariance_and_chi2(problem, best)[1])
+        self.scale = max(1.0, unknowns_covariance_and_reduced_chi2(problem, best)[1])
         self.first = self._chi2(best)
         self.base = 0.0
         self.notes: list[str] = []
@@ -341,7 +341,7 @@ class _Walk:
         if not len(self.others):
             return np.zeros(0)
         low, high = (bound[self.others] - s[self.others] for bound in (self.lower, self.upper))
-        return bounded_least_squares_step(jacobian, rows, damping, low, high)
+        return bounded_levenberg_marquardt_step(jacobian, rows, damping, low, high)
 
     def _at(self, s: Array) -> _Point | None:
         x = self._unknowns(s)
@@ -355,11 +355,11 @@ class _Walk:
         """Twice the cost without the weak priors, in units of the noise."""
         rows = self.problem.residual_rows
         stated, weak = (float(np.sum(evaluation.residual[own] ** 2)) for own in (rows.stated_priors, rows.weak_priors))
-        return (2.0 * evaluation.cost - weak - stated) / self.problem.data_noise_unit**2 + stated
+        return (2.0 * evaluation.cost - weak - stated) / self.problem.data_residual_noise_std**2 + stated
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
         """Residual and Jacobian by the coordinates, with anchors of positive unknowns in place of the weak priors."""
-        residual, jacobian = residual_without_weak_priors(self.problem, evaluation)
+        residual, jacobian = linearization_without_weak_priors(self.problem, evaluation)
         slope = np.where(self.positive, self._unknowns(s), 1.0)
         anchors = np.eye(len(s))[self.anchored] / _LOG_PRIOR_STD
         held = (s - self.centre)[self.anchored] / _LOG_PRIOR_STD

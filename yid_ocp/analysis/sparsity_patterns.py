@@ -12,13 +12,13 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.sensors import Sensor, sensor_function
+from yid_ocp.sensors import Sensor, sensor_reading_function
 
 _ZERO_RTOL = 1e-14  # of the largest entry: rounding
 
 
 @dataclass(frozen=True)
-class NamedRange:
+class NamedIndexRange:
     """A named range of row or column indices."""
 
     name: str
@@ -35,7 +35,7 @@ class SparsityPattern:
     name, title : str
         For files, and for people.
     nonzero_mask : ndarray of bool, shape (r, c)
-    row_blocks, column_blocks : tuple of NamedRange
+    row_blocks, column_blocks : tuple of NamedIndexRange
         Blocks, in order and without gaps.
     marked_mask : ndarray of bool, shape (r, c), or None
         Entries that are highlighted; `mark_label` is their meaning.
@@ -44,14 +44,14 @@ class SparsityPattern:
     name: str
     title: str
     nonzero_mask: BoolArray
-    row_blocks: tuple[NamedRange, ...]
-    column_blocks: tuple[NamedRange, ...]
+    row_blocks: tuple[NamedIndexRange, ...]
+    column_blocks: tuple[NamedIndexRange, ...]
     row_labels: tuple[str, ...]
     column_labels: tuple[str, ...]
     marked_mask: BoolArray | None = None
     mark_label: str = ""
 
-    def with_marked_nonzeros(self, values: Array, where: str) -> SparsityPattern:
+    def with_numerical_nonzeros_marked(self, values: Array, where: str) -> SparsityPattern:
         """The pattern with the numerically nonzero entries of one matrix highlighted."""
         marked = np.abs(values) > _ZERO_RTOL * np.max(np.abs(values), initial=0.0)
         return replace(self, marked_mask=marked, mark_label=f"not zero at {where}")
@@ -69,9 +69,11 @@ _Block = tuple[str, tuple[str, ...]]
 def _pattern(
     name: str, title: str, mask: BoolArray, rows: Sequence[_Block], columns: Sequence[_Block]
 ) -> SparsityPattern:
-    def named(blocks: Sequence[_Block]) -> tuple[tuple[NamedRange, ...], tuple[str, ...]]:
+    def named(blocks: Sequence[_Block]) -> tuple[tuple[NamedIndexRange, ...], tuple[str, ...]]:
         ends = np.cumsum([0, *(len(own) for _, own in blocks)]).tolist()
-        spans = (NamedRange(*entry) for entry in zip((name for name, _ in blocks), ends[:-1], ends[1:], strict=True))
+        spans = (
+            NamedIndexRange(*entry) for entry in zip((name for name, _ in blocks), ends[:-1], ends[1:], strict=True)
+        )
         return tuple(spans), tuple(label for _, own in blocks for label in own)
 
     (row_spans, row_labels), (column_spans, column_labels) = named(rows), named(columns)
@@ -96,9 +98,9 @@ def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
     `dR_dy`, residual by unknowns; `A` = dx_{k+1}/dx_k, `B_u` and `B_theta` by the implicit function theorem;
     `dR_dtheta`, all rows by the parameters.
     """
-    whole = _mask(symbols.jacobian_pattern)
+    whole = _mask(symbols.jacobian_sparsity_pattern)
     system = symbols.equations.system
-    free = list(system.free_indices)
+    free = list(system.unprescribed_coordinate_indices)
     joints = system.mechanism.joint_names
 
     def block(row: str, column: str) -> BoolArray:
@@ -111,7 +113,7 @@ def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
 
     by_new = by("q1", "z1", "lam")
     nc = len(joints)
-    known = np.setdiff1d(np.arange(by_new.shape[1]), system.prescribed_indices)
+    known = np.setdiff1d(np.arange(by_new.shape[1]), system.prescribed_coordinate_indices)
     by_unknown = by_new[:, known]
     inverse = _inverse_sparsity(by_unknown)
 
@@ -211,7 +213,7 @@ def nlp_stage_sparsity(
     others that are not prescribed.
     """
     e, system = symbols.equations, symbols.equations.system
-    kept = list(system.free_indices)
+    kept = list(system.unprescribed_coordinate_indices)
     rows = ca.vertcat(e.residual, e.p1)
     chosen = ca.vertcat(*(system.parameters[name].symbol for name in free)) if free else ca.SX(0, 1)
     local = ca.vertcat(chosen, e.q0, e.p0, e.z0, e.q1, e.z1, e.lam, e.u)
@@ -233,17 +235,17 @@ def nlp_stage_sparsity(
     measured = np.zeros((f + nx, f + nx), bool)
     measured[np.arange(f), np.arange(f)] = True  # priors
     for sensor in sensors:
-        function = sensor_function(system, sensor, tuple(free))
+        function = sensor_reading_function(system, sensor, tuple(free))
         by_q, by_z, by_theta = (_mask(function.sparsity_out(i)) for i in (1, 3, 6))
         reading = np.hstack([by_theta, by_q, np.zeros((len(by_q), n), bool), by_z])
         measured |= _times(reading.T, reading)
     rows_blocks = _blocks(symbols, "del", "internal", "constraint", "p1", kept=kept)
     state, labels = _blocks(symbols, "q0", "p0", "z0"), _blocks(symbols, "lam")[0][1]
-    fixed = np.setdiff1d(np.arange(nx), [*system.prescribed_indices, *loose]).tolist()
+    fixed = np.setdiff1d(np.arange(nx), [*system.prescribed_coordinate_indices, *loose]).tolist()
     return _NlpStage(by_stage, hessian, measured, rows_blocks, state, labels, tuple(free), fixed, loose)
 
 
-def kkt_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
+def full_nlp_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
     """Size of the NLP with a node at every step, of several recordings, whose numbers of steps are given.
 
     `jacobian_nonzeros` counts those of the constraints, `hessian_nonzeros` both triangles of the exact Hessian of the
@@ -287,7 +289,7 @@ def _nlp_sparsity_masks(stage: _NlpStage, steps: int) -> tuple[BoolArray, BoolAr
     return jacobian, hessian, measured
 
 
-def kkt_pattern(stage: _NlpStage, steps: int) -> SparsityPattern:
+def kkt_sparsity_pattern(stage: _NlpStage, steps: int) -> SparsityPattern:
     """The KKT matrix [[H, J'], [J, 0]] of the first steps of a recording, as if every node were measured."""
     jacobian, hessian, measured = _nlp_sparsity_masks(stage, steps)
     blank = np.zeros((len(jacobian), len(jacobian)), bool)

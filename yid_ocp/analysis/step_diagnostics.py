@@ -12,10 +12,10 @@ import numpy as np
 from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.arrays import Array
 from yid_ocp.integrator.step import Step
-from yid_ocp.integrator.step_model import StepLinearization
+from yid_ocp.integrator.step_model import StepEquationLinearizations
 from yid_ocp.model.system import System
 from yid_ocp.problem.episodes import Episode
-from yid_ocp.sensors import sensor_function
+from yid_ocp.sensors import sensor_reading_function
 
 # balances Newton's tolerance against the third derivative, for angles and stiffnesses of order one
 _DIFFERENCE_STEP = 1e-5
@@ -41,7 +41,7 @@ class CheckedLinearisation:
     finite_difference_errors: dict[str, float]
 
 
-def step_structure(step: Step) -> dict[str, Any]:
+def step_size_summary(step: Step) -> dict[str, Any]:
     """Sizes of a step's vectors, number of unknowns, nonzeros of d(residual)/d(unknowns), operations of its functions.
 
     `unknowns` are the free coordinates, internal coordinates and multipliers that Newton's iteration solves for.
@@ -69,7 +69,7 @@ def linearise_and_check(step: Step, state: Array, torque: Array, theta: Array, p
 
     by_state = _differences(lambda v: after(v, torque, theta), state)
     # prescribed coordinates come from the path, so the finite difference does not see them as part of the state
-    keep = np.setdiff1d(np.arange(len(state)), step.system.prescribed_indices)
+    keep = np.setdiff1d(np.arange(len(state)), step.system.prescribed_coordinate_indices)
     errors = {
         "A": _error(a[:, keep], by_state[:, keep]),
         "B_u": _error(b_input, _differences(lambda v: after(state, v, theta), torque)),
@@ -79,7 +79,9 @@ def linearise_and_check(step: Step, state: Array, torque: Array, theta: Array, p
     return CheckedLinearisation(state, a, b_input, b_theta, radius, errors)
 
 
-def linearise_step_equations(step: Step, state: Array, torque: Array, theta: Array, path: Array) -> StepLinearization:
+def linearise_step_equations(
+    step: Step, state: Array, torque: Array, theta: Array, path: Array
+) -> StepEquationLinearizations:
     """Linearised equations of the step that starts at a state (nx,), with derivatives by all parameters.
 
     The torque (nu,) is in N m; `path` (nc,) are the prescribed coordinates, before and after the step.
@@ -90,7 +92,7 @@ def linearise_step_equations(step: Step, state: Array, torque: Array, theta: Arr
     return step.kernel.linearize(theta, pair, lam[None, :], torque[None, :], step.system.parameters.names, True)
 
 
-def with_numeric_parameters(system: System, theta: Array) -> System:
+def system_with_numeric_parameters(system: System, theta: Array) -> System:
     """The system with numeric parameter values in place of symbols, internal coordinates at zero."""
     inner = ca.vertcat(*system.internal_coordinates.values()) if system.internal_coordinates else ca.SX(0, 1)
     symbols = ca.vertcat(system.parameters.symbols, inner)
@@ -128,7 +130,7 @@ _MAX_LISTED_ROWS = 8  # rows that are named one by one
 
 
 @dataclass(frozen=True)
-class ParameterDependence:
+class ParameterEquationDependence:
     """The equations of a step that one parameter enters, and how strongly sensors respond to it.
 
     `rows` contain it whatever the state; `seen` are those of them to which a sensor responds to first order, None
@@ -181,8 +183,13 @@ class ParameterDependence:
 
 
 def parameter_dependences(
-    step: Step, symbols: StepSymbols, episode: Episode | None, state: Array, theta: Array, stages: StepLinearization
-) -> tuple[ParameterDependence, ...]:
+    step: Step,
+    symbols: StepSymbols,
+    episode: Episode | None,
+    state: Array,
+    theta: Array,
+    stages: StepEquationLinearizations,
+) -> tuple[ParameterEquationDependence, ...]:
     """Dependence of the step equations and of a recording's sensors on every parameter, about a state (nx,).
 
     A unit is added to one row of one step that starts at `state`; with A - B_u K the steps after it are linear, K the
@@ -192,12 +199,14 @@ def parameter_dependences(
     names, parameters = symbols.row_names, step.system.parameters
     span = symbols.block_slice("theta")
     entered: dict[int, list[int]] = {i: [] for i in range(len(parameters))}
-    for row, column in zip(*symbols.jacobian_pattern.get_triplet(), strict=True):
+    for row, column in zip(*symbols.jacobian_sparsity_pattern.get_triplet(), strict=True):
         if span.start <= column < span.stop:
             entered[column - span.start].append(row)
     if episode is None:
         return tuple(
-            ParameterDependence(p.name, p.unit, tuple(names[r] for r in sorted(entered[i])), None, "", (), None, 0.0)
+            ParameterEquationDependence(
+                p.name, p.unit, tuple(names[r] for r in sorted(entered[i])), None, "", (), None, 0.0
+            )
             for i, p in enumerate(parameters)
         )
     sizes = step.sizes
@@ -218,7 +227,9 @@ def parameter_dependences(
         read = tuple(s.name for s in sensors if np.any(s.by_theta[:, i]))
         moved = float(np.max(by_theta[:, i], initial=0.0))
         seen, entered_rows = (tuple(names[r] for r in chosen) for chosen in (answered, rows))
-        found.append(ParameterDependence(p.name, p.unit, entered_rows, seen, best, read, moved, steps * step.time_step))
+        found.append(
+            ParameterEquationDependence(p.name, p.unit, entered_rows, seen, best, read, moved, steps * step.time_step)
+        )
     return tuple(found)
 
 
@@ -244,11 +255,11 @@ def _sensors(step: Step, episode: Episode, state: Array, theta: Array) -> list[_
     system, n, found = step.system, step.system.n_coordinates, []
     at = [state[:n], np.zeros(n), state[2 * n :], np.zeros(n), np.zeros(system.n_constraints), theta]
     for samples in episode.measurements:
-        known = np.where(np.isfinite(samples.std) & samples.is_used, samples.std, np.nan)
+        known = np.where(np.isfinite(samples.std) & samples.used_output_mask, samples.std, np.nan)
         if np.any(np.isfinite(known)):
-            used = np.any(samples.is_used, axis=0)
+            used = np.any(samples.used_output_mask, axis=0)
             std = np.array([np.nanmedian(known[:, k]) if u else np.inf for k, u in enumerate(used)])
-            function = sensor_function(system, samples.sensor, system.parameters.names)
+            function = sensor_reading_function(system, samples.sensor, system.parameters.names)
             _, by_q, _, by_z, by_effort, _, by_theta = (np.array(x.full()) / std[:, None] for x in function.call(at))
             by_state = np.hstack([by_q, np.zeros_like(by_q), by_z])
             found.append(_WhitenedSensor(samples.sensor.group_name, by_state, by_effort, by_theta))
@@ -257,7 +268,7 @@ def _sensors(step: Step, episode: Episode, state: Array, theta: Array) -> list[_
 
 def _answers(
     step: Step,
-    stages: StepLinearization,
+    stages: StepEquationLinearizations,
     gain: Array,
     push: Array,
     sensors: Sequence[_WhitenedSensor],
@@ -268,7 +279,7 @@ def _answers(
     sizes, h = step.sizes, step.time_step
     n, nz, width = sizes["n"], sizes["nz"], push.shape[1]
     nt = n + nz + sizes["m"]
-    known = list(step.system.prescribed_indices)
+    known = list(step.system.prescribed_coordinate_indices)
     solved = np.setdiff1d(np.arange(nt), known)
     new, p_new = stages.residual_by_new[0], stages.p1_by_new[0]
     inverse = np.linalg.inv(new[np.ix_(solved, solved)])

@@ -65,7 +65,7 @@ _FUNCTION_NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name 
 
 
 @dataclass(frozen=True)
-class SymbolName:
+class _SymbolName:
     """Name of a variable in plain text and in LaTeX."""
 
     text: str
@@ -94,7 +94,7 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
 
 
 def format_expressions(
-    expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[SymbolName], latex: bool = False
+    expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[_SymbolName], latex: bool = False
 ) -> FormulaText:
     """Scalar expressions as text or LaTeX, with the names of the variables (k, 1), all symbols that may occur."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
@@ -211,7 +211,7 @@ class EquationEntry:
         return f"d {self.row_name} / d {self.column_name}" if self.column_name else self.row_name
 
     @property
-    def is_zero(self) -> bool:
+    def is_identically_zero(self) -> bool:
         """Whether it is zero for every state."""
         return bool(self.expression.is_zero())
 
@@ -222,7 +222,7 @@ class EquationEntry:
     @property
     def text_lines(self) -> list[str]:
         """Text lines of the whole expression, its shared parts first."""
-        if self.is_zero:
+        if self.is_identically_zero:
             return [f"{self.title} = 0 whatever the state"]
         said = [_headline(self.title, self.formula.n_operations, self.variable_names)]
         said += [f"  {name} = {text}" for name, text in self.formula.shared_subexpressions]
@@ -257,7 +257,7 @@ class StepSymbols(ReprMixin):
         """Named rows and columns of a step's equations."""
         e, system = equations, equations.system
         joints, internal = system.mechanism.joint_names, tuple(system.internal_coordinates)
-        closed = tuple(name for grasp in system.grasps for name in grasp.equation_names)
+        closed = tuple(name for grasp in system.grasps for name in grasp.constraint_equation_names)
         k, after = r"_{k,\,#}", r"_{k+1,\,#}"
         rows = (
             SymbolBlock("del", joints, e.momentum_balance, "DEL equation, balance of momentum", "R" + k),
@@ -289,7 +289,7 @@ class StepSymbols(ReprMixin):
         return tuple(name for block in self.column_blocks for name in block.full_names)
 
     @cached_property
-    def row_expressions(self) -> ca.SX:
+    def _row_expressions(self) -> ca.SX:
         """Expressions of all rows, shape (n + nz + m + n, 1)."""
         return ca.vertcat(*(block.expressions for block in self.row_blocks))
 
@@ -299,16 +299,16 @@ class StepSymbols(ReprMixin):
         return ca.vertcat(*(block.expressions for block in self.column_blocks))
 
     @cached_property
-    def jacobian_pattern(self) -> ca.Sparsity:
+    def jacobian_sparsity_pattern(self) -> ca.Sparsity:
         """Sparsity of the Jacobian of all rows by all columns."""
-        found: ca.Sparsity = ca.jacobian_sparsity(self.row_expressions, self.column_symbols)
+        found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.column_symbols)
         return found
 
     @cached_property
-    def column_display_names(self) -> tuple[SymbolName, ...]:
+    def column_display_names(self) -> tuple[_SymbolName, ...]:
         """Text and LaTeX names of all columns, in order."""
         return tuple(
-            SymbolName(name, block.latex_template.replace("#", rf"\mathrm{{{escape_latex(label)}}}"))
+            _SymbolName(name, block.latex_template.replace("#", rf"\mathrm{{{escape_latex(label)}}}"))
             for block in self.column_blocks
             for name, label in zip(block.full_names, block.labels, strict=True)
         )
@@ -321,12 +321,12 @@ class StepSymbols(ReprMixin):
         at = names.index(block)
         return slice(ends[at], ends[at + 1])
 
-    def row_index(self, name: str) -> int:
+    def _row_index(self, name: str) -> int:
         """Index of a row by its full name; raises `ConfigError` with the nearest name where it does not exist."""
         return _place(name, self.row_names, "row", self.row_blocks)
 
-    def column_index(self, name: str) -> int:
-        """As `row_index`, of a column."""
+    def _column_index(self, name: str) -> int:
+        """As `_row_index`, of a column."""
         return _place(name, self.column_names, "column", self.column_blocks)
 
     def equation_entry(self, text: str) -> EquationEntry:
@@ -344,10 +344,10 @@ class StepSymbols(ReprMixin):
             allowed = "the name of a row, or of a row and a column with a comma between them"
             hint = "--entry 'del[T1_0_x], q1[T1_0_x]'"
             raise ConfigError(f"'{text}' is no entry", where="--entry", allowed=allowed, hint=hint)
-        row, column = self.row_index(said[0]), ""
-        expression = self.row_expressions[row]
+        row, column = self._row_index(said[0]), ""
+        expression = self._row_expressions[row]
         if len(said) == 2:
-            at = self.column_index(said[1])
+            at = self._column_index(said[1])
             expression, column = ca.jacobian(expression, self.column_symbols[at]), self.column_names[at]
         made = format_expressions([expression], self.column_symbols, self.column_display_names)
         used = self._summarize_columns(made.variable_indices)
@@ -367,7 +367,7 @@ class StepSymbols(ReprMixin):
         said = []
         place = {self.column_symbols[i].element_hash(): i for i in range(self.column_symbols.numel())}
         for at, name in enumerate(self.row_names):
-            row = self.row_expressions[at]
+            row = self._row_expressions[at]
             count = count_operations([row], self.column_symbols)
             if count <= _MAX_PRINTED_OPERATIONS:
                 said += self.equation_entry(name).text_lines

@@ -21,9 +21,9 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory
 from yid_ocp.integrator.rollout import linearized_steps
-from yid_ocp.integrator.tracking_feedback import torque_error_feedthrough
+from yid_ocp.integrator.tracking_feedback import applied_torque_error_feedthrough
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import InputErrors
+from yid_ocp.problem.episodes import InputErrorModel
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.sensors import Sensor
 from yid_ocp.sensors.joints import PositionSensor
@@ -33,7 +33,7 @@ _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 """Random samples of all errors at first, twice as many as long as they are too few, and at most."""
 
 
-def episode_sensitivities(
+def episode_sensitivities_and_information(
     problem: EstimationProblem,
     evaluation: Evaluation,
     x: Array,
@@ -72,7 +72,7 @@ def episode_sensitivities(
         if encoders is not None:
             nodes, nx = course.rollout.state.shape
             angles = np.zeros((nodes, len(driving.input_errors.angle_std), nx))
-            angles[:, np.arange(angles.shape[1]), list(problem.system.driven_indices)] = 1.0
+            angles[:, np.arange(angles.shape[1]), list(problem.system.driven_coordinate_indices)] = 1.0
             by_state.append(angles)
             units += list(driving.input_errors.angle_std)
         scale = np.array(units)[:, None]
@@ -96,7 +96,7 @@ def episode_sensitivities(
 
 def _by_state(course: NominalTrajectory, sensor: Sensor) -> Array:
     """Slopes of a sensor's readings at every node by the state there, shape (N + 1, k, nx)."""
-    read = course.model_functions.compiled_sensor(sensor)(course.node_values, course.theta)
+    read = course.model_functions.compiled_sensor_function(sensor)(course.node_values, course.theta)
     return np.concatenate([read.by_q, np.zeros_like(read.by_q), read.by_z], axis=2)
 
 
@@ -107,14 +107,14 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
         raise SolverError(f"the model cannot be rolled out: {evaluation.message}")
     for samples, rows in zip(encoders.episodes[i].measurements, encoders.residual_rows.measurements[i], strict=True):
         if isinstance(samples.sensor, PositionSensor):
-            read = samples.interpolate(blur[samples.evaluation_nodes])
+            read = samples.interpolate_to_samples(blur[samples.evaluation_nodes])
             own = samples.residual_block(np.zeros(samples.value.shape), read).jacobian
             assert own is not None
             return np.hstack([evaluation.jacobian[rows], own])
     return np.zeros((0, len(x) + blur.shape[2]))
 
 
-def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrors, slopes: Array) -> Array:
+def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrorModel, slopes: Array) -> Array:
     """Sensitivity of readings to a few unit-variance unknowns that represent all torque and encoder errors.
 
     The tracking filter keeps the arms on what they followed. Where it follows encoders that are measurements, its share
@@ -143,15 +143,15 @@ def _low_rank_error_sensitivity(course: NominalTrajectory, errors: InputErrors, 
 class _Motion:
     """How errors of unit standard deviation move the state: of the start, of samples, of steps, the constant one."""
 
-    def __init__(self, course: NominalTrajectory, errors: InputErrors) -> None:
+    def __init__(self, course: NominalTrajectory, errors: InputErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
-        momentum = course.model_functions.momentum_shift.momentum_by_torque(course.theta)
+        momentum = course.model_functions.momentum_shift.momentum_derivative_by_torque(course.theta)
         by_state, by_torque, by_angles = [], [], []
         for k, here in enumerate(linearized_steps(step, course.theta, course.rollout)):
             state, by_error = here.state_by_state.copy(), here.state_by_torque.copy()
             angles = np.zeros_like(by_error)
             if feedback is not None:
-                by_error = here.state_by_torque @ torque_error_feedthrough(feedback.gain[k], momentum)
+                by_error = here.state_by_torque @ applied_torque_error_feedthrough(feedback.gain[k], momentum)
                 pulled = here.state_by_torque @ feedback.gain[k]
                 state[:, feedback.state_indices] -= pulled
                 angles = pulled[:, : angles.shape[1]] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    MECHANICAL_CHANGES,
-    BaseExperiment,
+    MECHANICAL_EXPERIMENT_CHANGES,
     CandidateExperiment,
     CandidateExperimentBuilder,
-    FrameObservation,
+    FrameObservationSchedule,
+    RecordedExperiment,
     observable_frames,
     uniform_sample_times,
 )
@@ -46,7 +46,7 @@ class ExperimentChange:
     name : str
         `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
     mechanical_change : str
-        Key of `MECHANICAL_CHANGES`, empty where only sensors change.
+        Key of `MECHANICAL_EXPERIMENT_CHANGES`, empty where only sensors change.
     camera_frame, arm_frame : str
         Frame that the camera sees, or an arm measures, besides; empty for none.
     camera_rate : float or None
@@ -163,7 +163,7 @@ def what_if(
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
         inflation = max(1.0, identifiability(problem, x, start=start, grasp_std=grasp_std).chi2_per_dof)
-    setting = BaseExperiment(problem, x, start, grasp_std, two_arm_system)
+    setting = RecordedExperiment(problem, x, start, grasp_std, two_arm_system)
     outcomes = _Outcomes(setting, inflation, progress, evaluate_changes)
     (base,) = outcomes.of_all([()])
     if not base.verdicts:
@@ -178,7 +178,7 @@ def what_if(
 
 
 def evaluate_change_sets(
-    setting: BaseExperiment, sets: Sequence[Sequence[str]], inflation: float
+    setting: RecordedExperiment, sets: Sequence[Sequence[str]], inflation: float
 ) -> list[ChangedExperimentResult]:
     """Predicted results of an experiment with each of several sets of changes, given by name.
 
@@ -243,7 +243,7 @@ class _Outcomes:
 
     def __init__(
         self,
-        setting: BaseExperiment,
+        setting: RecordedExperiment,
         inflation: float,
         progress: Progress = NULL_PROGRESS,
         judge: ChangeSetEvaluator | None = None,
@@ -257,14 +257,14 @@ class _Outcomes:
     def possible(self) -> list[ExperimentChange]:
         """All single changes that apply to the experiment."""
         setting, episode = self.setting, self.setting.problem.episodes[0]
-        camera, arm = setting.camera_sampling(episode)[0], setting.arm_sampling(episode)[0]
-        views = setting.recorded_observations(episode)
+        camera, arm = setting.camera_sample_times_and_std(episode)[0], setting.arm_sample_times_and_std(episode)[0]
+        views = setting.existing_sensor_observations(episode)
         looked, felt = (
             {view.frame for view in views if group is not None and view.point_group == group.name}
             for group in (camera, arm)
         )
-        names = self.builder.applicable_changes()
-        changes = [ExperimentChange(name, MECHANICAL_CHANGES[name], name) for name in names]
+        names = self.builder.applicable_mechanical_changes()
+        changes = [ExperimentChange(name, MECHANICAL_EXPERIMENT_CHANGES[name], name) for name in names]
         for sight in observable_frames(setting.problem.system):
             name, words = sight.name, sight.description
             if name not in looked | felt:
@@ -308,28 +308,31 @@ class _Outcomes:
 
     def _views(
         self, episode: Episode, changes: Sequence[ExperimentChange], layout: CandidateExperiment
-    ) -> list[FrameObservation]:
+    ) -> list[FrameObservationSchedule]:
         setting = self.setting
-        camera, times, std = setting.camera_sampling(episode)
-        arm, arm_times, arm_std = setting.arm_sampling(episode)
+        camera, times, std = setting.camera_sample_times_and_std(episode)
+        arm, arm_times, arm_std = setting.arm_sample_times_and_std(episode)
         looking, feeling = CAMERA_GROUP if camera is None else camera.name, ARM_GROUP if arm is None else arm.name
         rate = next((change.camera_rate for change in changes if change.camera_rate is not None), None)
         if rate is not None:
             times = uniform_sample_times(episode.grid, rate)
 
-        def look(frame: str) -> FrameObservation:
-            return FrameObservation(looking, frame, times, np.full((len(times), 3), std))
+        def look(frame: str) -> FrameObservationSchedule:
+            return FrameObservationSchedule(looking, frame, times, np.full((len(times), 3), std))
 
         # a point that a second arm now holds is that arm's to measure
         held, before = ({grasp.held_frame for grasp in p.system.grasps} for p in (layout.problem, setting.problem))
         views = [
             look(view.frame) if view.point_group == looking and rate is not None else view
-            for view in setting.recorded_observations(episode)
+            for view in setting.existing_sensor_observations(episode)
             if view.point_group != looking or view.frame not in held - before
         ]
         views += [look(change.camera_frame) for change in changes if change.camera_frame]
         feels = [*sorted(held - before), *(change.arm_frame for change in changes if change.arm_frame)]
-        views += [FrameObservation(feeling, frame, arm_times, np.full((len(arm_times), 3), arm_std)) for frame in feels]
+        views += [
+            FrameObservationSchedule(feeling, frame, arm_times, np.full((len(arm_times), 3), arm_std))
+            for frame in feels
+        ]
         return views
 
 

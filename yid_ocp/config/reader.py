@@ -20,7 +20,12 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, ScalarEvent
 
-from yid_ocp.config.schema import SectionVariants, iter_settable_keys, section_variants, unknown_key_error
+from yid_ocp.config.schema import (
+    SectionVariants,
+    iter_settable_key_completions,
+    section_variants_from_annotation,
+    unknown_key_error,
+)
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.options import (
@@ -28,8 +33,8 @@ from yid_ocp.options import (
     dataclass_options,
     describe_type,
     mapping_value_type,
-    sequence_entry_type,
     split_annotated,
+    tuple_entry_type,
     union_members,
 )
 
@@ -70,7 +75,7 @@ def load_config(
     return dataclasses.replace(run, name=file.stem, config_file=str(file), key_locations=places)
 
 
-def settable_keys(prefix: str, path: str | Path | None = None) -> list[str]:
+def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> list[str]:
     """Dotted keys that `overrides` may set and that begin with a prefix, with the names used in a given file.
 
     Raises
@@ -79,7 +84,7 @@ def settable_keys(prefix: str, path: str | Path | None = None) -> list[str]:
         The file cannot be read.
     """
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
-    return list(iter_settable_keys(RunSettings, prefix, data))
+    return list(iter_settable_key_completions(RunSettings, prefix, data))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -198,15 +203,15 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
 
 def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_KeyPath, str]) -> Any:
     """What stands at a key once a value is set there: sections of one kind merge, all else is replaced."""
-    sections = section_variants(hint)
+    sections = section_variants_from_annotation(hint)
     merges = bool(value) and isinstance(before, dict) and isinstance(value, dict)
     if merges and sections is not None and sections.selector_key in value:
-        merges = sections.selected_variant(value) == sections.selected_variant(before)
+        merges = sections.selected_variant_name(value) == sections.selected_variant_name(before)
     if not merges:
         for known in [known for known in places if known[: len(path)] == path]:
             del places[known]
         return value
-    keys = {} if sections is None else sections.variant_options(sections.selected_variant({**before, **value}))
+    keys = {} if sections is None else sections.variant_options(sections.selected_variant_name({**before, **value}))
     for name, entry in value.items():
         kind = keys[name].type_hint if name in keys else mapping_value_type(hint)
         before[name] = _merged(kind, before.get(name), entry, (*path, name), places)
@@ -218,17 +223,17 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
     if not parts:
         return (), hint
     name, rest = parts[0], parts[1:]
-    sections, values = section_variants(hint), mapping_value_type(hint)
-    inner = section_variants(values)
+    sections, values = section_variants_from_annotation(hint), mapping_value_type(hint)
+    inner = section_variants_from_annotation(values)
     if sections is not None:
-        known = sections.variant_options(sections.selected_variant(raw))
+        known = sections.variant_options(sections.selected_variant_name(raw))
         if name not in known:
             raise unknown_key_error(name, known, origin)
         below = known[name].type_hint
     elif values is None:
         raise ConfigError(f"there are no keys below '{name}'", where=origin, hint="shorten the key")
     elif inner is not None and inner.selector_key == "name":
-        below = inner.for_name(name, origin).classes[""]
+        below = inner.variants_for_mapping_key(name, origin).classes[""]
     else:
         known = {} if inner is None else inner.variant_options()
         cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
@@ -260,19 +265,25 @@ class _Reader:
 
     def build(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
         """A value of the given type."""
-        sections, entries, values = section_variants(hint), sequence_entry_type(hint), mapping_value_type(hint)
+        sections, entries, values = (
+            section_variants_from_annotation(hint),
+            tuple_entry_type(hint),
+            mapping_value_type(hint),
+        )
         if sections is not None:
             return None if raw is None and sections.is_nullable else self._section(sections, raw, path)
-        if entries is not None and section_variants(entries) is not None:
+        if entries is not None and section_variants_from_annotation(entries) is not None:
             if not isinstance(raw, list):
                 raise self._wrong(raw, hint, path)
             return tuple(self.build(entries, value, (*path, i)) for i, value in enumerate(raw))
-        inner = section_variants(values)
+        inner = section_variants_from_annotation(values)
         if inner is not None:
             if raw is not None and not isinstance(raw, dict):
                 raise self._wrong(raw, hint, path)
             return {
-                name: self._section(inner.for_name(name, self.where((*path, name))), value, (*path, name))
+                name: self._section(
+                    inner.variants_for_mapping_key(name, self.where((*path, name))), value, (*path, name)
+                )
                 for name, value in (raw or {}).items()
             }
         return self._leaf(hint, raw, path)
@@ -284,7 +295,7 @@ class _Reader:
             what = f"{self._name(path)} = {_shown(raw)} is not a section"
             hint = _key_meant(self._name(path), keys)
             raise ConfigError(what, where=self.where(path), allowed="keys: " + ", ".join(keys), hint=hint)
-        word = sections.selected_variant(raw)
+        word = sections.selected_variant_name(raw)
         if not isinstance(word, str) or word not in sections.classes:
             at = (*path, sections.selector_key) if sections.selector_key in raw else path
             raise sections.unknown_variant_error(word, self.where(at))
@@ -346,7 +357,7 @@ def _refuse_nan(word: str) -> float:
 def _absolute(value: Any, hint: Any, base: Path) -> Any:
     """Paths within a value, relative to the configuration no longer."""
     if isinstance(value, tuple):
-        entries = sequence_entry_type(hint)
+        entries = tuple_entry_type(hint)
         return value if entries is None else tuple(_absolute(entry, entries, base) for entry in value)
     markers = [marker for part in (hint, *union_members(hint)) for marker in split_annotated(part)[1]]
     is_path = any(isinstance(marker, OptionInfo) and marker.is_path for marker in markers)

@@ -18,8 +18,8 @@ from yid_ocp.options import (
     RegistryChoice,
     dataclass_options,
     mapping_value_type,
-    sequence_entry_type,
     split_annotated,
+    tuple_entry_type,
     union_members,
 )
 
@@ -48,21 +48,21 @@ class SectionVariants:
     variant_noun: str = ""
     is_nullable: bool = False
 
-    def selected_variant(self, raw: Any) -> Any:
+    def selected_variant_name(self, raw: Any) -> Any:
         """Value of the selector key in a raw section; the default where the key is absent."""
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
 
     def variant_options(self, word: Any = "") -> Mapping[str, Option]:
-        """Options by key of the selected class; of the first class where the value selects none."""
+        """Options by key of the class that `word` selects; of the first class where it selects none."""
         known = isinstance(word, str) and word in self.classes
         options = dataclass_options(self.classes[word] if known else next(iter(self.classes.values())))
         if self.selector_key in ("", *options):
             return options
         return {self.selector_key: Option(Literal[tuple(self.classes)], self.default_variant), **options}
 
-    def for_name(self, name: str, where: str) -> SectionVariants:
-        """Classes allowed under one name of a mapping: the registered class of that name, or all."""
+    def variants_for_mapping_key(self, name: str, where: str) -> SectionVariants:
+        """The settings classes allowed under one key of a mapping: the class registered by that name, or all."""
         if self.selector_key != "name":
             return self
         if name not in self.classes:
@@ -78,7 +78,7 @@ class SectionVariants:
         return ConfigError(what, where=where, **unknown_name_details(str(word), self.classes))
 
 
-def section_variants(hint: Any) -> SectionVariants | None:
+def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
     """Alternative settings classes that a type annotation allows; None for other types."""
     bare, markers = split_annotated(hint)
     nullable = type(None) in get_args(bare)
@@ -106,7 +106,7 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
     return ConfigError(what, where=where, allowed=said["allowed"], hint="; ".join(hints))
 
 
-def iter_settable_keys(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
+def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
     """Yield completions of a dotted key prefix, up to the next dot or to `=` where a value follows.
 
     Parameters
@@ -118,11 +118,11 @@ def iter_settable_keys(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterat
     at : str
         The keys before, each with its dot.
     """
-    sections, values = section_variants(hint), mapping_value_type(hint)
-    named = section_variants(values)
+    sections, values = section_variants_from_annotation(hint), mapping_value_type(hint)
+    named = section_variants_from_annotation(values)
     below: dict[str, Any] = {}
     if sections is not None:
-        options = sections.variant_options(sections.selected_variant(raw))
+        options = sections.variant_options(sections.selected_variant_name(raw))
         below = {name: option.type_hint for name, option in options.items()}
     elif named is not None and named.selector_key == "name":
         below = dict(named.classes)
@@ -131,17 +131,21 @@ def iter_settable_keys(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterat
     for name, inner in below.items():
         path = f"{at}{name}"
         if prefix.startswith(f"{path}."):
-            yield from iter_settable_keys(inner, prefix, raw.get(name) if isinstance(raw, dict) else None, f"{path}.")
+            yield from iter_settable_key_completions(
+                inner, prefix, raw.get(name) if isinstance(raw, dict) else None, f"{path}."
+            )
         elif path.startswith(prefix):
-            yield path + ("=" if section_variants(inner) is None and mapping_value_type(inner) is None else ".")
+            yield path + (
+                "=" if section_variants_from_annotation(inner) is None and mapping_value_type(inner) is None else "."
+            )
 
 
 def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
     """Yield descriptions of the sections that have a key; NAME represents a user-chosen name."""
-    for inner, step in ((mapping_value_type(hint), ".NAME"), (sequence_entry_type(hint), "")):
+    for inner, step in ((mapping_value_type(hint), ".NAME"), (tuple_entry_type(hint), "")):
         if inner is not None:
             yield from _sections_with_key(inner, name, at + step)
-    sections = section_variants(hint)
+    sections = section_variants_from_annotation(hint)
     if sections is None:
         return
     having = [word for word, kind in sections.classes.items() if name in dataclass_options(kind)]
@@ -163,22 +167,22 @@ def config_json_schema() -> dict[str, Any]:
 
 
 def _described_schema(hint: Any) -> dict[str, Any]:
-    about = option_info(hint)
+    about = option_info_from_annotation(hint)
     text = about.description + (f" [{about.unit}]" if about.unit else "")
     return _type_schema(hint) | ({"description": text} if text else {})
 
 
 def _type_schema(hint: Any) -> dict[str, Any]:
-    sections, entries, values = section_variants(hint), sequence_entry_type(hint), mapping_value_type(hint)
+    sections, entries, values = section_variants_from_annotation(hint), tuple_entry_type(hint), mapping_value_type(hint)
     if sections is not None:
         parts = [_section_schema(sections, word) for word in sections.classes]
         parts += [{"type": "null"}] if sections.is_nullable else []
         return parts[0] if len(parts) == 1 else {"anyOf": parts}
-    if entries is not None and section_variants(entries) is not None:
+    if entries is not None and section_variants_from_annotation(entries) is not None:
         return {"type": "array", "items": _described_schema(entries)}
-    inner = section_variants(values)
+    inner = section_variants_from_annotation(values)
     if inner is not None and inner.selector_key == "name":
-        named = {name: _section_schema(inner.for_name(name, ""), "") for name in inner.classes}
+        named = {name: _section_schema(inner.variants_for_mapping_key(name, ""), "") for name in inner.classes}
         return {"type": "object", "properties": named, "additionalProperties": False}
     if inner is not None:
         return {"type": "object", "additionalProperties": _described_schema(values)}
@@ -206,7 +210,7 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
     return result | ({"required": required} if required else {})
 
 
-def option_info(hint: Any) -> OptionInfo:
-    """Meaning and unit of an option's type; empty ones where it has none."""
+def option_info_from_annotation(hint: Any) -> OptionInfo:
+    """The `OptionInfo` in a type annotation (meaning and unit); an empty one where there is none."""
     markers = reversed(split_annotated(hint)[1])
     return next((marker for marker in markers if isinstance(marker, OptionInfo)), OptionInfo())

@@ -19,9 +19,9 @@ from ruamel.yaml.comments import CommentedSeq
 from yid_ocp.data.recording import ClockKind
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
-from yid_ocp.inference.null_test import GapCriteria
+from yid_ocp.inference.null_test import ExcessResidualCriteria
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
-from yid_ocp.model.objects import OBJECTS, ObjectKind
+from yid_ocp.model.objects import OBJECT_KINDS, ObjectKind
 from yid_ocp.model.objects.base import MountSettings
 from yid_ocp.model.servos_and_springs import CommandInterpolation
 from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
@@ -160,7 +160,7 @@ class ModelSettings:
         ),
     ] = field(default_factory=dict)
     object: Annotated[
-        ObjectKind | None, RegistryChoice(OBJECTS, selector_key="kind"), OptionInfo("the flexible object")
+        ObjectKind | None, RegistryChoice(OBJECT_KINDS, selector_key="kind"), OptionInfo("the flexible object")
     ] = None
     grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("by name: left, right, gripper")] = field(
         default_factory=dict
@@ -304,9 +304,9 @@ class DiagnosisSettings(Thresholds):
     ] = ()
 
     @property
-    def fit_gap_limits(self) -> GapCriteria:
-        """Limits of the null test for a fit's residual, in the sensors' stated standard deviations."""
-        return replace(self.gap_limits, noise_fraction=self.noise_fraction)
+    def null_test_residual_limits(self) -> ExcessResidualCriteria:
+        """Limits of the null test on the residual after a fit, in units of the sensors' stated standard deviations."""
+        return replace(self.null_test_limits, noise_fraction=self.noise_fraction)
 
 
 def _compared() -> dict[str, Solver]:

@@ -10,16 +10,16 @@ import scipy.special
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.issues import (
-    MIN_NOISE_DIFFERENCES,
+    MIN_DIFFERENCES_FOR_NOISE_STD,
     QUALITY_LIMITS,
     Issue,
-    SensorChoiceLookup,
+    SensorOptionsLookup,
     median_sample_period,
 )
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, nearest_name_hint
-from yid_ocp.sensors import CHANNELS
-from yid_ocp.sensors.joints import EFFORT_GROUP, NOISE_DIFFERENCE_ORDER
+from yid_ocp.sensors import CHANNEL_KINDS
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_DIFFERENCE_ORDER
 
 _MAX_REPEATED_FRACTION = 0.1
 """Largest fraction of a channel's samples that may repeat the previous one."""
@@ -96,10 +96,10 @@ def _longest_run(same: BoolArray) -> tuple[int, int]:
 def white_noise_std(t: Array, values: Array) -> float:
     """Robust standard deviation of a channel's white noise; zero for long rests or an uneven clock."""
     even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
-    if len(t) < NOISE_DIFFERENCE_ORDER + MIN_NOISE_DIFFERENCES:
+    if len(t) < NOISE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
     together = np.lib.stride_tricks.sliding_window_view(even, NOISE_DIFFERENCE_ORDER).all(axis=1)
-    if together.sum() < MIN_NOISE_DIFFERENCES:
+    if together.sum() < MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
     size = math.sqrt(float(scipy.special.comb(2 * NOISE_DIFFERENCE_ORDER, NOISE_DIFFERENCE_ORDER)))
     return float(1.4826 * np.median(np.abs(np.diff(values, NOISE_DIFFERENCE_ORDER)[together])) / size)
@@ -118,7 +118,7 @@ def quantization_step(values: Array) -> float:
     return step if np.mean(np.abs(count - np.rint(count)) < 0.05 * np.maximum(count, 1)) > 0.95 else 0.0
 
 
-def _stated(recording: Recording, choice: SensorChoiceLookup, group: str, channel: str) -> float:
+def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, channel: str) -> float:
     """Standard deviation that settings or recording give to a channel, zero where nobody says."""
     joints = recording.joints
     quantity, _, name = channel.partition(".")
@@ -126,7 +126,9 @@ def _stated(recording: Recording, choice: SensorChoiceLookup, group: str, channe
         said = choice(f"joints.{quantity}").std
         if isinstance(said, Mapping):
             return float(said.get(name, 0.0))
-        given = said if said is not None else getattr(joints, CHANNELS[f"joints.{quantity}"].std_fields[0])
+        given = (
+            said if said is not None else getattr(joints, CHANNEL_KINDS[f"joints.{quantity}"].std_attribute_names[0])
+        )
         if given is None:
             return 0.0
         return float(np.broadcast_to(given, (len(joints.names),))[joints.names.index(name)])
@@ -140,7 +142,7 @@ def _stated(recording: Recording, choice: SensorChoiceLookup, group: str, channe
     return float(np.nanmedian(spread)) if np.any(np.isfinite(spread)) else 0.0
 
 
-def excess_noise_issues(recording: Recording, choice: SensorChoiceLookup) -> Iterator[Issue]:
+def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
     """Issues for channels whose quantization or noise exceeds the stated noise; slow frame rates are skipped."""
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) < 100 or median_sample_period(t) > 0.05:
@@ -172,7 +174,7 @@ def excess_noise_issues(recording: Recording, choice: SensorChoiceLookup) -> Ite
             yield Issue("noise", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
 
 
-def overstated_noise_issues(recording: Recording, choice: SensorChoiceLookup) -> Iterator[Issue]:
+def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
     """Issues for channels far less noisy than the recording states; channels of equal stated noise are pooled.
 
     What settings state may stand for what a model misses, and only a fit can say whether it is too much. Noise need not
@@ -186,7 +188,12 @@ def overstated_noise_issues(recording: Recording, choice: SensorChoiceLookup) ->
         sensor = f"joints.{channel.partition('.')[0]}" if group == "joints" else group
         said, step = choice(sensor), median_sample_period(t)
         stated = _stated(recording, choice, group, channel)
-        if stated <= 0 or said.std is not None or said.use is False or (commanded and sensor == EFFORT_GROUP):
+        if (
+            stated <= 0
+            or said.std is not None
+            or said.use is False
+            or (commanded and sensor == JOINT_EFFORT_GROUP_NAME)
+        ):
             continue
         if len(t) < 100 or not 0 < step <= _MAX_SAMPLE_PERIOD:
             continue
@@ -239,7 +246,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
             alone = at.sum() >= QUALITY_LIMITS.min_clipped_samples and at.sum() > 5 * np.max(counts[near], initial=0)
             if (
                 alone
-                and len(levels) > MIN_NOISE_DIFFERENCES
+                and len(levels) > MIN_DIFFERENCES_FOR_NOISE_STD
                 and held >= QUALITY_LIMITS.min_clipped_samples / 2
                 and apart >= 2
             ):
@@ -253,10 +260,10 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
                 yield Issue("saturated", what, "not_trusted", ratio, advice, "", group, channel, begin, end)
 
 
-def median_edge_lengths(
+def median_point_pair_distances(
     edges: Sequence[tuple[str, str]], recordings: Sequence[Recording], frames: int | None = None
 ) -> dict[tuple[str, str], float]:
-    """Median over recordings of the mean measured length of every edge [m].
+    """Distance between the points of every pair: mean over a recording's frames, median over recordings [m].
 
     Parameters
     ----------

@@ -23,13 +23,13 @@ from yid_ocp.data.channel_checks import (
 )
 from yid_ocp.data.issues import (
     DEGREES_PER_RADIAN,
-    MAX_LIMIT_RATIO,
-    MIN_EPOCH_SECONDS,
+    MAX_ISSUE_EVIDENCE,
+    MIN_UNIX_TIME_SECONDS,
     QUALITY_LIMITS,
     SECONDS_PER_CLOCK_UNIT,
     Issue,
-    SampleGroup,
-    SensorChoiceLookup,
+    JointOrPointGroup,
+    SensorOptionsLookup,
     median_sample_period,
 )
 from yid_ocp.data.recording import PointGroup, Recording
@@ -137,8 +137,8 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
     return Issue(cause, what, "warning", length / allowed, advice, recording.name, group, "t", begin, end)
 
 
-def check_recording(recording: Recording, choice: SensorChoiceLookup, driving: bool = True) -> list[Issue]:
-    """All issues of one recording that need no model.
+def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, driving: bool = True) -> list[Issue]:
+    """Data quality issues of one recording, from all checks that need no model.
 
     Parameters
     ----------
@@ -197,10 +197,10 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
         begin, end = group.t[0], group.t[-1]
         if end < first or begin > last:
             far = min(abs(begin - last), abs(first - end))
-            epoch = (abs(begin) > MIN_EPOCH_SECONDS) != (abs(first) > MIN_EPOCH_SECONDS)
+            epoch = (abs(begin) > MIN_UNIX_TIME_SECONDS) != (abs(first) > MIN_UNIX_TIME_SECONDS)
             since = "one of them counts from 1970: " if epoch else ""
             spans = f"from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to {end:.10g} s"
-            ratio = MAX_LIMIT_RATIO if epoch else 1 + far / max(last - first, 1e-9)
+            ratio = MAX_ISSUE_EVIDENCE if epoch else 1 + far / max(last - first, 1e-9)
             what, advice = f"{since}joints were recorded {spans}", "write the times of all groups on one clock"
             yield Issue("clock_base", what, "refused", ratio, advice, "", group.name, "t")
             continue
@@ -282,7 +282,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
         size, cause = abs(ratio[j]), "angle_scale"
         evidence = max(size, 1 / size) / QUALITY_LIMITS.max_rate_ratio
         if ratio[j] < 0 and abs(size - 1) < QUALITY_LIMITS.max_rate_ratio - 1:
-            cause, evidence = "angle_sign", MAX_LIMIT_RATIO
+            cause, evidence = "angle_sign", MAX_ISSUE_EVIDENCE
         what = f"the angle of {names[j]} turns {ratio[j]:.3g} times as fast as its recorded velocity says"
         advice = f"divide the angle of {names[j]} by {ratio[j]:.3g}"
         yield Issue(cause, what, "not_trusted", evidence, advice, "", "joints", f"position.{names[j]}")
@@ -336,7 +336,7 @@ def _shared_sample_count(one: Recording, other: Recording) -> int:
     return max((_common(_rows(g), _rows(others[g.name])) for g in one.points if g.name in others), default=0)
 
 
-def _rows(group: SampleGroup) -> Array:
+def _rows(group: JointOrPointGroup) -> Array:
     if isinstance(group, PointGroup):
         return np.nan_to_num(group.position.reshape(len(group.t), -1))
     return group.position if group.effort is None else np.hstack([group.position, np.nan_to_num(group.effort)])
@@ -356,4 +356,4 @@ def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
     if count < min(QUALITY_LIMITS.min_shared_samples, 0.5 * few):
         return None
     what = f"{count} samples of {other.name} are those of {one.name} to the last digit"
-    return Issue("same_data", what, "warning", MAX_LIMIT_RATIO, "list every measurement once", other.name)
+    return Issue("same_data", what, "warning", MAX_ISSUE_EVIDENCE, "list every measurement once", other.name)

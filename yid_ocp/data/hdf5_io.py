@@ -85,7 +85,7 @@ _MAX_UNPACKED_BYTES = 1 << 30
 
 @contextlib.contextmanager
 def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
-    """An HDF5 file in memory, written as a whole when the block ends without error.
+    """Context manager of a new HDF5 file in memory, written atomically when the block ends without error.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
 
 @contextlib.contextmanager
 def open_checked_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
-    """Open an HDF5 file after checking in another process that it can be read.
+    """Context manager of an HDF5 file, opened after another process has checked that it can be read.
 
     Raises
     ------

@@ -13,17 +13,17 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.sensors import SensorOptions
 
-SampleGroup = JointGroup | PointGroup
+JointOrPointGroup = JointGroup | PointGroup
 Severity = Literal["warning", "not_trusted", "refused"]
 
-MAX_LIMIT_RATIO = 1e3
+MAX_ISSUE_EVIDENCE = 1e3
 """Largest value of `Issue.evidence`; larger ratios are clipped."""
 SECONDS_PER_CLOCK_UNIT: Mapping[str, float] = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-MIN_EPOCH_SECONDS = 1e8
-"""Smallest time that is taken for a clock counting from 1970 instead of from power-on [s]."""
+MIN_UNIX_TIME_SECONDS = 1e8
+"""Smallest time stamp that is taken as seconds since 1970 (Unix time) instead of since power-on [s]."""
 DEGREES_PER_RADIAN = math.degrees(1.0)
-MIN_NOISE_DIFFERENCES = 30
-"""Fewest differences from which noise is estimated."""
+MIN_DIFFERENCES_FOR_NOISE_STD = 30
+"""Smallest number of differences between samples from which a channel's noise is estimated."""
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ QUALITY_LIMITS = _QualityLimits()
 class Issue:
     """One data quality issue of a recording."""
 
-    cause: str  # what is wrong, in one word of `ISSUE_CAUSES`
+    cause: str  # what is wrong, in one word of `ISSUE_CAUSE_DESCRIPTIONS`
     what: str  # the same in one sentence, with numbers
     # whether a run goes on as it would (and says so), goes on but says of no number that it is found, or stops
     weight: Severity
-    evidence: float  # how many times what was seen exceeds the limit from which on it counts, 1 to `MAX_LIMIT_RATIO`
+    evidence: float  # how many times what was seen exceeds the limit from which on it counts, 1 to `MAX_ISSUE_EVIDENCE`
     advice: str  # what to do
     # where; empty for all of them
     recording: str
@@ -69,9 +69,9 @@ class Issue:
     setting: str = ""  # line of configuration that repairs or describes it, where there is one
 
     def __post_init__(self) -> None:
-        if self.cause not in ISSUE_CAUSES:
+        if self.cause not in ISSUE_CAUSE_DESCRIPTIONS:
             raise ValueError(f"there is no cause '{self.cause}'")
-        object.__setattr__(self, "evidence", float(min(max(self.evidence, 1.0), MAX_LIMIT_RATIO)))
+        object.__setattr__(self, "evidence", float(min(max(self.evidence, 1.0), MAX_ISSUE_EVIDENCE)))
 
     @property
     def certainty_word(self) -> str:
@@ -86,7 +86,7 @@ class Issue:
         return place + span
 
 
-ISSUE_CAUSES: Mapping[str, str] = {
+ISSUE_CAUSE_DESCRIPTIONS: Mapping[str, str] = {
     "time_unit": "times are not in seconds",
     "time_scale": "the clock runs too fast or too slowly",
     "clock_base": "clocks of two groups have nothing in common",
@@ -127,7 +127,7 @@ ISSUE_CAUSES: Mapping[str, str] = {
 }
 """Description of every cause of an issue, as shown in tables."""
 
-SensorChoiceLookup = Callable[[str], SensorOptions]
+SensorOptionsLookup = Callable[[str], SensorOptions]
 
 
 def median_sample_period(t: Array) -> float:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError, nearest_name_hint
-from yid_ocp.sensors.base import EffortKind, declared_channels
+from yid_ocp.sensors.base import EffortKind, declared_channel_kinds
 
 ClockKind = Literal["recorded", "nominal"]
 
@@ -28,7 +28,7 @@ JOINT_CHANNEL_UNITS: Mapping[str, str] = {
 }
 """Channels of a joint group and their units."""
 
-JOINT_STD_FIELDS = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
+JOINT_STD_FIELD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
 """Standard deviations that a joint group may have, in the units of their channels."""
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""
@@ -87,7 +87,7 @@ class JointGroup(ReprMixin):
         for name in ("t", *JOINT_CHANNEL_UNITS):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, read_only_array(getattr(self, name), f"joints/{name}"))
-        for name in JOINT_STD_FIELDS:
+        for name in JOINT_STD_FIELD_NAMES:
             if getattr(self, name) is not None:
                 std = read_only_array(getattr(self, name), f"joints, attribute {name}")
                 object.__setattr__(self, name, float(std) if std.ndim == 0 else std)
@@ -168,7 +168,7 @@ class PointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChannelGroup(ReprMixin):
-    """Values of channels that sensors declare (`sensors.Channel`), on one clock.
+    """Values of channels that sensors declare (`sensors.ChannelKind`), on one clock.
 
     Arrays are copied, made float64 and read-only.
 
@@ -273,12 +273,12 @@ class Recording(ReprMixin):
 
     @property
     def all_groups(self) -> tuple[JointGroup | PointGroup | ChannelGroup, ...]:
-        """All groups there are, joints first, then points."""
+        """All groups: joints first, then points, then channels of further sensors."""
         return (*self.groups, *self.channel_groups)
 
     @property
-    def sensor_keys(self) -> tuple[str, ...]:
-        """Keys under `sensors` that settings may have for this recording."""
+    def sensor_setting_keys(self) -> tuple[str, ...]:
+        """Keys that the settings may have under `sensors` for this recording, such as `joints.effort`."""
         own = [f"joints.{quantity}" for quantity in ("effort", "position") if self.joints is not None]
         own += [group.name for group in self.points]
         return (*own, *(f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values))
@@ -316,7 +316,9 @@ class Recording(ReprMixin):
         kept = [group._rows(mask) for group, mask in zip(self.all_groups, masks, strict=True) if mask.any()]
         first, last = min(g.t[0] for g in self.all_groups), max(g.t[-1] for g in self.all_groups)
         what, allowed = f"nothing was recorded from {start:g} s to {stop:g} s", f"within {first:g} s to {last:g} s"
-        require_data(start < stop and bool(kept), what, f"recording '{self.name}'", f"start < stop, {allowed}")
+        raise_data_error_unless(
+            start < stop and bool(kept), what, f"recording '{self.name}'", f"start < stop, {allowed}"
+        )
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
         points = tuple(group for group in kept if isinstance(group, PointGroup))
         first_kept = bool(points) and points[0].name == self.points[0].name
@@ -349,22 +351,24 @@ def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, 
         machine; `straight` does not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
-    require_data(bool(recording.all_groups), "the recording has no group", origin, "joints, points, points_<name>")
+    raise_data_error_unless(
+        bool(recording.all_groups), "the recording has no group", origin, "joints, points, points_<name>"
+    )
     _check_text(origin, recording.description, recording.source, *recording.notes)
     for key, value in recording.true_parameters.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
-        require_data(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
+        raise_data_error_unless(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
     if recording.joints is not None:
         _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
     names = [group.name for group in recording.points]
     for group in recording.points:
         legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name) is not None
-        require_data(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
-        require_data(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
+        raise_data_error_unless(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
+        raise_data_error_unless(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
         _validate_points(group, f"{origin}: {group.name}")
     for channels in recording.channel_groups:
         repeated = sum(group.name == channels.name for group in recording.channel_groups) > 1
-        require_data(not repeated, f"two groups are called '{channels.name}'", origin)
+        raise_data_error_unless(not repeated, f"two groups are called '{channels.name}'", origin)
         _validate_channels(channels, f"{origin}: {channels.name}")
     if recording.marker_reference_pose is not None:
         _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")
@@ -377,7 +381,7 @@ def _sampled(t: Array) -> str:
     return f"{count_with_noun(len(t), 'sample')} at {rate:.4g} Hz" if rate else count_with_noun(len(t), "sample")
 
 
-def require_data(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:
+def raise_data_error_unless(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:
     """Raise a `DataError` unless a condition holds."""
     if not ok:
         raise DataError(what, where=where, allowed=allowed, hint=hint)
@@ -413,21 +417,23 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         unit = JOINT_CHANNEL_UNITS[channel]
         largest = float(np.nanmax(np.abs(value), initial=0.0))
         degrees = f"these look like degrees: convert them to radians, or read a CSV with units={{'{channel}': 'deg'}}"
-        require_data(
+        raise_data_error_unless(
             largest <= _LARGEST[unit],
             f"channel '{channel}' reaches {largest:g} {unit}",
             place,
             f"at most {_LARGEST[unit]:g} {unit}",
             degrees if unit == "rad" else "convert it again from what was recorded: no machine does that",
         )
-    for name in JOINT_STD_FIELDS:
+    for name in JOINT_STD_FIELD_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortKind)
         hint = "leave the attribute out where it is not known"
-        require_data(joints.effort_kind in kinds, f"the kind is '{joints.effort_kind}'", place, ", ".join(kinds), hint)
+        raise_data_error_unless(
+            joints.effort_kind in kinds, f"the kind is '{joints.effort_kind}'", place, ", ".join(kinds), hint
+        )
 
 
 def _validate_points(group: PointGroup, where: str) -> None:
@@ -444,7 +450,7 @@ def _validate_points(group: PointGroup, where: str) -> None:
             allowed="three finite coordinates, or three NaN where the point was not seen",
         )
     largest = float(np.abs(group.position[~unseen]).max(initial=0.0))
-    require_data(
+    raise_data_error_unless(
         largest <= _LARGEST_DISTANCE,
         f"a coordinate reaches {largest:g} m",
         f"{where}/position",
@@ -456,27 +462,29 @@ def _validate_points(group: PointGroup, where: str) -> None:
         seen = group.std[~unseen]
         wrong = seen[~((seen >= 0) & (seen <= _LARGEST_SPREAD))]
         what = f"the standard deviation of a point that was seen is {wrong[:1]}"
-        require_data(wrong.size == 0, what, f"{where}/std", f"not negative, and at most {_LARGEST_SPREAD:g} m")
+        raise_data_error_unless(
+            wrong.size == 0, what, f"{where}/std", f"not negative, and at most {_LARGEST_SPREAD:g} m"
+        )
     if group.pose is not None:
         _check_pose(group.pose, f"{where}, attribute pose")
 
 
 def _validate_channels(group: ChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
-    declared = {channel.quantity: channel for channel in declared_channels(group.name)}
-    fields = [name for channel in declared.values() for name in channel.std_fields]
-    require_data(bool(group.values), "the group has no values", where, ", ".join(declared))
+    declared = {channel.quantity: channel for channel in declared_channel_kinds(group.name)}
+    fields = [name for channel in declared.values() for name in channel.std_attribute_names]
+    raise_data_error_unless(bool(group.values), "the group has no values", where, ", ".join(declared))
     for noun, found, known in (("dataset", group.values, declared), ("attribute", group.stds, fields)):
         for name in found:
             what = f"no sensor declares a {noun} '{name}' here"
             allowed = ", ".join(known) or "groups that a sensor declares"
-            require_data(name in known, what, where, allowed, nearest_name_hint(name, known))
+            raise_data_error_unless(name in known, what, where, allowed, nearest_name_hint(name, known))
     for quantity, values in group.values.items():
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
         _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
         finite = bool(np.isfinite(values).all())
-        require_data(finite, "a value is not finite", f"{where}/{quantity}", "finite numbers")
+        raise_data_error_unless(finite, "a value is not finite", f"{where}/{quantity}", "finite numbers")
     for name, std in group.stds.items():
         _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
 
@@ -485,33 +493,37 @@ def _validate_std(std: float | Array, count: int, name: str, where: str, letters
     if np.ndim(std) > 0:
         _check_shape(np.asarray(std), (count,), where, letters)
     good = bool(np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD)))
-    require_data(good, f"{name} is {std}", where, f"not negative, and at most {_LARGEST_SPREAD:g}")
+    raise_data_error_unless(good, f"{name} is {std}", where, f"not negative, and at most {_LARGEST_SPREAD:g}")
 
 
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
-    require_data(bool(groups), "the positions of a straight object belong to no points", where, "a group of points")
+    raise_data_error_unless(
+        bool(groups), "the positions of a straight object belong to no points", where, "a group of points"
+    )
     _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
-    require_data(
+    raise_data_error_unless(
         bool(np.isfinite(straight).all()), "a position is not finite", where, "finite coordinates of every point"
     )
     largest = float(np.abs(straight).max())
     what, allowed = f"a coordinate reaches {largest:g} m", f"at most {_LARGEST_DISTANCE:g} m"
-    require_data(
+    raise_data_error_unless(
         largest <= _LARGEST_DISTANCE, what, where, allowed, "these look like millimetres: convert them to metres"
     )
     # a file lists its groups by name, so only that order survives it
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
-    require_data(first is groups[0], what, where, "groups of points sorted by name")
+    raise_data_error_unless(first is groups[0], what, where, "groups of points sorted by name")
 
 
 def _check_pose(pose: Array, where: str) -> None:
     _check_shape(pose, (4, 4), where, "(4, 4)")
     rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
-    require_data(bool(np.isfinite(pose).all()), "the pose has a value that is not finite", where, allowed)
-    require_data(_close(pose[3], np.eye(4)[3]), f"the last row of the pose is {pose[3]}", where, allowed)
-    require_data(_close(rotation.T @ rotation, np.eye(3)), "the axes of the pose are not orthonormal", where, allowed)
-    require_data(bool(np.linalg.det(rotation) > 0), "the pose is a reflection", where, allowed)
+    raise_data_error_unless(bool(np.isfinite(pose).all()), "the pose has a value that is not finite", where, allowed)
+    raise_data_error_unless(_close(pose[3], np.eye(4)[3]), f"the last row of the pose is {pose[3]}", where, allowed)
+    raise_data_error_unless(
+        _close(rotation.T @ rotation, np.eye(3)), "the axes of the pose are not orthonormal", where, allowed
+    )
+    raise_data_error_unless(bool(np.linalg.det(rotation) > 0), "the pose is a reflection", where, allowed)
 
 
 def _close(array: Array, expected: Array) -> bool:
@@ -519,20 +531,24 @@ def _close(array: Array, expected: Array) -> bool:
 
 
 def _check_names_and_clock(group: JointGroup | PointGroup | ChannelGroup, where: str) -> None:
-    require_data(bool(group.names), "the group has no names", where)
-    require_data(group.t.size > 0, "the group has no samples", where)
+    raise_data_error_unless(bool(group.names), "the group has no names", where)
+    raise_data_error_unless(group.t.size > 0, "the group has no samples", where)
     for name in group.names:
         place = f"{where}, names"
-        require_data(
+        raise_data_error_unless(
             isinstance(name, str) and bool(name), f"the name {name!r} cannot be used", place, "text, not empty"
         )
         _check_text(place, name)
-        require_data(group.names.count(name) == 1, f"the name '{name}' occurs {group.names.count(name)} times", place)
+        raise_data_error_unless(
+            group.names.count(name) == 1, f"the name '{name}' occurs {group.names.count(name)} times", place
+        )
     clocks = get_args(ClockKind)
-    require_data(group.clock in clocks, f"the clock is '{group.clock}'", f"{where}, attribute clock", ", ".join(clocks))
+    raise_data_error_unless(
+        group.clock in clocks, f"the clock is '{group.clock}'", f"{where}, attribute clock", ", ".join(clocks)
+    )
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
-    require_data(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
+    raise_data_error_unless(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
     backward = np.flatnonzero(np.diff(group.t) <= 0)
     if backward.size:
         index = int(backward[0])
@@ -546,11 +562,15 @@ def _check_names_and_clock(group: JointGroup | PointGroup | ChannelGroup, where:
 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
-    require_data(array.shape == shape, f"the array has shape {array.shape}", where, f"{shape}, that is {letters}")
+    raise_data_error_unless(
+        array.shape == shape, f"the array has shape {array.shape}", where, f"{shape}, that is {letters}"
+    )
 
 
 def _check_text(where: str, *texts: str) -> None:
     for text in texts:
         # HDF5 ends text at the first null character and stores it as UTF-8
         storable = "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
-        require_data(storable, f"the text {text!r} cannot be stored", where, "Unicode text without null characters")
+        raise_data_error_unless(
+            storable, f"the text {text!r} cannot be stored", where, "Unicode text without null characters"
+        )

@@ -15,27 +15,27 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.hdf5_io import create_hdf5_atomically, open_checked_hdf5
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
-    JOINT_STD_FIELDS,
+    JOINT_STD_FIELD_NAMES,
     POINT_GROUP_NAME_PATTERN,
     ChannelGroup,
     JointGroup,
     PointGroup,
     Recording,
+    raise_data_error_unless,
     read_only_array,
-    require_data,
     validate_recording,
 )
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import file_sha256
-from yid_ocp.sensors import CHANNELS
-from yid_ocp.sensors.base import declared_channels
+from yid_ocp.sensors import CHANNEL_KINDS
+from yid_ocp.sensors.base import declared_channel_kinds
 
 _RECORDING_FORMAT = "yid-recording/1"
 
 _STRAIGHT = "straight"
 _JOINT_UNITS = {"t": "s", **JOINT_CHANNEL_UNITS}
 _POINT_UNITS = {"t": "s", "position": "m", "std": "m"}
-_JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *JOINT_STD_FIELDS)
+_JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *JOINT_STD_FIELD_NAMES)
 _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 
 
@@ -56,7 +56,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     path = Path(path)
     digest = file_sha256(path)
     hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.data.read_any"
-    require_data(
+    raise_data_error_unless(
         h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), f"HDF5 in the format {_RECORDING_FORMAT}", hint
     )
     with open_checked_hdf5(path) as file:
@@ -87,7 +87,7 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
             attributes = [name for name in _POINT_ATTRIBUTES if name != "std"]
             _write_group(file.create_group(group.name), group, _POINT_UNITS, attributes)
         for channels in recording.channel_groups:
-            target, declared = file.create_group(channels.name), declared_channels(channels.name)
+            target, declared = file.create_group(channels.name), declared_channel_kinds(channels.name)
             units = {"t": "s"} | {c.quantity: c.unit for c in declared}
             for name, values in {"t": channels.t, **channels.values}.items():
                 target.create_dataset(name, data=values).attrs["unit"] = units[name]
@@ -116,24 +116,28 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         for key in ("format", "description", "source", "truth", "notes")
     }
     what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file does not say its format"
-    require_data(texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT)
+    raise_data_error_unless(
+        texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT
+    )
     joints, points, straight, channels = None, [], None, []
-    further = sorted({CHANNELS[kind].group for kind in CHANNELS} - {"joints", "points"})
+    further = sorted({CHANNEL_KINDS[kind].group for kind in CHANNEL_KINDS} - {"joints", "points"})
     allowed = ", ".join(["joints, points, points_<name>", *(f"{name}, {name}_<name>" for name in further), _STRAIGHT])
     for name in map(str, file):
-        where, declared = f"{origin}: {name}", declared_channels(name)
+        where, declared = f"{origin}: {name}", declared_channel_kinds(name)
         legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) is not None or bool(declared)
         hint = "" if legal else nearest_name_hint(name, ("joints", "points", *further, _STRAIGHT))
-        require_data(legal, f"the format has no group '{name}'", origin, allowed, hint)
+        raise_data_error_unless(legal, f"the format has no group '{name}'", origin, allowed, hint)
         if name == _STRAIGHT:
             straight = _read_dataset(file[name], where, "m")
             continue
-        require_data(isinstance(file[name], h5py.Group), f"'{name}' is not a group", where, "a group of datasets")
+        raise_data_error_unless(
+            isinstance(file[name], h5py.Group), f"'{name}' is not a group", where, "a group of datasets"
+        )
         if name == "joints":
             joints = JointGroup(**_read_group(file[name], where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",)))
         elif declared:
             units = {c.quantity: c.unit for c in declared}
-            fields = tuple(entry for c in declared for entry in c.std_fields)
+            fields = tuple(entry for c in declared for entry in c.std_attribute_names)
             found = _read_group(
                 file[name], where, {"t": "s", **units}, ("names", "clock", *fields), ("names",), needed={"t"}
             )
@@ -178,7 +182,7 @@ def _read_group(
         for name in sorted(wanted - found):
             raise DataError(f"the {noun} '{name}' is missing", where=where, allowed=", ".join(known))
     both = "std" in group and "std" in group.attrs
-    require_data(not both, "`std` is both a dataset and an attribute", where, "one of the two")
+    raise_data_error_unless(not both, "`std` is both a dataset and an attribute", where, "one of the two")
     values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
     for name, value in group.attrs.items():
         place = f"{where}, attribute {name}"
@@ -193,10 +197,10 @@ def _read_group(
 
 def _read_dataset(dataset: Any, where: str, unit: str) -> Array:
     numeric = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
-    require_data(numeric, "not a dataset of real numbers", where, "floating point or integer numbers")
+    raise_data_error_unless(numeric, "not a dataset of real numbers", where, "floating point or integer numbers")
     found = _text(dataset.attrs["unit"], f"{where}, attribute unit") if "unit" in dataset.attrs else unit
     hint = f"convert the values to {unit}: recordings are never converted silently"
-    require_data(found == unit, f"the unit is '{found}'", where, unit, hint)
+    raise_data_error_unless(found == unit, f"the unit is '{found}'", where, unit, hint)
     return np.asarray(dataset[()], dtype=np.float64)
 
 
@@ -210,7 +214,7 @@ def _text(value: object, where: str) -> str:
             return value.decode("utf-8")
         except UnicodeDecodeError as error:
             raise DataError("the text is not UTF-8", where=where) from error
-    require_data(isinstance(value, str), f"found {value!r}", where, "text")
+    raise_data_error_unless(isinstance(value, str), f"found {value!r}", where, "text")
     return str(value)
 
 

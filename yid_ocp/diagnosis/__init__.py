@@ -11,6 +11,6 @@ from yid_ocp.diagnosis.screening import candidate_detectability as candidate_det
 from yid_ocp.diagnosis.screening import confusability_matrix as confusability_matrix
 from yid_ocp.diagnosis.screening import linearize_candidates as linearize_candidates
 from yid_ocp.diagnosis.screening import score_candidates as score_candidates
-from yid_ocp.diagnosis.screening import score_jointly as score_jointly
-from yid_ocp.diagnosis.select import gap_closure as gap_closure
+from yid_ocp.diagnosis.screening import score_candidates_jointly as score_candidates_jointly
+from yid_ocp.diagnosis.select import held_out_gap_closure as held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import Thresholds as Thresholds

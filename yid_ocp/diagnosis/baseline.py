@@ -15,15 +15,20 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-from yid_ocp.analysis.estimate_history import RunEstimates, chi2_p_value, nearest_positive_definite, pool_estimates
+from yid_ocp.analysis.estimate_history import (
+    RunEstimates,
+    chi2_p_value,
+    nearby_positive_definite_covariance,
+    pool_estimates,
+)
 from yid_ocp.data.recording import Recording
-from yid_ocp.diagnosis.hypotheses import neutral_values
-from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefitModel
+from yid_ocp.diagnosis.hypotheses import neutral_effect_parameter_values
+from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, SolverError, YidError, nearest_name_hint
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
-from yid_ocp.inference.whitening import whitened_by_sensor_noise
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.problem.prediction_errors import rmse_by_channel
@@ -35,7 +40,7 @@ _MIN_INFORMED_FRACTION = 0.05
 
 
 @dataclass(frozen=True)
-class ParameterShift:
+class _ParameterShift:
     """Change of one parameter from the baseline to the current fit."""
 
     name: str
@@ -58,10 +63,10 @@ class BaselineComparison:
     baseline_effects: tuple[str, ...]  # labels of the effects that they had and that the model keeps
     between_runs_chi2: float  # of the differences between several earlier runs; zero and one for one run
     between_runs_p_value: float
-    parameter_shifts: tuple[ParameterShift, ...]
+    parameter_shifts: tuple[_ParameterShift, ...]
 
     @property
-    def changed_parameters(self) -> tuple[ParameterShift, ...]:
+    def changed_parameters(self) -> tuple[_ParameterShift, ...]:
         """Parameters that have changed significantly, smallest p-value first."""
         changed = (entry for entry in self.parameter_shifts if entry.has_changed)
         return tuple(sorted(changed, key=lambda entry: entry.p_value))
@@ -99,7 +104,7 @@ def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
             )
     values = dict(zip(parameters.names, map(float, problem.theta), strict=True))
     values |= dict(zip(names, map(float, baseline.values), strict=True))
-    prior = MultivariateGaussianPrior(names, nearest_positive_definite(baseline.covariance))
+    prior = MultivariateGaussianPrior(names, nearby_positive_definite_covariance(baseline.covariance))
     stds = {name: std for name, std in problem.options.prior_stds.items() if name not in names}
     options = replace(problem.options, prior_stds=stds, multivariate_prior=prior)
     free = (*problem.free, *(name for name in names if name not in problem.free))
@@ -125,7 +130,7 @@ class BaselineData:
         known, chi2, degrees = pool_estimates(runs)
         return BaselineData(known, tuple(run.run_name for run in runs), chi2, chi2_p_value(chi2, degrees), without)
 
-    def compare_with_baseline(self, fit: RefitModel, limits: Thresholds) -> BaselineComparison | None:
+    def compare_with_baseline(self, fit: RefittedModel, limits: Thresholds) -> BaselineComparison | None:
         """Return how far the parameters of a fit have moved from its baseline prior; None if there are no runs."""
         baseline, prior = self.combined_estimates, fit.problem.options.multivariate_prior
         if baseline is None:
@@ -148,18 +153,18 @@ class BaselineData:
                 score = (now - float(value)) / math.sqrt(variance)
                 p = float(2 * scipy.stats.norm.sf(abs(score)))
             known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, fit.std[name])
-            shifts.append(ParameterShift(name, *known, score, p, p < limits.significance_level / len(names)))
+            shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(names)))
         between = (self.between_runs_chi2, self.between_runs_p_value)
         labels = tuple(baseline.effects)
         return BaselineComparison(self.baseline_runs, baseline.is_fit_adequate, labels, *between, tuple(shifts))
 
-    def has_changed(self, fit: RefitModel, limits: Thresholds) -> bool:
+    def has_changed_parameters(self, fit: RefittedModel, limits: Thresholds) -> bool:
         """Whether any parameter of a fit changed significantly since the earlier runs."""
         found = self.compare_with_baseline(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
     def predict_counterfactual(
-        self, nominal: RefitModel, last: RefitModel, progress: Progress
+        self, nominal: RefittedModel, last: RefittedModel, progress: Progress
     ) -> CounterfactualTest | None:
         """Predict reference recordings with the effects of `last` removed, and the diagnosed ones with them added.
 
@@ -187,12 +192,12 @@ class BaselineData:
         return CounterfactualTest(removed, _predicted(last, present, then, {**then, **effects}))
 
 
-def _plain_variance(fit: RefitModel) -> Mapping[str, float]:
+def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
     """Variance of every unknown by the stated noise and priors alone."""
     problem, evaluation = fit.problem, fit.evaluation
     if evaluation.jacobian is None:
         evaluation = problem.evaluate(problem.vector(fit.values), equilibrium_guesses=evaluation.equilibrium_guesses)
-    jacobian = residual_without_weak_priors(problem, evaluation)[1] * problem.unknown_scales
+    jacobian = linearization_without_weak_priors(problem, evaluation)[1] * problem.unknown_scales
     variance = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)) * problem.unknown_scales**2
     return dict(zip(problem.unknown_names, map(float, variance), strict=True))
 
@@ -203,7 +208,7 @@ _ChannelErrors = Mapping[str, tuple[float, str]]
 
 
 @dataclass(frozen=True)
-class PredictionErrors:
+class _PredictionErrors:
     """Prediction errors on recordings no fit has used, without diagnosis and counterfactual."""
 
     recordings: tuple[str, ...]
@@ -224,7 +229,7 @@ class PredictionErrors:
         return found
 
     @property
-    def is_improved(self) -> bool:
+    def is_improved_by_counterfactual(self) -> bool:
         """Whether the counterfactual prediction has the smaller RMSE in every unit."""
         return bool(self.rmse_by_unit) and all(after < before for before, after in self.rmse_by_unit.values())
 
@@ -234,7 +239,7 @@ class PredictionErrors:
             channel: {"without_diagnosis": before, "counterfactual": self.counterfactual[channel][0], "unit": unit}
             for channel, (before, unit) in self.without_diagnosis.items()
         }
-        better = self.is_improved if rmse else None
+        better = self.is_improved_by_counterfactual if rmse else None
         return {"recordings": [*self.recordings], "rmse": rmse, "better": better, "message": self.failure_message}
 
 
@@ -244,10 +249,10 @@ class CounterfactualTest:
 
     # recordings made without the effects: by the diagnosed model with its effects taken out, against the
     # nominal model as it was fitted to the recordings with them
-    effects_removed: PredictionErrors
+    effects_removed: _PredictionErrors
     # recordings made with the effects: by the model of the world without them with the effects put in, against
     # that model alone
-    effects_added: PredictionErrors
+    effects_added: _PredictionErrors
 
     def to_dict(self) -> dict[str, Any]:
         """As in `yid-diagnosis/2`."""
@@ -255,22 +260,22 @@ class CounterfactualTest:
 
 
 def _predicted(
-    last: RefitModel, recordings: Sequence[Recording], plain: _ParameterValues, other: _ParameterValues
-) -> PredictionErrors:
+    last: RefittedModel, recordings: Sequence[Recording], plain: _ParameterValues, other: _ParameterValues
+) -> _PredictionErrors:
     """Errors by two models; parameters that neither names are the problem's own, and effects neutral."""
     try:
         problem = _on(last, recordings)
         first, second = (_errors(problem, values, last.effects) for values in (plain, other))
     except YidError as error:
         return _nothing(recordings, error.what)
-    return PredictionErrors(tuple(recording.name for recording in recordings), first, second)
+    return _PredictionErrors(tuple(recording.name for recording in recordings), first, second)
 
 
-def _nothing(recordings: Sequence[Recording], message: str) -> PredictionErrors:
-    return PredictionErrors(tuple(recording.name for recording in recordings), {}, {}, message)
+def _nothing(recordings: Sequence[Recording], message: str) -> _PredictionErrors:
+    return _PredictionErrors(tuple(recording.name for recording in recordings), {}, {}, message)
 
 
-def _on(last: RefitModel, recordings: Sequence[Recording]) -> EstimationProblem:
+def _on(last: RefittedModel, recordings: Sequence[Recording]) -> EstimationProblem:
     """The problem with its compiled step, all candidates in it, on other recordings: to predict and to estimate on."""
     own, none = last.problem, MultivariateGaussianPrior()
     options = replace(own.options, prior_stds={}, local_parameters=(), multivariate_prior=none, known_initial_states={})
@@ -280,8 +285,8 @@ def _on(last: RefitModel, recordings: Sequence[Recording]) -> EstimationProblem:
 
 def _errors(problem: EstimationProblem, values: _ParameterValues, effects: Sequence[EffectBase]) -> _ChannelErrors:
     if problem.has_process_noise:
-        problem = whitened_by_sensor_noise(problem)
-    found = problem.predict_held_out(problem.vector({**neutral_values(effects), **values}))
+        problem = problem_whitened_by_sensor_noise(problem)
+    found = problem.predict_held_out(problem.vector({**neutral_effect_parameter_values(effects), **values}))
     failed = [result for _, result in found if isinstance(result, str)]
     if failed:
         raise SolverError(f"a recording cannot be predicted: {failed[0]}")
@@ -289,7 +294,7 @@ def _errors(problem: EstimationProblem, values: _ParameterValues, effects: Seque
     return {channel: (float(entry["rmse"]), str(entry["unit"])) for channel, entry in errors.items()}
 
 
-def _estimated_without(last: RefitModel, without: Sequence[Recording], shared: Sequence[str]) -> dict[str, float]:
+def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared: Sequence[str]) -> dict[str, float]:
     """The nominal parameters as they are estimated on the recordings without the effects."""
     problem = _on(last, without).with_free_subset(shared)
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)

@@ -18,17 +18,17 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_messages import (
     diagnosis_summary_text,
+    held_out_truncation_message,
     insufficient_data_message,
-    next_experiment_text,
-    truncation_message,
+    recommended_experiment_text,
 )
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult, NominalParameterChange
-from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_events, problem_without_events
+from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_disturbance_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
     TRUNCATION_FRACTIONS,
     AllCandidatesProblem,
     CandidateChoice,
-    TruncatedRecording,
+    TruncatedHeldOutRecording,
     exclude_candidates,
     make_candidate_effects,
 )
@@ -37,25 +37,25 @@ from yid_ocp.diagnosis.localise import (
     attribute_gap_to_effects,
     localise_gap,
     main_gap_locations,
-    merge_intervals,
+    merge_time_intervals,
 )
 from yid_ocp.diagnosis.refit import (
-    KnownFits,
+    PrecomputedFits,
     RefitContext,
-    RefitModel,
     RefitStore,
+    RefittedModel,
     load_stored_refit,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import ScreeningResult, screen_candidates
-from yid_ocp.diagnosis.select import NO_CLOSURE, SelectedEffect, gap_closure, select_effects
+from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, SelectedEffect, held_out_gap_closure, select_effects
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import (
-    check_transfer,
-    compute_explained_fraction,
+    check_parameter_transfer,
+    compute_explained_chi2_fraction,
     decide_verdict,
-    find_unknown_reason,
-    has_gap,
+    find_unknown_verdict_reason,
+    has_significant_gap,
     inflate_std_by_disagreement,
     is_chance_excess,
 )
@@ -63,19 +63,19 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.null_test import (
     NullTestResult,
     channel_noise_levels,
-    residual_channels,
+    residual_channel_samples,
     run_null_test,
     whiten_with_extra_errors,
 )
-from yid_ocp.inference.smoother import SmootherResult, run_smoother
-from yid_ocp.inference.uncertainty import noise_covariance_factor
-from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise
+from yid_ocp.inference.smoother import SmootherResult, select_and_smooth_unknowns
+from yid_ocp.inference.uncertainty import unknowns_covariance_factor
+from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.measurements import subtract_estimated_biases
 from yid_ocp.progress import NULL_PROGRESS, LoggingProgress, Progress
 from yid_ocp.solvers import GaussNewton, Solution, solve
-from yid_ocp.solvers.base import RESTART_FACTORS
+from yid_ocp.solvers.base import INITIAL_VALUE_RESTART_FACTORS
 
 log = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ def diagnose(
     *,
     thresholds: Thresholds | None = None,
     progress: Progress | None = None,
-    known_fits: KnownFits | None = None,
+    known_fits: PrecomputedFits | None = None,
     baseline: RunEstimates | Sequence[RunEstimates] | BaselineData = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
@@ -105,7 +105,7 @@ def diagnose(
         Never touched by a fit; the problem's own where absent. Where there are none, alternate blocks are held out.
     progress : Progress, optional
         The package's log when absent.
-    known_fits : KnownFits, optional
+    known_fits : PrecomputedFits, optional
     baseline : RunEstimates or sequence of RunEstimates, or BaselineData, optional
         What earlier runs of the same model say of its parameters (`read_estimates`): priors, so that the question is
         what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is. A `BaselineData`
@@ -124,7 +124,11 @@ def diagnose(
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
-        clock, told, known = {"": time.perf_counter()}, progress or LoggingProgress(log), known_fits or KnownFits()
+        clock, told, known = (
+            {"": time.perf_counter()},
+            progress or LoggingProgress(log),
+            known_fits or PrecomputedFits(),
+        )
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
         earlier = runs if isinstance(runs, BaselineData) else BaselineData.from_runs(runs, ())
         if earlier.combined_estimates is not None and not problem.options.multivariate_prior.parameter_names:
@@ -140,8 +144,8 @@ class _Examined:
     """The nominal model beside all that is no event: fit, null tests, screening, and whether there is a gap."""
 
     search: RefitContext  # the weights of all hypotheses frozen at the fit
-    nominal: RefitModel
-    truncated: tuple[TruncatedRecording, ...]
+    nominal: RefittedModel
+    truncated: tuple[TruncatedHeldOutRecording, ...]
     whole: EstimationProblem  # with all samples
     events: EventSet
     smoothed: SmootherResult | None  # about the fit, on all recordings, where it was asked
@@ -179,7 +183,7 @@ def _examined(
 def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) -> DiagnosisResult:
     search, nominal, before, held, screened = seen.search, seen.nominal, seen.before, seen.held, seen.screened
     limits, enough, scores = search.thresholds, seen.has_enough_samples, screened.candidate_scores
-    changed = earlier.has_changed(nominal, limits)
+    changed = earlier.has_changed_parameters(nominal, limits)
     moved = changed and not seen.has_gap
     gap, smoothed, trusted = seen.has_gap or moved, None, None
     if gap and enough:
@@ -192,22 +196,22 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
         gap = not is_chance_excess(trusted, scores, before, held, limits)
     clock["localisation"] = time.perf_counter()
     where = () if smoothed is None else localise_gap(smoothed, limits.location_z)
-    fits: tuple[RefitModel, ...] = ()
+    fits: tuple[RefittedModel, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
     if gap and enough and scores:
         places = [place.location for place in main_gap_locations(where)]
         fits, added = select_effects(search, nominal, screened, places, changed)
     clock["refits"] = time.perf_counter()
-    carried = check_transfer(search, added[-1].refitted_model) if added else ()
+    carried = check_parameter_transfer(search, added[-1].refitted_model) if added else ()
     if carried:
         last = inflate_std_by_disagreement(added[-1].refitted_model, carried)
         added = (*added[:-1], replace(added[-1], refitted_model=last))
     clock["carry_over"] = time.perf_counter()
     last = added[-1].refitted_model if added else nominal
-    total = gap_closure(nominal.held_out_loss, last.held_out_loss, limits) if added else NO_CLOSURE
-    explained = compute_explained_fraction(nominal, added, trusted)
+    total = held_out_gap_closure(nominal.held_out_loss, last.held_out_loss, limits) if added else UNDEFINED_GAP_CLOSURE
+    explained = compute_explained_chi2_fraction(nominal, added, trusted)
     same = all(entry.is_consistent for entry in carried)
-    reason = find_unknown_reason(added, total, limits, explained, same)
+    reason = find_unknown_verdict_reason(added, total, limits, explained, same)
     # what parameters explain by moving is no gap
     verdict = decide_verdict(gap and (bool(added) or not moved), enough, screened.detectability, reason, added)
     accepted = added if verdict in ("effect", "confusable") else ()
@@ -233,7 +237,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
         remaining_test=remaining,
         remaining_gap_locations=rest,
         nominal_changes=_changes(nominal, final),
-        next_experiment=next_experiment_text(verdict, accepted, where, screened.detectability),
+        next_experiment=recommended_experiment_text(verdict, accepted, where, screened.detectability),
         held_out_names=tuple(episode.name for episode in nominal.problem.held_out),
         is_split_in_blocks=search.problem.is_split_in_blocks,
         message=insufficient_data_message(verdict, before, len(nominal.values), screened.detectability, limits),
@@ -257,12 +261,14 @@ def _undivided(composed: AllCandidatesProblem, problem: EstimationProblem) -> Es
     return composed.problem.with_episodes(episodes, () if composed.is_split_in_blocks else composed.problem.held_out)
 
 
-def _happened(whole: EstimationProblem, fit: RefitModel, limits: Thresholds) -> tuple[EventSet, SmootherResult | None]:
+def _happened(
+    whole: EstimationProblem, fit: RefittedModel, limits: Thresholds
+) -> tuple[EventSet, SmootherResult | None]:
     """Events about a fit in all that was recorded, none where that cannot be predicted, and what the smoother says."""
     own, x = fit.problem.with_episodes(whole.episodes, whole.held_out), fit.problem.vector(fit.values)
     smoothed, guesses, is_flagged = None, fit.evaluation.equilibrium_guesses, False
-    if own.system.free_indices:
-        judged = whitened_at(own, x, guesses)
+    if own.system.unprescribed_coordinate_indices:
+        judged = problem_whitened_at(own, x, guesses)
         residual = judged.evaluate(x, False, guesses)
         if not residual.ok:
             return NO_EVENTS, None
@@ -272,37 +278,37 @@ def _happened(whole: EstimationProblem, fit: RefitModel, limits: Thresholds) -> 
         smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits)
     if not evaluation.ok:
         return NO_EVENTS, None
-    found = find_events(own, x, evaluation, smoothed, limits)
+    found = find_disturbance_events(own, x, evaluation, smoothed, limits)
     pushed, share = found.only_force_events, 1 - limits.min_event_chi2_fraction
-    if pushed and _excess(fit, problem_without_events(own, pushed)) > share * _excess(fit, own):
+    if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
         found = found.without_force_events
     return found, smoothed
 
 
-def _excess(fit: RefitModel, problem: EstimationProblem) -> float:
+def _excess(fit: RefittedModel, problem: EstimationProblem) -> float:
     """r'r of a fit beyond the number of samples that count, in all of a problem's recordings that can be predicted."""
     x, guesses = problem.vector(fit.values), fit.evaluation.equilibrium_guesses
-    judged = whitened_at(problem, x, guesses)
+    judged = problem_whitened_at(problem, x, guesses)
     evaluation = judged.evaluate(x, False, guesses)
     if not evaluation.ok:
         return math.inf
     rows = [evaluation.residual[judged.residual_rows.data]]
     for i, (episode, result) in enumerate(judged.predict_held_out(x)):
         if not isinstance(result, str):
-            rows.append(judged.held_out_residual(i, episode, result).residual)
+            rows.append(judged.whitened_held_out_residual(i, episode, result).residual)
     counted = np.concatenate(rows)
     return float(counted @ counted) - np.count_nonzero(counted)
 
 
 def _without_events(
-    search: RefitContext, nominal: RefitModel, whole: EstimationProblem
-) -> tuple[RefitContext, RefitModel, EventSet, SmootherResult | None]:
+    search: RefitContext, nominal: RefittedModel, whole: EstimationProblem
+) -> tuple[RefitContext, RefittedModel, EventSet, SmootherResult | None]:
     """All that follows without what events explain, the nominal model fitted to that, and what happened about it."""
     first, (events, smoothed) = search.problem, _happened(whole, nominal, search.thresholds)
     for round_ in range(_MAX_EVENT_ROUNDS):
         if not events:
             break
-        less = replace(first, problem=problem_without_events(first.problem, events))
+        less = replace(first, problem=problem_corrected_for_events(first.problem, events))
         search.progress.begin_stage(f"fitting the nominal model without {len(events.disturbances)} events")
         cleaned = replace(search, problem=less)
         again = _settled(cleaned, nominal.values, f"the nominal model without events, round {round_ + 1}")
@@ -311,43 +317,45 @@ def _without_events(
         search, nominal, before = cleaned, again, events
         # what the smoother says is of all recordings, events not taken out
         events, smoothed = _happened(whole, nominal, search.thresholds)[0], None
-        if events.overlaps_with(before):
+        if events.overlaps_on_same_channels(before):
             break
     return search, nominal, events, smoothed
 
 
 def _tested(
     search: RefitContext,
-    nominal: RefitModel,
-    cuts: tuple[TruncatedRecording, ...],
+    nominal: RefittedModel,
+    cuts: tuple[TruncatedHeldOutRecording, ...],
     whole: EstimationProblem,
     events: EventSet,
     smoothed: SmootherResult | None,
 ) -> _Examined:
     """Null tests and screening at a nominal fit, at which the weights of all hypotheses are frozen."""
     angles, limits = _largest_joint_angles(nominal), search.thresholds
-    effects = tuple(effect.with_expected_ranges(angles) for effect in search.problem.candidate_effects)
+    effects = tuple(effect.with_prior_ranges_for_angles(angles) for effect in search.problem.candidate_effects)
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
     before, held = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
     search.progress.begin_stage(f"screening {len(effects)} candidates")
     screened = screen_candidates(composed, (), nominal.values, limits)
-    gap = has_gap(before, held, limits, screened.candidate_scores, _offsets_stated(nominal.problem))
+    gap = has_significant_gap(before, held, limits, screened.candidate_scores, _offsets_stated(nominal.problem))
     enough = before.degrees_of_freedom >= limits.min_samples_per_unknown * len(nominal.values)
     search = replace(search, problem=composed)
     return _Examined(search, nominal, cuts, whole, events, smoothed, before, held, screened, gap, enough)
 
 
 def _followed(
-    search: RefitContext, nominal: RefitModel, before: tuple[TruncatedRecording, ...] = ()
-) -> tuple[RefitContext, RefitModel, tuple[TruncatedRecording, ...]]:
+    search: RefitContext, nominal: RefittedModel, before: tuple[TruncatedHeldOutRecording, ...] = ()
+) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
     """The nominal model beside held-out recordings as far as it can follow them, fitted again where they were cut."""
     found = before
     for margin in TRUNCATION_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
-        composed, cuts = replace(search.problem, problem=nominal.problem).truncate_held_out(nominal.values, margin)
+        composed, cuts = replace(search.problem, problem=nominal.problem).truncate_held_out_recordings(
+            nominal.values, margin
+        )
         for cut in cuts:
-            search.progress.begin_stage(truncation_message(cut))
+            search.progress.begin_stage(held_out_truncation_message(cut))
         names = {cut.recording for cut in cuts}
         found = (*(cut for cut in found if cut.recording not in names), *cuts)
         shorter = replace(search, problem=composed)
@@ -360,31 +368,31 @@ def _followed(
 def _offsets_stated(problem: EstimationProblem) -> bool:
     """Whether the size of torque offsets or of constant sensor errors is stated."""
     return any(
-        episode.has_constant_sensor_errors
+        episode.has_uncertain_sensor_biases
         or (episode.input_errors is not None and bool(np.any(episode.input_errors.torque_bias_std > 0)))
         for episode in problem.episodes
     )
 
 
-def _better_nominal_fit(search: RefitContext, nominal: RefitModel) -> RefitModel | None:
+def _better_nominal_fit(search: RefitContext, nominal: RefittedModel) -> RefittedModel | None:
     """The nominal model refitted from a start that ends far likelier; None if no start does."""
     search.progress.begin_stage("fitting the nominal model from other starts")
     problem, limits = search.problem.problem, search.thresholds
 
-    def begun(factor: float) -> RefitModel | None:
+    def begun(factor: float) -> RefittedModel | None:
         x = problem.initial_unknowns
-        start = problem.named_values(np.where(problem.is_positive, np.clip(factor * x, *problem.bounds), x))
+        start = problem.named_values(np.where(problem.positive_unknowns_mask, np.clip(factor * x, *problem.bounds), x))
         name = f"the nominal model from {factor:g} times its start"
         return refit_with_effects(search.problem, (), start, search.store, name, limits)
 
     best = nominal
-    for found in map_with_batched_calls(begun, RESTART_FACTORS):
+    for found in map_with_batched_calls(begun, INITIAL_VALUE_RESTART_FACTORS):
         if found is not None and found.cost < best.cost - limits.min_log_bayes_factor:
             best = found
     return None if best is nominal else _settled(search, best.values, "the nominal model from a better start")
 
 
-def _settled(search: RefitContext, start: Mapping[str, float], name: str) -> RefitModel | None:
+def _settled(search: RefitContext, start: Mapping[str, float], name: str) -> RefittedModel | None:
     """The nominal model fitted from a start, under weights that were frozen near its end."""
     composed, limits = search.problem, search.thresholds
     if composed.problem.has_process_noise:
@@ -418,7 +426,7 @@ def _composed(
 
 
 def _after(
-    nominal: RefitModel,
+    nominal: RefittedModel,
     accepted: Sequence[SelectedEffect],
     where: tuple[GapLocation, ...],
     before: NullTestResult,
@@ -430,9 +438,9 @@ def _after(
         return held, where, where
     last = accepted[-1].refitted_model
     remaining = _held_out_null_test(last, limits)
-    left = has_gap(_estimation_null_test(last, limits), remaining, limits)
+    left = has_significant_gap(_estimation_null_test(last, limits), remaining, limits)
     rest = localise_gap(_smooth_about_model(last, limits), limits.location_z) if left else ()
-    windows = merge_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
+    windows = merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
     # every effect closes what it adds to those before it
     closed: dict[str, float] = {}
     most = 0.0
@@ -443,7 +451,7 @@ def _after(
     return remaining, attribute_gap_to_effects(where, closed, rest, windows), rest
 
 
-def _changes(before: RefitModel, after: RefitModel) -> tuple[NominalParameterChange, ...]:
+def _changes(before: RefittedModel, after: RefittedModel) -> tuple[NominalParameterChange, ...]:
     """How each nominal parameter changes from one model to another."""
     parameters = before.problem.system.parameters
     return tuple(
@@ -458,7 +466,7 @@ def fit_nominal_model(
     solution: Solution | None = None,
     store: RefitStore | None = None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
-) -> RefitModel:
+) -> RefittedModel:
     """Return the fit of the nominal model within the problem with all candidates.
 
     Raises
@@ -488,7 +496,7 @@ def fit_nominal_model(
     return fit
 
 
-def _largest_joint_angles(fit: RefitModel) -> dict[str, float]:
+def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
     """The largest joint angle of each segment in the estimation recordings [rad]."""
     system, states = fit.problem.system, [r.rollout.state for r in fit.evaluation.episode_predictions]
     found = {}
@@ -499,18 +507,20 @@ def _largest_joint_angles(fit: RefitModel) -> dict[str, float]:
 
 
 def _null_test(
-    problem: EstimationProblem, residual: Array, fit: RefitModel | None, limits: Thresholds
+    problem: EstimationProblem, residual: Array, fit: RefittedModel | None, limits: Thresholds
 ) -> NullTestResult:
     """The null test of a residual from which a fit's parameters took their part."""
     count = 0 if fit is None else len(fit.values)
-    return run_null_test(residual_channels(problem), residual, count, limits.significance_level, limits.residual_window)
+    return run_null_test(
+        residual_channel_samples(problem), residual, count, limits.significance_level, limits.residual_window
+    )
 
 
-def _estimation_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
+def _estimation_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
     return _null_test(fit.problem, fit.evaluation.residual, fit, limits)
 
 
-def _held_out_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
+def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
     """The null test of a model on the held-out recordings."""
     problem, shared = fit.problem, len(fit.problem.shared_parameters)
     residuals, slopes = [], []
@@ -521,26 +531,26 @@ def _held_out_null_test(fit: RefitModel, limits: Thresholds = DEFAULT_THRESHOLDS
                 where=episode.name,
                 hint="hold out a recording that the nominal model can follow",
             )
-        rows = problem.held_out_residual(i, episode, result)
+        rows = problem.whitened_held_out_residual(i, episode, result)
         assert rows.jacobian is not None
         residuals.append(rows.residual)
         slopes.append(rows.jacobian[:, :shared])
-    spread = np.vstack(slopes) @ noise_covariance_factor(problem, fit.evaluation)[:shared]
+    spread = np.vstack(slopes) @ unknowns_covariance_factor(problem, fit.evaluation)[:shared]
     residual = whiten_with_extra_errors(np.concatenate(residuals), spread)
     return _null_test(problem.with_episodes(problem.held_out, ()), residual, None, limits)
 
 
-def _smooth_about_model(fit: RefitModel, limits: Thresholds) -> SmootherResult:
+def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmootherResult:
     """Run the weak-constraint smoother about a fitted model, with torque noise among its unknowns."""
     problem, evaluation, x = fit.problem, fit.evaluation, fit.problem.vector(fit.values)
     if problem.has_process_noise:
-        problem = whitened_by_sensor_noise(problem)
+        problem = problem_whitened_by_sensor_noise(problem)
         evaluation = problem.evaluate(x, equilibrium_guesses=fit.evaluation.equilibrium_guesses)
-    if any(episode.has_constant_sensor_errors for episode in problem.episodes):
+    if any(episode.has_uncertain_sensor_biases for episode in problem.episodes):
         less = [
             replace(e, measurements=subtract_estimated_biases(e.measurements, result.predicted_outputs))
             for e, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
         ]
         problem = problem.with_episodes(less, ())
         evaluation = problem.evaluate(x, equilibrium_guesses=evaluation.equilibrium_guesses)
-    return run_smoother(problem, x, evaluation, limits)
+    return select_and_smooth_unknowns(problem, x, evaluation, limits)

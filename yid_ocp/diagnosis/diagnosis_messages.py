@@ -8,15 +8,15 @@ from collections.abc import Sequence
 from yid_ocp.diagnosis.baseline import BaselineComparison, CounterfactualTest
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet
-from yid_ocp.diagnosis.hypotheses import TruncatedRecording
+from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.localise import GapLocation, main_gap_locations
-from yid_ocp.diagnosis.refit import RefitModel
+from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import CandidateDetectability
 from yid_ocp.diagnosis.select import SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import assumption_count, failed_transfer_checks, required_explained_fraction
+from yid_ocp.diagnosis.verdict import failed_transfer_checks, independent_assumption_count, required_explained_fraction
 from yid_ocp.effects import EffectBase
-from yid_ocp.effects.base import EXCITATIONS
+from yid_ocp.effects.base import EXCITATION_DESCRIPTIONS
 from yid_ocp.inference.null_test import NullTestResult
 
 _MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
@@ -49,19 +49,24 @@ _UNKNOWN_REASON_TEXTS = {
     "close{s} {low:.3g} % on held-out motions; {enough:.3g} % {asked}.",
     "stand_in": "{names} imitate{s} it (closing {closure:.3g} % on held-out motions) and {are} not its cause: {apart}.",
 }
-"""Sentences on why the verdict is unknown, by `verdict.UnknownReason`."""
+"""Sentences on why the verdict is unknown, by `verdict.UnknownVerdictReason`."""
 
 
 def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
     """The experiment that separates indistinguishable effects, from what their equations depend on."""
     said = list(dict.fromkeys(effect.required_excitation for effect in rivals if effect.required_excitation))
-    aspects = sorted(said, key=lambda aspect: EXCITATIONS.index(aspect) if aspect in EXCITATIONS else len(EXCITATIONS))
+    aspects = sorted(
+        said,
+        key=lambda aspect: (
+            EXCITATION_DESCRIPTIONS.index(aspect) if aspect in EXCITATION_DESCRIPTIONS else len(EXCITATION_DESCRIPTIONS)
+        ),
+    )
     places = list(dict.fromkeys(effect.location for effect in rivals))
     case = "separate" if len(aspects) > 1 else "places" if len(places) > 1 else "vary" if aspects else "other"
     return _NEXT_EXPERIMENT_TEXTS[case].format(aspects=" and ".join(aspects), places=" and ".join(places))
 
 
-def next_experiment_text(
+def recommended_experiment_text(
     verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], seen: Sequence[CandidateDetectability]
 ) -> str:
     """Return the recommended next recording as text."""
@@ -93,7 +98,7 @@ def insufficient_data_message(
     )
 
 
-def truncation_message(cut: TruncatedRecording) -> str:
+def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
     """Return the sentence on how far the nominal model follows a held-out recording."""
     if cut.kept_duration == 0:
         return f"The nominal model cannot follow {cut.recording} at all, which is left out."
@@ -110,7 +115,7 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
         text += _effects(finding)
     elif finding.verdict == "unknown":
         text.append(_nameless(finding))
-    text += [truncation_message(cut) for cut in finding.truncated_recordings]
+    text += [held_out_truncation_message(cut) for cut in finding.truncated_recordings]
     if finding.baseline_comparison is not None:
         text += _since(finding.baseline_comparison, bool(finding.accepted_effects))
     if finding.counterfactual is not None:
@@ -158,8 +163,8 @@ def _places(finding: DiagnosisResult) -> str:
 def _nameless(finding: DiagnosisResult) -> str:
     """Why no effect is named, with the numbers that say so."""
     added, tried, reason = finding.selected_effects, finding.single_effect_models, finding.unknown_reason
-    apart = [entry.disagreement for entry in failed_transfer_checks(finding.transfer_checks)]
-    count = assumption_count(added)
+    apart = [entry.disagreement_text for entry in failed_transfer_checks(finding.transfer_checks)]
+    count = independent_assumption_count(added)
     return _UNKNOWN_REASON_TEXTS[reason if reason != "none" or tried else "nothing"].format(
         best=tried[0].effects[0].label if tried else "",
         names=" and ".join(entry.effect.label for entry in added),
@@ -207,7 +212,7 @@ def _effects(finding: DiagnosisResult) -> list[str]:
     return [*text, f"With it {', '.join(moved[:6])}."] if moved else text
 
 
-def _figures(effect: EffectBase, fit: RefitModel) -> str:
+def _figures(effect: EffectBase, fit: RefittedModel) -> str:
     known = {
         name: f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".strip().removesuffix(" 1")
         if math.isfinite(r.std)
@@ -217,7 +222,7 @@ def _figures(effect: EffectBase, fit: RefitModel) -> str:
     return ", ".join(f"{name} {said}" for name, said in known.items())
 
 
-def _out_of_range(effect: EffectBase, fit: RefitModel) -> list[str]:
+def _out_of_range(effect: EffectBase, fit: RefittedModel) -> list[str]:
     """Amplitudes beyond the range that an engineer would expect."""
     found = []
     for name in effect.amplitude_names:
@@ -268,7 +273,9 @@ def _counterfactual(found: CounterfactualTest) -> list[str]:
         names += " and others" if len(part.recordings) > 2 else ""
         plain, errors = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in part.rmse_by_unit.items()) for i in (0, 1))
         text.append(f"{begin} {names}, {made}, to {errors} (rms), where the model {rival} has {plain}.")
-        text += [] if part.is_improved else ["That is no better, so it may stand in for something else."]
+        text += (
+            [] if part.is_improved_by_counterfactual else ["That is no better, so it may stand in for something else."]
+        )
     return text
 
 
@@ -285,10 +292,10 @@ def _event_sentences(events: EventSet) -> str:
         more = f"; and {count - _MAX_EVENTS_LISTED} more" if count > _MAX_EVENTS_LISTED else ""
         first = "One event stands" if count == 1 else f"{count} events stand"
         text.append(f"{first} beside all this, short and in one place: {told}{more}.")
-    return " ".join([*text, *overspeed_messages(events)])
+    return " ".join([*text, *joint_overspeed_messages(events)])
 
 
-def overspeed_messages(events: EventSet) -> list[str]:
+def joint_overspeed_messages(events: EventSet) -> list[str]:
     """Return one sentence for each recording whose end is ignored because a joint moves too fast."""
     why = "moves too fast for the model to follow."
     return [

@@ -9,9 +9,9 @@ from typing import Any
 
 from yid_ocp.diagnosis.baseline import BaselineComparison, CounterfactualTest
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
-from yid_ocp.diagnosis.hypotheses import TruncatedRecording
+from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.localise import GapLocation
-from yid_ocp.diagnosis.refit import RefitModel
+from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
     CandidateDetectability,
     CandidateScore,
@@ -21,19 +21,24 @@ from yid_ocp.diagnosis.screening import (
 from yid_ocp.diagnosis.select import (
     GapClosure,
     SelectedEffect,
-    gap_closure,
+    held_out_gap_closure,
     held_out_improvement,
     penalized_chi2_difference,
-    rmse_reduction,
+    relative_rmse_reduction,
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import TransferCheck, UnknownReason, assumption_count, failed_transfer_checks
+from yid_ocp.diagnosis.verdict import (
+    TransferCheck,
+    UnknownVerdictReason,
+    failed_transfer_checks,
+    independent_assumption_count,
+)
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.effects import EffectBase
-from yid_ocp.files import attributes_to_json, finite_json
-from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult, bonferroni_p_value
+from yid_ocp.files import attributes_to_json, json_with_nonfinite_as_none
+from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult, min_bonferroni_p_value
 from yid_ocp.inference.smoother import SmootherResult
-from yid_ocp.inference.uncertainty import covariance_and_chi2, covariance_to_dict
+from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 
 _FORMAT = "yid-diagnosis/2"
 
@@ -62,8 +67,8 @@ class DiagnosisResult(ReprMixin):
     candidate_scores: tuple[CandidateScore, ...]  # first pass, best first
     smoother_result: SmootherResult | None  # about the nominal model; None where there is no gap to locate
     gap_locations: tuple[GapLocation, ...]
-    nominal_model: RefitModel
-    single_effect_models: tuple[RefitModel, ...]  # of the first round, best first
+    nominal_model: RefittedModel
+    single_effect_models: tuple[RefittedModel, ...]  # of the first round, best first
     selected_effects: tuple[SelectedEffect, ...]
     gap_closure: GapClosure
     remaining_test: NullTestResult  # held-out, with the effects added
@@ -78,8 +83,8 @@ class DiagnosisResult(ReprMixin):
     baseline_comparison: BaselineComparison | None = None
     counterfactual: CounterfactualTest | None = None
     summary: str = ""
-    truncated_recordings: tuple[TruncatedRecording, ...] = ()
-    unknown_reason: UnknownReason = ""
+    truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
+    unknown_reason: UnknownVerdictReason = ""
     explained_fraction: float = 1.0  # what the effects explain over what the smoother explains
     transfer_checks: tuple[TransferCheck, ...] = ()
     events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
@@ -103,7 +108,7 @@ class DiagnosisResult(ReprMixin):
         )
 
     @property
-    def final_model(self) -> RefitModel:
+    def final_model(self) -> RefittedModel:
         """The model with all accepted effects; the nominal model if there are none."""
         return self.selected_effects[-1].refitted_model if self.accepted_effects else self.nominal_model
 
@@ -142,8 +147,8 @@ class DiagnosisResult(ReprMixin):
             "next_experiment": self.next_experiment,
             "side": None if smoothed is None else smoothed.gap_origin,
             "evidence": {} if smoothed is None else dict(smoothed.log_evidence),
-            "explainable": None if smoothed is None else smoothed.explainable_fraction,
-            "statistics": threshold_statistics(self),
+            "explainable": None if smoothed is None else smoothed.explainable_gap_fraction,
+            "statistics": statistics_compared_with_thresholds(self),
             "summary": self.summary,
             "message": self.message,
             "held_out_in_blocks": self.is_split_in_blocks,
@@ -167,7 +172,7 @@ class DiagnosisResult(ReprMixin):
         }
 
 
-def threshold_statistics(finding: DiagnosisResult) -> dict[str, Any]:
+def statistics_compared_with_thresholds(finding: DiagnosisResult) -> dict[str, Any]:
     """Return the statistics compared with `Thresholds`, JSON-compatible, from which these are calibrated.
 
     None where a step was not come to.
@@ -189,26 +194,26 @@ def threshold_statistics(finding: DiagnosisResult) -> dict[str, Any]:
     apart = [distance / std for distance, std in (entry.difference for entry in finding.transfer_checks) if std > 0]
     of_effects: dict[str, Any] = dict.fromkeys(("closure", "closure_low", "fall", "explained"))
     if added:
-        fall = rmse_reduction(before.held_out_loss, added[-1].refitted_model.held_out_loss)
+        fall = relative_rmse_reduction(before.held_out_loss, added[-1].refitted_model.held_out_loss)
         own = (finding.gap_closure.fraction, finding.gap_closure.ci_low, fall, finding.explained_fraction)
         of_effects = dict(zip(of_effects, own, strict=True))
     found = {
-        "p_value": bonferroni_p_value(tests),
+        "p_value": min_bonferroni_p_value(tests),
         "chi2_per_dof": max(test.chi2_per_dof for test in tests),
         "largest_channel": max((value for test in tests for value in test.channel_chi2.values()), default=None),
         "candidate": min(1.0, bonferroni_min_p_value(finding.candidate_scores)),
         "evidence": None if seen is None or before.problem.has_process_noise else max(seen.log_evidence.values()),
         **of_effects,
-        "assumptions": assumption_count(added),
+        "assumptions": independent_assumption_count(added),
         "carried": max(apart, default=None),
         "behind": {
             fit.effects[-1].label: _behind(fit, finding.single_effect_models[0]) for fit in finding.single_effect_models
         },
     }
-    return {name: finite_json(value) for name, value in found.items()}
+    return {name: json_with_nonfinite_as_none(value) for name, value in found.items()}
 
 
-def _behind(fit: RefitModel, first: RefitModel) -> dict[str, float]:
+def _behind(fit: RefittedModel, first: RefittedModel) -> dict[str, float]:
     """How much worse a refit is than the first."""
     lost, error = held_out_improvement(fit.held_out_loss, first.held_out_loss)
     left, squares = fit.held_out_loss.chi2_per_sample, penalized_chi2_difference(fit, first)
@@ -229,11 +234,11 @@ def final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     for entry, value in zip(problem.system.parameters, theta, strict=True):
         if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
             free = entry.name in shared
-            std = finite_json(fit.std[entry.name]) if free else 0.0
+            std = json_with_nonfinite_as_none(fit.std[entry.name]) if free else 0.0
             found[entry.name] = {"value": float(value), "std": std, "unit": entry.unit, "free": free}
     if finish.jacobian is None:
         finish = problem.evaluate(problem.vector(fit.values), equilibrium_guesses=finish.equilibrium_guesses)
-    matrix, _ = covariance_and_chi2(problem, finish)
+    matrix, _ = unknowns_covariance_and_reduced_chi2(problem, finish)
     covariance = covariance_to_dict(shared, matrix[: len(shared), : len(shared)], [fit.std[name] for name in shared])
     return {"parameters": found, "covariance": covariance}
 
@@ -251,7 +256,7 @@ def _since(found: BaselineComparison) -> dict[str, Any]:
     return {**known, "parameters": parameters, "changed": changed}
 
 
-def _state(fit: RefitModel, test: NullTestResult) -> dict[str, Any]:
+def _state(fit: RefittedModel, test: NullTestResult) -> dict[str, Any]:
     channels = fit.held_out_loss.channel_rmse
     return {
         "rmse": {name: value for name, (value, _) in channels.items()},
@@ -266,8 +271,8 @@ def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
     failed, listed = failed_transfer_checks(finding.transfer_checks), []
     for entry in finding.selected_effects if finding.unknown_reason == "stand_in" else ():
         own = [check for check in failed if check.effect_label == entry.effect.label] or failed
-        reason = "; ".join(check.disagreement for check in own)
-        closed = finite_json(entry.cumulative_closure.fraction)
+        reason = "; ".join(check.disagreement_text for check in own)
+        closed = json_with_nonfinite_as_none(entry.cumulative_closure.fraction)
         listed.append({**attributes_to_json(entry.effect, _EFFECT), "closure": closed, "reason": reason})
     return listed
 
@@ -275,14 +280,17 @@ def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
 def _closure(closed: GapClosure | None) -> dict[str, Any]:
     if closed is None:
         return {"closure": None, "closure_ci": None}
-    return {"closure": finite_json(closed.fraction), "closure_ci": finite_json([closed.ci_low, closed.ci_high])}
+    return {
+        "closure": json_with_nonfinite_as_none(closed.fraction),
+        "closure_ci": json_with_nonfinite_as_none([closed.ci_low, closed.ci_high]),
+    }
 
 
 def _ranked_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
     """All candidates ranked: added effects, then other refits by held-out loss, then the rest by score."""
     scores = {score.effect.label: score for score in finding.candidate_scores}
     alone = {fit.effects[0].label: fit for fit in finding.single_effect_models}
-    entries: list[tuple[EffectBase, RefitModel | None]] = [
+    entries: list[tuple[EffectBase, RefittedModel | None]] = [
         *((effect, finding.final_model) for effect in finding.accepted_effects),
         *((fit.effects[0], fit) for fit in finding.single_effect_models),
         *((score.effect, None) for score in finding.candidate_scores),
@@ -300,6 +308,6 @@ def _ranked_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
             "parameters": {name: attributes_to_json(r, "value std unit") for name, r in reported.items()},
             "score": 0.0 if score is None else score.lm_statistic,
             "p_value": 1.0 if score is None else score.p_value,
-            **_closure(None if own is None else gap_closure(before, own.held_out_loss)),
+            **_closure(None if own is None else held_out_gap_closure(before, own.held_out_loss)),
         }
     return list(listed.values())

@@ -2,9 +2,9 @@
 
 Along prescribed joints whose efforts are compared the unknown force is measured minus needed torque, sample by sample;
 elsewhere it is what the smoother's linear model says of the force at one coordinate, everything else as the smoother
-has it. In both cases `detect_pulses` looks for what rises and falls beside a rest that follows the load. What a sensor
-says for one to three samples alone is an event of that sensor. What events explain is taken out before anything else is
-judged: torques act beside the recorded ones, and samples in an event's window do not count.
+has it. In both cases `detect_force_pulses` looks for what rises and falls beside a rest that follows the load. What a
+sensor says for one to three samples alone is an event of that sensor. What events explain is taken out before anything
+else is judged: torques act beside the recorded ones, and samples in an event's window do not count.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import quantization_step
-from yid_ocp.diagnosis.hypotheses import hide_samples
-from yid_ocp.diagnosis.localise import force_unit, surely_not_zero
+from yid_ocp.diagnosis.hypotheses import mask_out_samples
+from yid_ocp.diagnosis.localise import generalised_force_unit, is_significantly_nonzero
 from yid_ocp.diagnosis.pulse_detection import (
     MAX_EVENT_TIME_FRACTION,
-    DetectedPulse,
+    DetectedForcePulse,
     ForceEstimate,
     InverseDynamicsModel,
-    detect_pulses,
+    detect_force_pulses,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.effects.base import robot_joints
+from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.files import attributes_to_json
-from yid_ocp.inference.null_test import benjamini_hochberg_mask, sample_times
-from yid_ocp.inference.smoother import SmootherResult, force_likelihood_terms
+from yid_ocp.inference.null_test import benjamini_hochberg_mask, times_since_recording_start
+from yid_ocp.inference.smoother import SmootherResult, force_log_likelihood_coefficients
 from yid_ocp.inference.smoother_model import linear_residual_models, sensor_bias_location
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -40,7 +40,7 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import effort_filter
-from yid_ocp.sensors.base import CHANNELS, values_by_joint
+from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
 
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 """A recording, its prediction and the parameters theta of that."""
@@ -73,9 +73,9 @@ class DisturbanceEvent:
     impulse: float  # integral over time [unit x s]
     impulse_std: float  # standard deviation of the impulse, counting what the model is allowed to be wrong by
     unit: str
-    detected_pulse: DetectedPulse | None = None  # shape of a force
+    detected_pulse: DetectedForcePulse | None = None  # shape of a force
 
-    def overlap(self, other: DisturbanceEvent) -> float:
+    def overlap_duration(self, other: DisturbanceEvent) -> float:
         """Time for which both last, of whatever recording [s]; negative where one begins after the other."""
         return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
 
@@ -86,7 +86,7 @@ class DisturbanceEvent:
 
 
 @dataclass(frozen=True)
-class Overspeed:
+class _Overspeed:
     """Time after which a recording is ignored because a joint moves faster than `Thresholds.max_joint_speed`."""
 
     recording: str
@@ -95,7 +95,7 @@ class Overspeed:
 
 
 @dataclass(frozen=True)
-class EventForceSeries:
+class _EventForceSeries:
     """Time series of the unknown force at a coordinate with an event, for plots; shape (M,) each."""
 
     recording: str
@@ -111,16 +111,16 @@ class EventSet:
     """All events of a diagnosis by recording and time, the force time series, and overspeeds."""
 
     disturbances: tuple[DisturbanceEvent, ...] = ()
-    overspeeds: tuple[Overspeed, ...] = ()
-    force_series: tuple[EventForceSeries, ...] = ()
+    overspeeds: tuple[_Overspeed, ...] = ()
+    force_series: tuple[_EventForceSeries, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.disturbances or self.overspeeds)
 
-    def overlaps_with(self, other: EventSet) -> bool:
+    def overlaps_on_same_channels(self, other: EventSet) -> bool:
         """Whether both hold events of the same channels at overlapping times."""
         return len(self.disturbances) == len(other.disturbances) and all(
-            (a.recording, a.channel) == (b.recording, b.channel) and a.overlap(b) > 0
+            (a.recording, a.channel) == (b.recording, b.channel) and a.overlap_duration(b) > 0
             for a, b in zip(self.disturbances, other.disturbances, strict=True)
         )
 
@@ -146,7 +146,7 @@ class EventSet:
 NO_EVENTS = EventSet()
 
 
-def find_events(
+def find_disturbance_events(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
@@ -167,11 +167,11 @@ def find_events(
     """
     runs: list[_RecordingRollout] = []
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
-        runs.append((episode, result, problem.predictor.episode_theta(episode, problem.split(x, i)[0])))
+        runs.append((episode, result, problem.predictor.theta_with_episode_values(episode, problem.split(x, i)[0])))
     shared = problem.split(x, 0)[0]
     for episode, outcome in problem.predict_held_out(x):
         if not isinstance(outcome, str):
-            runs.append((episode, outcome, problem.predictor.episode_theta(episode, shared)))
+            runs.append((episode, outcome, problem.predictor.theta_with_episode_values(episode, shared)))
     ends = EventSet((), tuple(fall for run in runs for fall in _overspeed(problem, run, limits)))
     wrong = [e for run in runs for e in _wrong_samples(problem, run) if e.end_time < ends._end_of(e.recording)]
     torques = InverseDynamicsModel(problem.step)
@@ -179,10 +179,10 @@ def find_events(
     if smoothed is not None:
         histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques, limits)
     cut = [entry for entry in (_before_overspeed(history, ends) for history in histories) if entry is not None]
-    found: list[tuple[ForceEstimate, DetectedPulse]] = []
+    found: list[tuple[ForceEstimate, DetectedForcePulse]] = []
     tries = 0.0
     for history in cut:
-        own, looked = detect_pulses(history, limits)
+        own, looked = detect_force_pulses(history, limits)
         tries += looked
         found += [(history, pulse) for pulse in own]
     real = benjamini_hochberg_mask([pulse.p_value for _, pulse in found], tries, limits.significance_level)
@@ -197,8 +197,13 @@ def find_events(
     everything = sorted([*forces, *wrong], key=lambda event: (event.recording, event.start_time, event.location))
     there = {(event.recording, event.channel) for event in forces}
     shown = tuple(
-        EventForceSeries(
-            h.recording, h.coordinate, h.unit, h.t, h.force_values, np.hypot(h.model_error_std, h.friction_limit)
+        _EventForceSeries(
+            h.recording,
+            h.coordinate,
+            h.unit,
+            h.t,
+            h.max_likelihood_forces,
+            np.hypot(h.model_error_std, h.friction_limit),
         )
         for h in cut
         if (h.recording, h.coordinate) in there
@@ -209,23 +214,23 @@ def find_events(
 # -- forces -----------------------------------------------------------------------------------------------------------
 
 
-def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thresholds) -> Iterator[Overspeed]:
+def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thresholds) -> Iterator[_Overspeed]:
     """When a joint of the robot first moves too fast."""
     episode, result, _ = run
     names, h = problem.system.mechanism.joint_names, episode.grid.time_step
-    places = [names.index(name) for name in robot_joints(problem.system)]
+    places = [names.index(name) for name in arm_joint_names(problem.system)]
     if not places:
         return
     speed = np.abs(np.gradient(result.rollout.state[:, places], h, axis=0))
     for at in np.flatnonzero(np.any(speed > limits.max_joint_speed, axis=1))[:1]:
-        yield Overspeed(episode.name, names[places[int(speed[at].argmax())]], float(at * h))
+        yield _Overspeed(episode.name, names[places[int(speed[at].argmax())]], float(at * h))
 
 
 def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
     """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
     until = ends._end_of(history.recording) - effort_filter(history.filter_cutoff).settling_time
     keep = np.flatnonzero(history.t <= until)
-    return None if len(keep) < 10 else history.subset_at(keep)
+    return None if len(keep) < 10 else history.subset_at_times(keep)
 
 
 def _allowed(
@@ -233,7 +238,7 @@ def _allowed(
 ) -> tuple[Array, Array]:
     """What the model of every coordinate's torque may be wrong by, and what friction may hold, shape (M, n)."""
     episode, result, theta = run
-    terms = torques.evaluate_term_sizes(theta, result.rollout, nodes)
+    terms = torques.inverse_dynamics_term_magnitudes(theta, result.rollout, nodes)
     joints = episode.recording.joints
     # a torque is known at no better time than that of a sample
     late = 0.0 if joints is None else float(np.median(np.diff(joints.t)))
@@ -252,9 +257,9 @@ def _read_forces(
             continue
         error, held = _allowed(torques, run, samples.node, limits)
         unit_effort = samples.sensor.effort_per_output
-        weight = np.where(samples.is_used, samples.weight, 0.0) / unit_effort
-        value = np.where(samples.is_used, predicted - samples.value, 0.0) * unit_effort
-        times = sample_times(episode, samples)
+        weight = np.where(samples.used_output_mask, samples.weight, 0.0) / unit_effort
+        value = np.where(samples.used_output_mask, predicted - samples.value, 0.0) * unit_effort
+        times = times_since_recording_start(episode, samples)
         # what lies closer together than an interval counts together
         bins = np.unique(np.floor((times - times[0]) / _FORCE_INTERVAL + 1e-6), return_inverse=True)[1]
         together = np.zeros((int(bins.max()) + 1, len(times)))
@@ -263,17 +268,17 @@ def _read_forces(
         for column, joint in enumerate(samples.sensor.effort_joints):
             at, square = problem.system.mechanism.joint_index(joint), weight[:, column] ** 2
             score, information = together @ (square * value[:, column]), np.diag(together @ square)
-            what = (episode.name, joint, joint, force_unit(problem.system, joint))
+            what = (episode.name, joint, joint, generalised_force_unit(problem.system, joint))
             allowed = (mean @ error[:, at], mean @ held[:, at], problem.options.path_cutoff)
             yield from _spans(ForceEstimate(*what, mean @ times, score, information, *allowed), limits)
 
 
 def _spans(whole: ForceEstimate, limits: Thresholds) -> Iterator[ForceEstimate]:
     """A long history in parts that overlap by twice the longest pulse: the work grows with the cube of their points."""
-    overlap = math.ceil(2 * limits.max_event_duration / whole.sample_spacing)
+    overlap = math.ceil(2 * limits.max_event_duration / whole.time_spacing)
     length = max(_MAX_SPAN_POINTS, 3 * overlap)
     for begin in range(0, max(len(whole.t) - overlap, 1), length - overlap):
-        yield whole.subset_at(np.arange(begin, min(begin + length, len(whole.t))))
+        yield whole.subset_at_times(np.arange(begin, min(begin + length, len(whole.t))))
 
 
 def _driving_forces(
@@ -302,8 +307,16 @@ def _driving_forces(
             for name in sought[model.recording]:
                 index, at = model.unknown_names.index(name), problem.system.mechanism.joint_index(name)
                 source, size = model.unknown_groups[index], model.reference_std[index]
-                score, information = force_likelihood_terms(model, smoothed.group_variance | {source: 0.0}, index)
-                what = (model.recording, source.location, name, force_unit(problem.system, name), middle[full])
+                score, information = force_log_likelihood_coefficients(
+                    model, smoothed.group_variance | {source: 0.0}, index
+                )
+                what = (
+                    model.recording,
+                    source.location,
+                    name,
+                    generalised_force_unit(problem.system, name),
+                    middle[full],
+                )
                 known = (score[full] / size, information[full, full] / size**2)
                 found.append(ForceEstimate(*what, *known, error[full, at], held[full, at]))
     return found
@@ -315,24 +328,24 @@ def _short(smoothed: SmootherResult, recording: int, limits: Thresholds) -> list
     for i, source in enumerate(trace.unknown_groups):
         if source.kind != "force" or source.is_confounded_with_bias or not smoothed.group_variance[source]:
             continue
-        sure = surely_not_zero(trace, [i], limits.location_z)
+        sure = is_significantly_nonzero(trace, [i], limits.location_z)
         if np.any(sure) and np.mean(sure) <= MAX_EVENT_TIME_FRACTION:
             names.append(trace.unknown_names[i])
     return names
 
 
 def _one_each(
-    found: Sequence[tuple[ForceEstimate, DetectedPulse]], problem: EstimationProblem
+    found: Sequence[tuple[ForceEstimate, DetectedForcePulse]], problem: EstimationProblem
 ) -> list[DisturbanceEvent]:
     """Events of forces; where one push moves the model, it is named at the coordinate that explains most of it."""
     prescribed = set(problem.system.prescribed)
     kept: list[DisturbanceEvent] = []
     for history, pulse in sorted(found, key=lambda entry: entry[1].p_value):
         what = (history.recording, history.location, history.coordinate, "force", pulse.start_time, pulse.end_time)
-        size = (pulse.peak_value, pulse.impulse, pulse.peak_std * pulse.unit_impulse, history.unit)
+        size = (pulse.peak_value, pulse.impulse, pulse.peak_std * pulse.impulse_per_unit_peak, history.unit)
         event = DisturbanceEvent(*what, *size, pulse)
         same = [e for e in kept if e.recording == event.recording and not {e.channel, event.channel} <= prescribed]
-        if all(event.overlap(other) <= 0 for other in same):
+        if all(event.overlap_duration(other) <= 0 for other in same):
             kept.append(event)
     return kept
 
@@ -342,7 +355,7 @@ def _recurs(one: DisturbanceEvent, other: DisturbanceEvent) -> bool:
     if one.recording == other.recording or one.channel != other.channel or one.peak_value * other.peak_value < 0:
         return False
     longer = max(one.end_time - one.start_time, other.end_time - other.start_time)
-    return one.overlap(other) > _MIN_RECURRENCE_OVERLAP * longer
+    return one.overlap_duration(other) > _MIN_RECURRENCE_OVERLAP * longer
 
 
 # -- wrong samples ----------------------------------------------------------------------------------------------------
@@ -355,19 +368,19 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
         sensor = samples.sensor
         if sensor.effort_joints or samples.node.ndim > 1:
             continue
-        t = sample_times(episode, samples)
-        for column, channel in enumerate(samples.channel_of_column):
+        t = times_since_recording_start(episode, samples)
+        for column, channel in enumerate(samples.output_channel_names):
             location = channel.rpartition(".")[2]
             if sensor.outputs_per_channel > 1:
                 location = sensor_bias_location(problem.system, sensor, sensor.output_frames[column])
-            seen, about = samples.is_used[:, column], (location, sensor.output_names[column], sensor.unit)
+            seen, about = samples.used_output_mask[:, column], (location, sensor.output_names[column], sensor.unit)
             values = (samples.value - predicted)[seen, column]
             yield from _alone(t[seen], values, samples.std[seen, column], episode.name, about)
     joints = episode.recording.joints
     if joints is None:
         return
     for quantity in ("position", "effort"):
-        values, unit = joints.channels.get(quantity), CHANNELS[f"joints.{quantity}"].unit
+        values, unit = joints.channels.get(quantity), CHANNEL_KINDS[f"joints.{quantity}"].unit
         for column, joint in enumerate(joints.names):
             floor = _floor(problem, episode, joint, quantity)
             if values is not None and floor is not None:
@@ -385,8 +398,12 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
         return None
     group = f"joints.{quantity}"
     choice = options.sensors.get(group, SensorOptions())
-    given = choice.std if choice.std is not None else getattr(joints, CHANNELS[group].std_fields[0])
-    std = 0.0 if given is None else float(values_by_joint(given, joints.names, (joint,), f"sensors.{group}.std")[0])
+    given = choice.std if choice.std is not None else getattr(joints, CHANNEL_KINDS[group].std_attribute_names[0])
+    std = (
+        0.0
+        if given is None
+        else float(expand_to_joint_values(given, joints.names, (joint,), f"sensors.{group}.std")[0])
+    )
     if quantity == "effort" and joint in system.prescribed and math.isfinite(options.path_cutoff):
         # of one sample that much is left: its share of the filter's time
         share = 2 * options.path_cutoff * float(np.median(np.diff(joints.t)))
@@ -444,7 +461,7 @@ def _beside_neighbours(t: Array, values: Array) -> Array:
 # -- the recordings without them --------------------------------------------------------------------------------------
 
 
-def problem_without_events(problem: EstimationProblem, events: EventSet) -> EstimationProblem:
+def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -> EstimationProblem:
     """Return the problem with force events compensated and affected samples excluded.
 
     Forces at joints that recorded torques drive act beside these. Samples of prescribed joints' efforts in the window
@@ -461,7 +478,7 @@ def problem_without_events(problem: EstimationProblem, events: EventSet) -> Esti
         times = episode.grid.node_times[:-1] - episode.grid.start_time + episode.grid.time_step / 2
         for event in own:
             if event.detected_pulse is not None and event.channel in set(system.driven) - set(system.servos):
-                torque[:, system.driven.index(event.channel)] += event.detected_pulse.evaluate_at(times)
+                torque[:, system.driven.index(event.channel)] += event.detected_pulse.filtered_force_at(times)
         parts = [_counting(episode, samples, own, end, cutoff) for samples in episode.measurements]
         return replace(episode, torque=torque, measurements=tuple(parts))
 
@@ -473,16 +490,16 @@ def _counting(
 ) -> Measurements:
     """Samples without those that an event spoils."""
     hidden, is_effort = np.zeros(samples.value.shape, bool), bool(samples.sensor.effort_joints)
-    t = sample_times(episode, samples)
+    t = times_since_recording_start(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
     if math.isfinite(end) and is_effort:
         hidden |= t > end - effort_filter(cutoff).settling_time
     smear = 1 / cutoff if is_effort else 0.0
     for event in own:
         inside = (t > event.start_time - smear) & (t < event.end_time + smear)
-        for column, channel in enumerate(samples.channel_of_column):
+        for column, channel in enumerate(samples.output_channel_names):
             name = channel.rpartition(".")[2] if is_effort else samples.sensor.output_names[column]
             # a wrong angle is smeared over what all joints need
             if event.channel == name or (is_effort and event.kind == "sample"):
                 hidden[:, column] |= inside[:, column]
-    return hide_samples(samples, hidden) if np.any(hidden & samples.is_used) else samples
+    return mask_out_samples(samples, hidden) if np.any(hidden & samples.used_output_mask) else samples

@@ -11,20 +11,20 @@ import numpy as np
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
-from yid_ocp.effects import EFFECTS, EffectBase, candidate_effects, make_effect
+from yid_ocp.effects import EFFECTS, EffectBase, candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.inference.whitening import (
-    held_out_relinearized_at_torque_bias,
-    held_out_whitened_at,
-    relinearized_at_torque_bias,
-    whitened_at,
+    problem_relinearized_at_torque_bias,
+    problem_whitened_at,
+    problem_with_relinearized_held_out,
+    problem_with_whitened_held_out,
 )
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, truncate_episode
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.recorded_inputs import recorded_sensors
+from yid_ocp.problem.recorded_inputs import recorded_sensor_kinds
 
 CandidateChoice = Literal["all"] | Sequence[str]
 
@@ -52,9 +52,9 @@ def make_candidate_effects(
     ModelError
         A location that does not exist.
     """
-    where, sensors = "diagnosis.candidates", recorded_sensors(recordings)
+    where, sensors = "diagnosis.candidates", recorded_sensor_kinds(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
-    possible = [pair for pair in candidate_effects(system, sensors) if "@".join(pair) not in present]
+    possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
     if isinstance(choice, str) and choice == "all":
         return [make_effect(kind, place, system) for kind, place in possible]
     if isinstance(choice, str) or not choice:
@@ -101,7 +101,7 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
     return kept
 
 
-def neutral_values(effects: Sequence[EffectBase]) -> dict[str, float]:
+def neutral_effect_parameter_values(effects: Sequence[EffectBase]) -> dict[str, float]:
     """Return the parameter values at which some effects are absent, by parameter name."""
     return {name: value for effect in effects for name, value in effect.neutral_values.items()}
 
@@ -112,7 +112,7 @@ def join_effect_labels(effects: Sequence[EffectBase]) -> str:
 
 
 @dataclass(frozen=True)
-class TruncatedRecording:
+class TruncatedHeldOutRecording:
     """A held-out recording truncated where the nominal model stops following it."""
 
     recording: str
@@ -160,7 +160,7 @@ class AllCandidatesProblem:
         return AllCandidatesProblem(made if held else _in_blocks(made), effects, not held)
 
     @property
-    def nominal_parameters(self) -> tuple[str, ...]:
+    def nominal_free_parameters(self) -> tuple[str, ...]:
         """Parameters that the nominal problem frees."""
         return self.problem.free
 
@@ -170,11 +170,11 @@ class AllCandidatesProblem:
         Twice in a row, so that what is frozen is about the offsets that the torques have there.
         """
         x = self.problem.vector(values)
-        return replace(self, problem=held_out_whitened_at(whitened_at(self.problem, x, rounds=2), x))
+        return replace(self, problem=problem_with_whitened_held_out(problem_whitened_at(self.problem, x, rounds=2), x))
 
-    def truncate_held_out(
+    def truncate_held_out_recordings(
         self, values: Mapping[str, float], margin: float
-    ) -> tuple[AllCandidatesProblem, tuple[TruncatedRecording, ...]]:
+    ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
         """Truncate held-out recordings where the rollout fails; return the problem and the truncated recordings.
 
         A gap may be so large that the nominal model cannot follow a recording at all; what it says until then is
@@ -191,7 +191,7 @@ class AllCandidatesProblem:
                 continue
             steps = round(margin * steps)
             usable = steps * h >= _MIN_PREDICTED_DURATION
-            cuts.append(TruncatedRecording(episode.name, steps * h if usable else 0.0, whole * h))
+            cuts.append(TruncatedHeldOutRecording(episode.name, steps * h if usable else 0.0, whole * h))
             kept += [truncate_episode(episode, steps)] if usable else []
         if not cuts:
             return self, ()
@@ -201,27 +201,27 @@ class AllCandidatesProblem:
     def with_free_effects(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Return the problem with the nominal parameters and those of some effects free."""
         own = (name for effect in effects for name in effect.parameters.names)
-        return self.problem.with_free_subset((*self.nominal_parameters, *own))
+        return self.problem.with_free_subset((*self.nominal_free_parameters, *own))
 
     def relinearized_with_effects(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
         """Return the problem with some effects free, relinearised about the torque errors that remain with them.
 
         Torque offsets that the nominal model sees are too large by what an effect does. Filters of held-out recordings
-        are left as they are: see `held_out_relinearized`.
+        are left as they are: see `with_held_out_relinearized`.
         """
         own = self.with_free_effects(effects)
-        return relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
+        return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
-    def held_out_relinearized(
+    def with_held_out_relinearized(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
         """Return a `relinearized_with_effects` problem with held-out recordings relinearised too, after a fit."""
-        return held_out_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
+        return problem_with_relinearized_held_out(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
 
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
     """Unknowns at some values, and with neutral effects, where filters are about the right torques."""
-    return own.vector(at), own.vector({**at, **neutral_values(effects)})
+    return own.vector(at), own.vector({**at, **neutral_effect_parameter_values(effects)})
 
 
 _JOINT: WeakKeyDictionary[Step, tuple[Step, tuple[EffectBase, ...]]] = WeakKeyDictionary()
@@ -278,10 +278,10 @@ def _masked(episode: Episode, parity: int) -> Episode:
     for entry in episode.measurements:
         t = (entry.node + entry.fraction) * episode.grid.time_step
         hidden = (np.floor(t / _BLOCK_DURATION).astype(int) % 2 != parity)[:, None] & np.ones(entry.value.shape, bool)
-        samples.append(hide_samples(entry, hidden))
+        samples.append(mask_out_samples(entry, hidden))
     return replace(episode, measurements=tuple(samples))
 
 
-def hide_samples(samples: Measurements, hidden: BoolArray) -> Measurements:
+def mask_out_samples(samples: Measurements, hidden: BoolArray) -> Measurements:
     """Return measurements of which some samples, shape (M, k), do not count."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

@@ -10,7 +10,7 @@ import numpy as np
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
-from yid_ocp.inference.smoother_model import UnknownGroup
+from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.system import System
 
 _MIN_NAMED_SHARE = 0.1  # share of the gap from which a place is named
@@ -44,7 +44,7 @@ def localise_gap(
 
     The gap is there when an unknown is `location_z` standard deviations away from zero.
     """
-    groups: dict[str, list[UnknownGroup]] = {}
+    groups: dict[str, list[SmoothedUnknownGroup]] = {}
     for source in smoothed.log_evidence_drop:
         groups.setdefault(source.location, []).append(source)
     drop = smoothed.log_evidence_drop
@@ -61,24 +61,24 @@ def localise_gap(
     return _by_share(found)
 
 
-def surely_not_zero(trace: SmoothedUnknowns, columns: Sequence[int], limit: float) -> BoolArray:
+def is_significantly_nonzero(trace: SmoothedUnknowns, columns: Sequence[int], limit: float) -> BoolArray:
     """Whether some unknowns are further from zero than `limit` standard deviations, shape (J, columns)."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > limit * std)
 
 
 def _windows(
-    smoothed: SmootherResult, sources: Sequence[UnknownGroup], limit: float
+    smoothed: SmootherResult, sources: Sequence[SmoothedUnknownGroup], limit: float
 ) -> tuple[tuple[float, float], ...]:
     spans: list[tuple[float, float]] = []
     for trace in smoothed.smoothed_unknowns:
         own = [i for i, source in enumerate(trace.unknown_groups) if source in sources]
-        sure = np.flatnonzero(np.any(surely_not_zero(trace, own, limit), axis=1))
+        sure = np.flatnonzero(np.any(is_significantly_nonzero(trace, own, limit), axis=1))
         spans += [(float(trace.interval_edges[j]), float(trace.interval_edges[j + 1])) for j in sure]
-    return merge_intervals(spans)
+    return merge_time_intervals(spans)
 
 
-def merge_intervals(spans: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+def merge_time_intervals(spans: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
     """Merge overlapping or adjacent time intervals."""
     joined: list[tuple[float, float]] = []
     for begin, end in sorted(spans):
@@ -123,7 +123,7 @@ def attribute_gap_to_effects(
     return _by_share(found)
 
 
-def informed_z_scores(
+def smoothed_unknown_z_scores(
     smoothed: SmootherResult, recording: int = 0, informed_fraction: float = DEFAULT_THRESHOLDS.informed_fraction
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Return the unknowns of one recording divided by their posterior standard deviation, NaN if not informed.
@@ -145,14 +145,14 @@ def informed_z_scores(
     return trace.interval_edges, trace.unknown_names, values
 
 
-def unknown_units(system: System, trace: SmoothedUnknowns) -> tuple[str, ...]:
+def smoothed_unknown_units(system: System, trace: SmoothedUnknowns) -> tuple[str, ...]:
     """Return the SI unit of every unknown of a trace: force or torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
     other = {"push": "N", "offset": "m", "bias": "m"}
-    return tuple(force_unit(system, name) if of.kind == "force" else other[of.kind] for name, of in pairs)
+    return tuple(generalised_force_unit(system, name) if of.kind == "force" else other[of.kind] for name, of in pairs)
 
 
-def force_unit(system: System, coordinate: str) -> str:
+def generalised_force_unit(system: System, coordinate: str) -> str:
     """Return the SI unit of the generalised force at a coordinate, N or N m."""
     kinds = {joint.name: joint.kind for joint in system.mechanism.joints}
     return "N" if kinds.get(coordinate) == "prismatic" else "N m"

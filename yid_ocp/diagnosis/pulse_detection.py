@@ -29,7 +29,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.integrator.rollout import applied_joint_torque
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.system import MidpointState, System
 from yid_ocp.problem.signal_filters import effort_filter
 
@@ -57,7 +57,7 @@ class InverseDynamicsModel:
     def _function(self) -> ca.Function:
         return _function(self._step.system, self._step.time_step)
 
-    def evaluate_term_sizes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
+    def inverse_dynamics_term_magnitudes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
         """Return the term magnitudes along a rollout, accelerations from finite differences.
 
         Parameters
@@ -75,7 +75,10 @@ class InverseDynamicsModel:
         squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
         applied = np.zeros((len(nodes), n))
         torque = applied_joint_torque(self._step, theta, rollout)
-        for indices, effort in ((system.driven_indices, torque), (system.prescribed_indices, rollout.effort)):
+        for indices, effort in (
+            (system.driven_coordinate_indices, torque),
+            (system.prescribed_coordinate_indices, rollout.effort),
+        ):
             if indices:
                 applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]
         rate = np.gradient(needed, time_step * nodes, axis=0) if len(nodes) > 1 else np.zeros_like(needed)
@@ -87,8 +90,8 @@ def _function(system: System, time_step: float) -> ca.Function:
     n, names = system.n_coordinates, tuple(system.internal_coordinates)
     q, v, a, z = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("a", n), ("z", len(names))))
     kinematics = forward_kinematics(system.mechanism, q)
-    moving = rigid_body_derivatives(kinematics, v, system.gravity)
-    weight = rigid_body_derivatives(kinematics, ca.SX.zeros(n), system.gravity).lagrangian_by_q
+    moving = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
+    weight = rigid_body_lagrangian_derivatives(kinematics, ca.SX.zeros(n), system.gravity).lagrangian_by_q
     rest, u = ca.SX.zeros(len(names)), ca.SX.zeros(len(system.driven))
     pulls = ca.SX.zeros(system.n_constraints)
     rows = {name: i for i, name in enumerate(names)}
@@ -150,25 +153,25 @@ class ForceEstimate:
     filter_cutoff: float = math.inf
 
     @property
-    def sample_spacing(self) -> float:
+    def time_spacing(self) -> float:
         """From point to point [s]."""
         return float(np.median(np.diff(self.t)))
 
-    def subset_at(self, keep: IntArray) -> ForceEstimate:
+    def subset_at_times(self, keep: IntArray) -> ForceEstimate:
         """Return the estimate restricted to some time points."""
         information = self.information[np.ix_(keep, keep)]
         parts = {name: getattr(self, name)[keep] for name in ("t", "score", "model_error_std", "friction_limit")}
         return replace(self, information=information, **parts)
 
     @property
-    def force_values(self) -> Array:
+    def max_likelihood_forces(self) -> Array:
         """Maximum-likelihood force at every time point, shape (M,)."""
         least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)
         return np.asarray(np.linalg.solve(self.information + least * np.eye(len(self.t)), self.score))
 
 
 @dataclass(frozen=True)
-class DetectedPulse:
+class DetectedForcePulse:
     """A force pulse that rises and falls within a time window."""
 
     start_time: float  # [s]
@@ -179,16 +182,16 @@ class DetectedPulse:
     p_value: float  # of an evidence raised so far by chance in one window
 
     @property
-    def unit_impulse(self) -> float:
+    def impulse_per_unit_peak(self) -> float:
         """Integral of the pulse shape for unit peak [s]."""
         return (self.end_time - self.start_time) * (1 - _FLAT_RAMP_FRACTION / 2 if self.is_flat_topped else 0.5)
 
     @property
     def impulse(self) -> float:
         """Integral over time."""
-        return self.peak_value * self.unit_impulse
+        return self.peak_value * self.impulse_per_unit_peak
 
-    def evaluate_at(self, t: Array, cutoff: float = math.inf) -> Array:
+    def filtered_force_at(self, t: Array, cutoff: float = math.inf) -> Array:
         """Return the low-pass filtered pulse at times `t`."""
         window = _Windows(*map(np.atleast_1d, (self.start_time, self.end_time, self.is_flat_topped)))
         return self.peak_value * _Filter.of(cutoff)(window, t)[:, 0]
@@ -311,7 +314,9 @@ class _Rest:
         return np.asarray(profiles.T @ self.scored), np.where(sure > 1e-6 * seen, sure, 0.0)
 
 
-def detect_pulses(history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS) -> tuple[list[DetectedPulse], float]:
+def detect_force_pulses(
+    history: ForceEstimate, limits: Thresholds = DEFAULT_THRESHOLDS
+) -> tuple[list[DetectedForcePulse], float]:
     """Return the pulses of one force history, largest evidence first, and the number of windows searched.
 
     p-values are those of single windows; windows count that do not overlap, of lengths a factor of two apart.
@@ -373,7 +378,7 @@ def _both_shapes(begin: Array, end: Array) -> _Windows:
 
 
 def _rests(history: ForceEstimate) -> list[_Rest]:
-    values = history.force_values
+    values = history.max_likelihood_forces
     least = 1e-9 + float(np.median(history.model_error_std))
     spread = max(1.4826 * float(np.median(np.abs(values - np.median(values)))), least)
     slowest = max(float(np.sqrt(np.mean(values**2))), spread)
@@ -383,7 +388,7 @@ def _rests(history: ForceEstimate) -> list[_Rest]:
 
 def _refined(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter, limits: Thresholds) -> _Windows:
     """A window, its ends and its shape moved to where the evidence is largest."""
-    spacing = history.sample_spacing
+    spacing = history.time_spacing
     first, last, shortest = history.t[0] + spacing, history.t[-1] - spacing, _MIN_PULSE_POINTS * spacing
     gain = float(rest.gains(seen(window, history.t))[0])
     moves = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
@@ -404,7 +409,7 @@ def _other(history: ForceEstimate, rest: _Rest, window: _Windows, seen: _Filter)
     """A step or a swing to both sides that explains as much as a pulse does, so that it is none; shape (M,)."""
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, gain = end - begin, float(rest.gains(seen(window, t))[0])
-    steps = np.arange(begin - length / 2, end + length / 2, history.sample_spacing)
+    steps = np.arange(begin - length / 2, end + length / 2, history.time_spacing)
     rising = [step for step in (np.asarray(t > at, float) for at in steps) if 1 < step.sum() < len(t) - 1]
     middles = (begin, begin + length / 4, (begin + end) / 2, end - length / 4, end)
     places = product(length * np.array([0.75, 1.0]), middles)
@@ -422,20 +427,20 @@ def _stands_out(
     t, begin, end = history.t, float(window.begin[0]), float(window.end[0])
     length, own = end - begin, seen(window, t)
     # at either bound its length is not found but cut off: jumps of friction are shorter, errors of the model longer
-    if not 1.02 * _MIN_PULSE_POINTS * history.sample_spacing < length < 0.98 * longest:
+    if not 1.02 * _MIN_PULSE_POINTS * history.time_spacing < length < 0.98 * longest:
         return False
     size = abs(float(rest.sizes(own)[0]))
-    near = history.force_values[(t > begin - length) & (t < end + length)]
+    near = history.max_likelihood_forces[(t > begin - length) & (t < end + length)]
     if size * float(np.abs(own).max()) > _MAX_PULSE_RANGE_RATIO * float(np.ptp(near)):
         return False
-    begins = np.arange(float(t[0]), float(t[-1]) - length, history.sample_spacing)
+    begins = np.arange(float(t[0]), float(t[-1]) - length, history.time_spacing)
     everywhere = _Windows(begins, begins + length, np.repeat(window.flat, len(begins)))
     return size > _MIN_PROMINENCE_RATIO * float(np.median(np.abs(bare.sizes(seen(everywhere, t)))))
 
 
 def _sized(
     history: ForceEstimate, rests: Sequence[_Rest], found: Sequence[tuple[_Windows, float]], taken: Array, seen: _Filter
-) -> list[DetectedPulse]:
+) -> list[DetectedForcePulse]:
     """The pulses with their sizes, all together, beside the rest of the largest evidence."""
     if not found:
         return []
@@ -450,5 +455,5 @@ def _sized(
         # friction can change by twice what it slides with wherever the joint stands still, whatever moves it
         stuck = np.max(history.friction_limit[(history.t >= begin) & (history.t <= end)], initial=0.0)
         if abs(float(size[at])) > 2 * float(stuck):
-            result.append(DetectedPulse(begin, end, float(size[at]), flat, std, p_value))
+            result.append(DetectedForcePulse(begin, end, float(size[at]), flat, std, p_value))
     return result

@@ -15,12 +15,16 @@ import numpy as np
 from scipy.stats import chi2
 
 from yid_ocp.arrays import Array
-from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_values
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase, ReportedParameter
-from yid_ocp.inference.null_test import sample_times
-from yid_ocp.inference.uncertainty import assess_goodness_of_fit, covariance_of_fit, std_from_covariance
-from yid_ocp.inference.whitening import relinearized_at_torque_bias, torque_bias_distance, whitened_by_sensor_noise
+from yid_ocp.inference.null_test import times_since_recording_start
+from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_widened_covariance, std_from_covariance
+from yid_ocp.inference.whitening import (
+    max_normalized_torque_bias_difference,
+    problem_relinearized_at_torque_bias,
+    problem_whitened_by_sensor_noise,
+)
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode
@@ -66,7 +70,7 @@ class HeldOutLoss:
 
 @dataclass(frozen=True)
 class StoredFit:
-    """The result of a refit as stored: one evaluation restores its `RefitModel`."""
+    """The result of a refit as stored: one evaluation restores its `RefittedModel`."""
 
     values: dict[str, float]  # of every unknown
     std: dict[str, float]  # inflated by the misfit as in `solve`; infinite where the data say nothing
@@ -75,7 +79,7 @@ class StoredFit:
 
 
 @dataclass(frozen=True)
-class RefitModel(StoredFit):
+class RefittedModel(StoredFit):
     """The nominal model with some effects, fitted again, with its standard deviations and held-out loss."""
 
     effects: tuple[EffectBase, ...]
@@ -106,7 +110,7 @@ class RefitStore(Protocol):
 
 
 @dataclass(frozen=True)
-class KnownFits:
+class PrecomputedFits:
     """What is known before a diagnosis begins: the nominal problem's solution, and refits of an interrupted run."""
 
     solution: Solution | None = None
@@ -139,7 +143,7 @@ def refit_with_effects(
     store: RefitStore | None = None,
     name: str = "",
     limits: Thresholds = DEFAULT_THRESHOLDS,
-) -> RefitModel | None:
+) -> RefittedModel | None:
     """Fit the nominal parameters and those of some effects, and predict held-out recordings; None if it never runs.
 
     Parameters
@@ -162,7 +166,7 @@ def refit_with_effects(
         fresh = {
             key: value
             for key, value in start.items()
-            if key.split("[")[0] not in problem.nominal_parameters and not key.startswith("start.")
+            if key.split("[")[0] not in problem.nominal_free_parameters and not key.startswith("start.")
         }
         best = _cheaper(best, _attempt(problem, effects, fresh) if len(fresh) < len(start) else None)
     # those before it were found from both already
@@ -175,7 +179,7 @@ def refit_with_effects(
         return None
     x, finish = best.outcome.x, best.finish
     values = best.problem.named_values(x)
-    own = problem.held_out_relinearized(best.problem, effects, values)
+    own = problem.with_held_out_relinearized(best.problem, effects, values)
     covariance = _refit_covariance(own, finish, limits)
     std = _mark_uninformative_std(effects, own.named_values(std_from_covariance(covariance, x)))
     held = _mark_uninformative_std(effects, _conditional_amplitude_std(own.unknown_names, effects, covariance))
@@ -187,7 +191,7 @@ def refit_with_effects(
 
 def load_stored_refit(
     problem: AllCandidatesProblem, effects: Sequence[EffectBase], store: RefitStore | None, name: str = ""
-) -> RefitModel | None:
+) -> RefittedModel | None:
     """Return a refit from the store, evaluated once; None if the store does not have it."""
     known = None if store is None else store.get(name or join_effect_labels(effects))
     unknowns = {*problem.with_free_effects(effects).unknown_names}
@@ -201,7 +205,7 @@ def load_stored_refit(
     finish = own.evaluate(x)
     if not finish.ok:
         return None
-    own = problem.held_out_relinearized(own, effects, known.values)
+    own = problem.with_held_out_relinearized(own, effects, known.values)
     return _model(known, effects, own, finish, x, True)
 
 
@@ -212,9 +216,9 @@ def _model(
     finish: Evaluation,
     x: Array,
     is_from_store: bool = False,
-) -> RefitModel:
+) -> RefittedModel:
     loss, same = _held_out_loss(own, x), vars(known)
-    return RefitModel(
+    return RefittedModel(
         **same,
         effects=tuple(effects),
         problem=own,
@@ -234,7 +238,9 @@ def _half_done(
 ) -> bool:
     """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
     own, count = problem.with_free_effects(effects), len(finish.residual)
-    before = own.evaluate(own.vector({**start, **neutral_values(effects)}), False, finish.equilibrium_guesses)
+    before = own.evaluate(
+        own.vector({**start, **neutral_effect_parameter_values(effects)}), False, finish.equilibrium_guesses
+    )
     if 2 * finish.cost < limits.restart_chi2 * count or not before.ok:
         return False
     return before.cost - finish.cost > limits.restart_gain * (before.cost - count / 2)
@@ -256,7 +262,7 @@ def _attempt(
     problem: AllCandidatesProblem, effects: Sequence[EffectBase], start: Mapping[str, float]
 ) -> _Attempt | None:
     """One run from one start; None where the model cannot be rolled out."""
-    neutral = neutral_values(effects)
+    neutral = neutral_effect_parameter_values(effects)
     own = problem.relinearized_with_effects(effects, start)
     for pull in (1.0, 0.5, 0.2, 0.05, 0.0):
         drawn = {name: value + pull * (start.get(name, value) - value) for name, value in neutral.items()}
@@ -268,7 +274,8 @@ def _attempt(
     if (
         found is None
         or not effects
-        or torque_bias_distance(problem.problem.whitening_filters, found.problem.whitening_filters) < _RELINEARIZE_Z
+        or max_normalized_torque_bias_difference(problem.problem.whitening_filters, found.problem.whitening_filters)
+        < _RELINEARIZE_Z
     ):
         return found
     # about fixed torques a run stops where the effect and an offset that it makes superfluous hold each other
@@ -283,7 +290,7 @@ def _relinearizing(problem: EstimationProblem) -> Callable[..., Evaluation]:
         x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
         nonlocal problem
-        problem = relinearized_at_torque_bias(problem, x, x)
+        problem = problem_relinearized_at_torque_bias(problem, x, x)
         return problem.evaluate(x, derivatives, equilibrium_guesses)
 
     return evaluate
@@ -298,7 +305,7 @@ def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome:
 
 def _refit_covariance(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:
     """Covariance of the unknowns, shape (nx, nx), inflated by the misfit as in `solve`."""
-    return covariance_of_fit(problem, finish, assess_goodness_of_fit(problem, finish, limits.gap_limits))
+    return misfit_widened_covariance(problem, finish, assess_goodness_of_fit(problem, finish, limits.null_test_limits))
 
 
 def _conditional_amplitude_std(
@@ -311,7 +318,7 @@ def _conditional_amplitude_std(
     """
     found = {}
     for effect in effects if len(covariance) else ():
-        shapes = [names.index(name) for name in effect.shape_names]
+        shapes = [names.index(name) for name in effect.shape_parameter_names]
         for name in effect.amplitude_names:
             i = names.index(name)
             own, along, other = covariance[i, i], covariance[shapes, i], covariance[np.ix_(shapes, shapes)]
@@ -327,13 +334,13 @@ def _mark_uninformative_std(effects: Sequence[EffectBase], std: Mapping[str, flo
     return {name: math.inf if size > most.get(name, math.inf) else size for name, size in std.items()}
 
 
-def refit_each(
+def refit_with_each_effect(
     search: RefitContext,
     base: Sequence[EffectBase],
     tried: Sequence[tuple[Sequence[EffectBase], Mapping[str, float]]],
     values: Mapping[str, float],
     where: str = "",
-) -> list[RefitModel]:
+) -> list[RefittedModel]:
     """Refit the model with each of several effects or pairs added to those of `base`; return the refits that succeed.
 
     Parameters
@@ -352,7 +359,7 @@ def refit_each(
     search.progress.begin_stage(f"refitting with each of {len(tried)} {noun}{beside}")
     parts = ParallelProgress(search.progress, len(tried), join_effect_labels(tried[0][0]))
 
-    def one(entry: tuple[Sequence[EffectBase], Mapping[str, float]]) -> RefitModel | None:
+    def one(entry: tuple[Sequence[EffectBase], Mapping[str, float]]) -> RefittedModel | None:
         effects, label = (*base, *entry[0]), join_effect_labels(entry[0])
         name = f"{join_effect_labels(effects)} {where}" if where else ""
         start = {**values, **entry[1]}
@@ -383,20 +390,22 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
         number = int(episode.grid.steps * episode.grid.time_step / length) + 1
         blocks = []
         for samples in episode.measurements:
-            block = np.minimum((sample_times(episode, samples) / length).astype(int), number - 1)
-            blocks.append(np.broadcast_to(block.reshape(len(block), -1), samples.is_used.shape)[samples.is_used])
+            block = np.minimum((times_since_recording_start(episode, samples) / length).astype(int), number - 1)
+            blocks.append(
+                np.broadcast_to(block.reshape(len(block), -1), samples.used_output_mask.shape)[samples.used_output_mask]
+            )
         of_row = np.concatenate(blocks)
         count = np.bincount(of_row, minlength=number).astype(float)
         if isinstance(result, str):
             total = np.full(number, np.inf)
         else:
-            rows = problem.held_out_residual(i, episode, result).residual
+            rows = problem.whitened_held_out_residual(i, episode, result).residual
             total = np.bincount(of_row, weights=rows**2, minlength=number)
         squares.append(total[count > 0])
         counts.append(count[count > 0])
     if problem.has_process_noise:
         # in metres and radians a prediction has its torques as they were recorded, less their offsets
-        found = whitened_by_sensor_noise(problem).predict_held_out(x)
+        found = problem_whitened_by_sensor_noise(problem).predict_held_out(x)
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_by_channel(*map(list, zip(*predicted, strict=True))) if predicted else {}
     channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}

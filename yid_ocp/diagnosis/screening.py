@@ -27,14 +27,14 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
-from yid_ocp.inference.null_test import ResidualChannel, residual_channels
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.null_test import ResidualChannelSamples, residual_channel_samples
 
 _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
 
 
 @dataclass(frozen=True)
-class EffectSignature:
+class _EffectSignature:
     """First-order change of the residual by the amplitudes of a candidate."""
 
     effect: EffectBase
@@ -44,11 +44,11 @@ class EffectSignature:
 
 
 @dataclass(frozen=True)
-class CandidateLinearization:
+class AllCandidatesLinearization:
     """Residual and signatures of all candidates, linearised at one point."""
 
     projected_residual: Array  # P r, shape (nr,)
-    signatures: tuple[EffectSignature, ...]  # one for each candidate and grid value
+    signatures: tuple[_EffectSignature, ...]  # one for each candidate and grid value
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class CandidateScore:
 
 def _shape_grid(effect: EffectBase, count: int = DEFAULT_THRESHOLDS.shape_grid_size) -> list[dict[str, float]]:
     """Grid values of a candidate's shape parameters, uniform or log-uniform over the prior range."""
-    ranges = {name: effect.prior_ranges[name] for name in effect.shape_names}
+    ranges = {name: effect.prior_ranges[name] for name in effect.shape_parameter_names}
     axes = [(np.geomspace if low > 0 else np.linspace)(low, high, count) for low, high in ranges.values()]
     return [dict(zip(ranges, map(float, point), strict=True)) for point in zip(*axes, strict=True)] or [{}]
 
@@ -83,7 +83,7 @@ def linearize_candidates(
     base: Sequence[EffectBase],
     values: Mapping[str, float],
     grid: int = DEFAULT_THRESHOLDS.shape_grid_size,
-) -> CandidateLinearization:
+) -> AllCandidatesLinearization:
     """Return the residual and the signatures of all candidates that are not yet in the model.
 
     Parameters
@@ -104,18 +104,20 @@ def linearize_candidates(
     grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
     own = [name for effect in base for name in effect.parameters.names]
     residual, basis, warm = np.zeros(0), np.zeros((0, 0)), None
-    placed, series = problem.relinearized_with_effects(base, values), residual_channels(problem.problem)
-    signatures: list[EffectSignature] = []
+    placed, series = problem.relinearized_with_effects(base, values), residual_channel_samples(problem.problem)
+    signatures: list[_EffectSignature] = []
     for k in range(max(map(len, grids.values()), default=0)):
         chosen = [effect for effect in problem.candidate_effects if k < len(grids.get(effect.label, ()))]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
         amplitudes = [name for effect in chosen for name in effect.amplitude_names]
-        trial = placed.with_free_subset((*problem.nominal_parameters, *own, *amplitudes)).with_parameter_values(shape)
+        trial = placed.with_free_subset((*problem.nominal_free_parameters, *own, *amplitudes)).with_parameter_values(
+            shape
+        )
         evaluation = trial.evaluate(trial.vector(values), equilibrium_guesses=warm)
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")
         names, warm = list(trial.unknown_names), evaluation.equilibrium_guesses
-        data, jacobian = residual_without_weak_priors(trial, evaluation)
+        data, jacobian = linearization_without_weak_priors(trial, evaluation)
         places = [names.index(name) for name in amplitudes]
         if k == 0:
             basis = _basis(jacobian[:, np.setdiff1d(np.arange(len(names)), places)])
@@ -125,8 +127,8 @@ def linearize_candidates(
         edges = np.cumsum([len(effect.amplitude_names) for effect in chosen])[:-1]
         for effect, part in zip(chosen, np.split(moved, edges, axis=1), strict=True):
             columns = np.ascontiguousarray(part)
-            signatures.append(EffectSignature(effect, grids[effect.label][k], columns, _coloured(columns, series)))
-    return CandidateLinearization(residual, tuple(signatures))
+            signatures.append(_EffectSignature(effect, grids[effect.label][k], columns, _coloured(columns, series)))
+    return AllCandidatesLinearization(residual, tuple(signatures))
 
 
 def _basis(matrix: Array) -> Array:
@@ -137,7 +139,7 @@ def _basis(matrix: Array) -> Array:
 
 
 def candidate_detectability(
-    point: CandidateLinearization, detection_z: float = DEFAULT_THRESHOLDS.detection_z
+    point: AllCandidatesLinearization, detection_z: float = DEFAULT_THRESHOLDS.detection_z
 ) -> tuple[CandidateDetectability, ...]:
     """Return the detectability of every candidate: amplitudes of `detection_z` standard deviations."""
     found: dict[str, CandidateDetectability] = {}
@@ -167,7 +169,7 @@ def _pinv(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
 
 
-def _coloured(columns: Array, series: Sequence[ResidualChannel]) -> Array:
+def _coloured(columns: Array, series: Sequence[ResidualChannelSamples]) -> Array:
     """X' Omega X under the noise's known colour."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     least = 1e-6 * float(np.max(np.abs(columns), initial=0.0))
@@ -183,7 +185,7 @@ def _coloured(columns: Array, series: Sequence[ResidualChannel]) -> Array:
     return (total + total.T) / 2
 
 
-def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannel]) -> Array:
+def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannelSamples]) -> Array:
     """Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p)."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
@@ -197,7 +199,9 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Res
 
 
 def score_candidates(
-    point: CandidateLinearization, series: Sequence[ResidualChannel], visible: Sequence[CandidateDetectability]
+    point: AllCandidatesLinearization,
+    series: Sequence[ResidualChannelSamples],
+    visible: Sequence[CandidateDetectability],
 ) -> tuple[CandidateScore, ...]:
     """Return the score of every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
@@ -234,7 +238,7 @@ def _promised(information: Array, slope: Array, lower: Array, upper: Array) -> t
     return step, np.sum((2 * slope - (information @ step[..., None])[..., 0]) * step, axis=-1)
 
 
-def _score(signature: EffectSignature, residual: Array, series: Sequence[ResidualChannel]) -> CandidateScore:
+def _score(signature: _EffectSignature, residual: Array, series: Sequence[ResidualChannelSamples]) -> CandidateScore:
     effect, x, floor = signature.effect, signature.projected_sensitivity, signature.score_noise_covariance
     slope = -(x.T @ residual)
     lower, upper = _room(effect)
@@ -272,7 +276,7 @@ class ConfusabilityMatrix:
 
 
 @dataclass(frozen=True)
-class CandidatePair:
+class CandidatePairScore:
     """First-order decrease of the residual by two candidates together."""
 
     effects: tuple[EffectBase, EffectBase]
@@ -294,7 +298,7 @@ class JointScores:
         """Columns of every candidate."""
         return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
 
-    def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePair]:
+    def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePairScore]:
         """Yield all pairs of the candidates with these labels, largest penalised decrease first.
 
         What two effects do together neither need do alone: one of them may hide in what the other leaves.
@@ -315,13 +319,16 @@ class JointScores:
             (one, other), width = (self.effects[i], self.effects[j]), len(columns[i])
             values = _values(one, step[:width]) | _values(other, step[width:])
             values |= self.shape_values[i] | self.shape_values[j]
-            yield CandidatePair((one, other), values, float(penalized))
+            yield CandidatePairScore((one, other), values, float(penalized))
 
 
-def score_jointly(point: CandidateLinearization, chosen: Sequence[CandidateScore] = ()) -> JointScores:
+def score_candidates_jointly(point: AllCandidatesLinearization, chosen: Sequence[CandidateScore] = ()) -> JointScores:
     """Return the joint linear model of all candidates, at the scores' shape values or the middle of the grid."""
-    shape = {s.effect.label: {k: v for k, v in s.predicted_values.items() if k in s.effect.shape_names} for s in chosen}
-    groups: dict[str, list[EffectSignature]] = {}
+    shape = {
+        s.effect.label: {k: v for k, v in s.predicted_values.items() if k in s.effect.shape_parameter_names}
+        for s in chosen
+    }
+    groups: dict[str, list[_EffectSignature]] = {}
     for signature in point.signatures:
         groups.setdefault(signature.effect.label, []).append(signature)
     kept = [
@@ -368,6 +375,6 @@ def screen_candidates(
     """Screen all candidates except those of `base`: detectability, score and confusability."""
     point = linearize_candidates(problem, base, values, limits.shape_grid_size)
     visible = candidate_detectability(point, limits.detection_z)
-    ranked = score_candidates(point, residual_channels(problem.problem), visible)
-    everything = score_jointly(point, ranked)
+    ranked = score_candidates(point, residual_channel_samples(problem.problem), visible)
+    everything = score_candidates_jointly(point, ranked)
     return ScreeningResult(visible, ranked, confusability_matrix(everything), everything)

@@ -16,12 +16,12 @@ from yid_ocp.diagnosis.hypotheses import join_effect_labels
 from yid_ocp.diagnosis.refit import (
     HeldOutLoss,
     RefitContext,
-    RefitModel,
-    refit_each,
+    RefittedModel,
+    refit_with_each_effect,
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import (
-    CandidatePair,
+    CandidatePairScore,
     CandidateScore,
     ScreeningResult,
     bonferroni_min_p_value,
@@ -45,7 +45,7 @@ class GapClosure:
     is_decisive: bool = False  # whether the likelihood ratio favours the model decisively, however small the gap
 
 
-NO_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
+UNDEFINED_GAP_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -53,16 +53,18 @@ class SelectedEffect:
     """An effect added by the selection, with the refitted model of its round."""
 
     effect: EffectBase
-    refitted_model: RefitModel  # with all effects up to this one
+    refitted_model: RefittedModel  # with all effects up to this one
     cumulative_closure: GapClosure  # of the whole gap by all effects up to this one
     equivalent_effects: tuple[EffectBase, ...]  # effects that the data cannot tell from this one, the chosen one first
 
 
-def gap_closure(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> GapClosure:
+def held_out_gap_closure(
+    before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS
+) -> GapClosure:
     """Return the fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
     sure = _lr_decisive(before, after, limits)
     if before.excess_chi2 <= 0 or not np.isfinite(after.chi2_per_sample):
-        return replace(NO_CLOSURE, is_decisive=sure)
+        return replace(UNDEFINED_GAP_CLOSURE, is_decisive=sure)
     draws = np.random.default_rng(0).integers(
         0, len(before.block_sample_counts), (_N_BOOTSTRAP, len(before.block_sample_counts))
     )
@@ -96,11 +98,11 @@ def held_out_improvement(before: HeldOutLoss, after: HeldOutLoss) -> tuple[float
     return float(difference.sum() + before.baseline_chi2 - after.baseline_chi2) / total, float(error) / total
 
 
-def _chi2(fit: RefitModel) -> float:
+def _chi2(fit: RefittedModel) -> float:
     return fit.held_out_loss.chi2_per_sample
 
 
-def _near_best_models(fits: Sequence[RefitModel], limits: Thresholds = DEFAULT_THRESHOLDS) -> list[RefitModel]:
+def _near_best_models(fits: Sequence[RefittedModel], limits: Thresholds = DEFAULT_THRESHOLDS) -> list[RefittedModel]:
     """Models that predict the held-out recordings as well as the best one, the simplest first."""
     best = min(fits, key=_chi2)
     likely = [fit for fit in fits if not fit.effects or _likely(fit.effects[-1], fit, limits)]
@@ -115,20 +117,20 @@ def _near_best_models(fits: Sequence[RefitModel], limits: Thresholds = DEFAULT_T
     likeliest = min(near, key=lambda fit: penalized_chi2_difference(fit, best))
     near = [fit for fit in near if not _noise_difference(fit, likeliest, limits) > 2 * limits.min_log_bayes_factor]
 
-    def order(fit: RefitModel) -> tuple[bool, int, float]:
+    def order(fit: RefittedModel) -> tuple[bool, int, float]:
         odd = any(_is_amplitude_outside_prior(effect, fit, limits) for effect in fit.effects[-1:])
         return odd, fit.effect_parameter_count, penalized_chi2_difference(fit, likeliest)
 
     return sorted(near, key=order)
 
 
-def _noise_difference(fit: RefitModel, other: RefitModel, limits: Thresholds) -> float:
+def _noise_difference(fit: RefittedModel, other: RefittedModel, limits: Thresholds) -> float:
     """`penalized_chi2_difference`; NaN where either leaves more than noise, so that squares are errors of a model."""
     left = _noise_is_left(limits, fit.held_out_loss, other.held_out_loss)
     return penalized_chi2_difference(fit, other) if left else math.nan
 
 
-def penalized_chi2_difference(fit: RefitModel, other: RefitModel) -> float:
+def penalized_chi2_difference(fit: RefittedModel, other: RefittedModel) -> float:
     """Return r'r of `fit` minus that of `other` over all recordings, fitted and held out, with parameter penalty.
 
     Every parameter counts as the one by which chance alone lowers r'r.
@@ -137,7 +139,7 @@ def penalized_chi2_difference(fit: RefitModel, other: RefitModel) -> float:
     return held + 2 * (fit.cost - other.cost) + fit.effect_parameter_count - other.effect_parameter_count
 
 
-def _bic_prefers(fit: RefitModel, best: RefitModel, limits: Thresholds) -> bool:
+def _bic_prefers(fit: RefittedModel, best: RefittedModel, limits: Thresholds) -> bool:
     """Whether BIC prefers `fit` with fewer parameters over `best` when model error dominates.
 
     Residuals are then errors of the model, of unknown size and alike for the length of a block: blocks times the
@@ -150,13 +152,13 @@ def _bic_prefers(fit: RefitModel, best: RefitModel, limits: Thresholds) -> bool:
     return blocks * math.log(_chi2(fit) / _chi2(best)) <= fewer * math.log(blocks)
 
 
-def _likely(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
+def _likely(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
     return _is_significant(effect, fit, limits) and not _is_shape_outside_prior(effect, fit, limits)
 
 
-def _is_shape_outside_prior(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
+def _is_shape_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
     """Whether a shape parameter lies outside its prior range by `shape_range_factor` or `prior_range_margin` widths."""
-    for name in effect.shape_names:
+    for name in effect.shape_parameter_names:
         low, high = effect.prior_ranges[name]
         room, factor = limits.prior_range_margin * (high - low), limits.shape_range_factor
         near, far = (low / factor, high * factor) if low > 0 else (low - room, high + room)
@@ -166,7 +168,7 @@ def _is_shape_outside_prior(effect: EffectBase, fit: RefitModel, limits: Thresho
     return False
 
 
-def _is_amplitude_outside_prior(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
+def _is_amplitude_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
     """Whether an amplitude lies outside its prior range by more than `prior_range_margin` widths of that range."""
     ranges = {name: effect.prior_ranges[name] for name in effect.amplitude_names}
     margin = limits.prior_range_margin
@@ -176,7 +178,7 @@ def _is_amplitude_outside_prior(effect: EffectBase, fit: RefitModel, limits: Thr
     )
 
 
-def _is_significant(effect: EffectBase, fit: RefitModel, limits: Thresholds) -> bool:
+def _is_significant(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
     """Whether any amplitude is at least `min_z` standard deviations from neutral."""
     neutral, std = effect.neutral_values, fit.amplitude_std
     return any(abs(fit.values[n] - neutral[n]) >= limits.min_z * std.get(n, 0.0) for n in effect.amplitude_names)
@@ -186,10 +188,10 @@ def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds
     """Whether the held-out error, of all channels or of any one, is reduced by the fraction `min_rmse_reduction`."""
     if _lr_decisive(before, after, limits) or not np.isfinite(before.chi2_per_sample):
         return True
-    return rmse_reduction(before, after) >= limits.min_rmse_reduction
+    return relative_rmse_reduction(before, after) >= limits.min_rmse_reduction
 
 
-def rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
+def relative_rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
     """Return the relative reduction of the held-out RMSE: the larger of all channels together and the best channel."""
     channels = [name for name in before.channel_rmse if name in after.channel_rmse]
     pairs = [(np.sqrt(before.chi2_per_sample), np.sqrt(after.chi2_per_sample))]
@@ -223,7 +225,7 @@ def _refit_shortlist(
     return [((s.effect,), s.predicted_values) for s in chosen]
 
 
-def _from_before(search: RefitContext) -> list[RefitModel]:
+def _from_before(search: RefitContext) -> list[RefittedModel]:
     """Candidates refitted from the earlier run's parameters: the nominal fit's stand in for what is missing."""
     try:
         screened = screen_candidates(search.problem, (), {}, search.thresholds)
@@ -231,12 +233,12 @@ def _from_before(search: RefitContext) -> list[RefitModel]:
         return []
     search.progress.begin_stage("trying candidates from the earlier run's parameters")
     chosen = _refit_shortlist(screened, search.thresholds)
-    return refit_each(search, (), chosen, {}, "from the earlier run's parameters")
+    return refit_with_each_effect(search, (), chosen, {}, "from the earlier run's parameters")
 
 
-def _likelier(fits: Sequence[RefitModel]) -> list[RefitModel]:
+def _likelier(fits: Sequence[RefittedModel]) -> list[RefittedModel]:
     """Of every effect the fit of least cost, in the order of their first ones."""
-    best: dict[str, RefitModel] = {}
+    best: dict[str, RefittedModel] = {}
     for fit in fits:
         label = fit.effects[-1].label
         best[label] = min(best.get(label, fit), fit, key=lambda entry: entry.cost)
@@ -245,11 +247,11 @@ def _likelier(fits: Sequence[RefitModel]) -> list[RefitModel]:
 
 def select_effects(
     search: RefitContext,
-    nominal: RefitModel,
+    nominal: RefittedModel,
     screened: ScreeningResult,
     places: Sequence[str] = (),
     moved: bool = False,
-) -> tuple[tuple[RefitModel, ...], tuple[SelectedEffect, ...]]:
+) -> tuple[tuple[RefittedModel, ...], tuple[SelectedEffect, ...]]:
     """Select effects by forward selection on the held-out gap, then try replacing and removing each.
 
     Parameters
@@ -263,13 +265,13 @@ def select_effects(
 
     Returns
     -------
-    fits : tuple of RefitModel
+    fits : tuple of RefittedModel
         Of single effects in the first round, the chosen one first, then by held-out loss; where one effect alone stays,
         its last fit first.
     selected : tuple of SelectedEffect
     """
     limits, alone, current = search.thresholds, screened, nominal
-    first: tuple[RefitModel, ...] = ()
+    first: tuple[RefittedModel, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
     paired = False
     while len(added) < limits.max_effects:
@@ -281,11 +283,13 @@ def select_effects(
             p_value = bonferroni_min_p_value(screened.candidate_scores)
             if _little_is_left(current, limits) and p_value >= limits.candidate_significance_level:
                 break
-        fits = refit_each(search, base, _refit_shortlist(screened, limits, base, places), current.values)
+        fits = refit_with_each_effect(search, base, _refit_shortlist(screened, limits, base, places), current.values)
         if moved and not base:
             fits = _likelier([*fits, *_from_before(search)])
         if len(base) == 1:
-            pairs = refit_each(search, (), _pairs_to_refit(alone, limits, base[0]), nominal.values, "together")
+            pairs = refit_with_each_effect(
+                search, (), _pairs_to_refit(alone, limits, base[0]), nominal.values, "together"
+            )
             fits += [
                 fit
                 for fit in pairs
@@ -300,7 +304,7 @@ def select_effects(
         if chosen is None:
             break
         paired = chosen.effects[:-1] != base
-        total = gap_closure(nominal.held_out_loss, chosen.held_out_loss, limits)
+        total = held_out_gap_closure(nominal.held_out_loss, chosen.held_out_loss, limits)
         both = f"put {join_effect_labels(chosen.effects)} in the place of {join_effect_labels(base)}"
         said = "" if np.isnan(total.fraction) else f": {100 * total.fraction:.3g} % of the held-out gap closed"
         search.progress.begin_stage((both if paired else f"added {chosen.effects[-1].label}") + said)
@@ -328,12 +332,12 @@ def _pairs_to_refit(
         alike = screened.confusability.confusable_with(one.label, limits.signature_overlap)
         return one.label == other.label or other.label in alike
 
-    def covered(pair: CandidatePair, by: CandidatePair) -> bool:
+    def covered(pair: CandidatePairScore, by: CandidatePairScore) -> bool:
         (a, b), (c, d) = pair.effects, by.effects
         return (same(a, c) and same(b, d)) or (same(a, d) and same(b, c))
 
     labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without.label]
-    chosen: list[CandidatePair] = []
+    chosen: list[CandidatePairScore] = []
     for pair in screened.joint_scores.ranked_pairs(labels):
         if len(chosen) == limits.n_refit_pairs:
             break
@@ -342,17 +346,17 @@ def _pairs_to_refit(
     return [(pair.effects, pair.predicted_values) for pair in chosen]
 
 
-def _of_a_size(fits: Sequence[RefitModel], limits: Thresholds) -> list[RefitModel]:
+def _of_a_size(fits: Sequence[RefittedModel], limits: Thresholds) -> list[RefittedModel]:
     """Fits whose last effect is of a size to be expected: beyond it, it mends what those before it do wrong."""
     return [fit for fit in fits if not _is_amplitude_outside_prior(fit.effects[-1], fit, limits)]
 
 
-def _little_is_left(fit: RefitModel, limits: Thresholds) -> bool:
+def _little_is_left(fit: RefittedModel, limits: Thresholds) -> bool:
     """Whether the effects of a fit leave little but noise; a gap that is as little is one without any."""
     return bool(fit.effects) and _noise_is_left(limits, fit.held_out_loss)
 
 
-def _worth_adding(current: RefitModel, chosen: RefitModel, limits: Thresholds) -> bool:
+def _worth_adding(current: RefittedModel, chosen: RefittedModel, limits: Thresholds) -> bool:
     """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all."""
     before, after = current.held_out_loss, chosen.held_out_loss
     gained, error = held_out_improvement(before, after)
@@ -361,14 +365,14 @@ def _worth_adding(current: RefitModel, chosen: RefitModel, limits: Thresholds) -
     return (closes or _lr_decisive(before, after, limits)) and _is_there(current, chosen, chosen.effects[-1], limits)
 
 
-def _is_there(without: RefitModel, full: RefitModel, effect: EffectBase, limits: Thresholds) -> bool:
+def _is_there(without: RefittedModel, full: RefittedModel, effect: EffectBase, limits: Thresholds) -> bool:
     """Whether an effect is surely not zero and takes away a relevant part of the held-out error."""
     reduced = _is_rmse_reduced(without.held_out_loss, full.held_out_loss, limits)
     return reduced and _is_significant(effect, full, limits)
 
 
 def _reconsidered(
-    search: RefitContext, nominal: RefitModel, added: Sequence[SelectedEffect], paired: bool
+    search: RefitContext, nominal: RefittedModel, added: Sequence[SelectedEffect], paired: bool
 ) -> tuple[SelectedEffect, ...]:
     """Every effect tried for its place again beside the others: without it, and others instead of it."""
     kept = tuple(added)
@@ -392,7 +396,7 @@ def _labels(added: Sequence[SelectedEffect]) -> frozenset[str]:
 
 
 def _revised(
-    search: RefitContext, nominal: RefitModel, kept: tuple[SelectedEffect, ...], entry: SelectedEffect
+    search: RefitContext, nominal: RefittedModel, kept: tuple[SelectedEffect, ...], entry: SelectedEffect
 ) -> tuple[SelectedEffect, ...]:
     """The effects without one of them, with another in its place, or as they are with what would do as well."""
     limits, full, label = search.thresholds, kept[-1].refitted_model, entry.effect.label
@@ -408,7 +412,7 @@ def _revised(
     screened = screen_candidates(search.problem, rest, without.values, limits)
     tried = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]
     own = replace(full, effects=(*rest, entry.effect))
-    others = refit_each(search, rest, [pair for pair in tried if pair[0][0].label != label], without.values)
+    others = refit_with_each_effect(search, rest, [pair for pair in tried if pair[0][0].label != label], without.values)
     if not _is_amplitude_outside_prior(entry.effect, own, limits):
         others = _of_a_size(others, limits)
     near = _near_best_models([own, *others], limits)
@@ -421,7 +425,7 @@ def _revised(
     return _rebuilt(search, nominal, placed, replace(chosen, effects=tuple(e.effect for e in placed)))
 
 
-def _needed(without: RefitModel, full: RefitModel, effect: EffectBase, limits: Thresholds) -> bool:
+def _needed(without: RefittedModel, full: RefittedModel, effect: EffectBase, limits: Thresholds) -> bool:
     """Whether held-out recordings are surely predicted worse without an effect, and it is there at all."""
     gained, error = held_out_improvement(without.held_out_loss, full.held_out_loss)
     sure = gained > error or _lr_decisive(without.held_out_loss, full.held_out_loss, limits)
@@ -429,7 +433,7 @@ def _needed(without: RefitModel, full: RefitModel, effect: EffectBase, limits: T
 
 
 def _rebuilt(
-    search: RefitContext, nominal: RefitModel, entries: Sequence[SelectedEffect], last: RefitModel
+    search: RefitContext, nominal: RefittedModel, entries: Sequence[SelectedEffect], last: RefittedModel
 ) -> tuple[SelectedEffect, ...]:
     """Effects in their order, each with the fit of all up to it, or of all where that cannot be made."""
     effects = [entry.effect for entry in entries]
@@ -439,12 +443,12 @@ def _rebuilt(
         replace(
             entry,
             refitted_model=fit,
-            cumulative_closure=gap_closure(nominal.held_out_loss, fit.held_out_loss, search.thresholds),
+            cumulative_closure=held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss, search.thresholds),
         )
         for entry, fit in zip(entries, [*fits, last], strict=True)
     )
 
 
-def _again(search: RefitContext, effects: Sequence[EffectBase], near: RefitModel, name: str) -> RefitModel | None:
+def _again(search: RefitContext, effects: Sequence[EffectBase], near: RefittedModel, name: str) -> RefittedModel | None:
     """A refit that begins where another one ended."""
     return refit_with_effects(search.problem, effects, near.values, search.store, name, search.thresholds)

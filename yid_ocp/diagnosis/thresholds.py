@@ -7,7 +7,11 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le, Lt
 
-from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, RESIDUAL_WINDOW_LENGTH, GapCriteria
+from yid_ocp.inference.null_test import (
+    DEFAULT_EXCESS_RESIDUAL_CRITERIA,
+    RESIDUAL_WINDOW_SECONDS,
+    ExcessResidualCriteria,
+)
 from yid_ocp.inference.smoother_model import SmootherThresholds
 from yid_ocp.options import OptionInfo
 
@@ -21,10 +25,10 @@ class Thresholds(SmootherThresholds):
 
     # is there a gap
     significance_level: Annotated[float, Gt(0), Lt(1), OptionInfo("significance below which a gap counts as one")] = (
-        DEFAULT_GAP_CRITERIA.significance_level
+        DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level
     )
     min_excess_chi2: Annotated[float, Ge(0), OptionInfo("chi2/n - 1 below which a gap is not worth a name")] = (
-        DEFAULT_GAP_CRITERIA.min_excess_chi2
+        DEFAULT_EXCESS_RESIDUAL_CRITERIA.min_excess_chi2
     )
     min_channel_excess_chi2: Annotated[
         float, Ge(0), OptionInfo("the same of the worst channel, where a candidate mends it")
@@ -37,7 +41,7 @@ class Thresholds(SmootherThresholds):
     ] = 0.01
     min_samples_per_unknown: Annotated[float, Gt(0), OptionInfo("effective samples needed for every unknown")] = 3.0
     residual_window: Annotated[float, Gt(0), OptionInfo("length of the windows of the residual", "s")] = (
-        RESIDUAL_WINDOW_LENGTH
+        RESIDUAL_WINDOW_SECONDS
     )
     # which candidates are worth a refit
     detection_z: Annotated[float, Gt(0), OptionInfo("standard deviations of a detectable amplitude")] = 2.576 + 1.282
@@ -96,9 +100,9 @@ class Thresholds(SmootherThresholds):
     ] = 20.0
 
     @property
-    def gap_limits(self) -> GapCriteria:
+    def null_test_limits(self) -> ExcessResidualCriteria:
         """Limits of the null test, which `solve` uses as well."""
-        return GapCriteria(self.significance_level, self.min_excess_chi2)
+        return ExcessResidualCriteria(self.significance_level, self.min_excess_chi2)
 
 
 DEFAULT_THRESHOLDS = Thresholds()

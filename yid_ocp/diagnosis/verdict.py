@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
-from yid_ocp.diagnosis.refit import RefitContext, RefitModel, refit_with_effects
+from yid_ocp.diagnosis.refit import RefitContext, RefittedModel, refit_with_effects
 from yid_ocp.diagnosis.screening import CandidateDetectability, CandidateScore, bonferroni_min_p_value
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
-from yid_ocp.inference.null_test import NullTestResult, exceeds_noise
+from yid_ocp.inference.null_test import NullTestResult, residuals_exceed_noise
 from yid_ocp.inference.smoother import SmootherResult
 
-UnknownReason = Literal["", "none", "unsure", "little", "stand_in"]
+UnknownVerdictReason = Literal["", "none", "unsure", "little", "stand_in"]
 """Why the verdict is unknown: no candidate helps, closure not significant, too little explained, no transfer."""
 
 _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
@@ -40,7 +40,7 @@ class TransferCheck:
     is_consistent: bool
 
     @property
-    def disagreement(self) -> str:
+    def disagreement_text(self) -> str:
         """Both estimates, in words."""
         here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
@@ -53,7 +53,7 @@ class TransferCheck:
         return abs(self.estimation_value - self.held_out_value), spread
 
 
-def check_transfer(search: RefitContext, fit: RefitModel) -> tuple[TransferCheck, ...]:
+def check_parameter_transfer(search: RefitContext, fit: RefittedModel) -> tuple[TransferCheck, ...]:
     """Refit the effects on the held-out recordings and compare every amplitude.
 
     Empty if one recording is split, or if the model cannot be fitted there, which is no evidence against it.
@@ -66,7 +66,7 @@ def check_transfer(search: RefitContext, fit: RefitModel) -> tuple[TransferCheck
     if problem.has_process_noise:
         turned = turned.whitened_at(fit.values)
     # what both sets of recordings have in common, nothing of single recordings' starts
-    names = {*turned.nominal_parameters, *(name for effect in fit.effects for name in effect.parameters.names)}
+    names = {*turned.nominal_free_parameters, *(name for effect in fit.effects for name in effect.parameters.names)}
     start = {name: value for name, value in fit.values.items() if name in names}
     name = f"{join_effect_labels(fit.effects)} on the held-out recordings"
     again = refit_with_effects(turned, fit.effects, start, search.store, name, search.thresholds)
@@ -75,7 +75,9 @@ def check_transfer(search: RefitContext, fit: RefitModel) -> tuple[TransferCheck
     return tuple(entry for effect in fit.effects for entry in _compare(effect, fit, again, search.thresholds))
 
 
-def _compare(effect: EffectBase, first: RefitModel, second: RefitModel, limits: Thresholds) -> list[TransferCheck]:
+def _compare(
+    effect: EffectBase, first: RefittedModel, second: RefittedModel, limits: Thresholds
+) -> list[TransferCheck]:
     """The amplitudes of one effect in two fits."""
     neutral, found = effect.neutral_values, []
     width = {name: high - low for name, (low, high) in effect.prior_ranges.items()}
@@ -92,7 +94,7 @@ def _compare(effect: EffectBase, first: RefitModel, second: RefitModel, limits: 
     return found
 
 
-def inflate_std_by_disagreement(fit: RefitModel, entries: Sequence[TransferCheck]) -> RefitModel:
+def inflate_std_by_disagreement(fit: RefittedModel, entries: Sequence[TransferCheck]) -> RefittedModel:
     """Return the fit with amplitude standard deviations inflated by the disagreement between the recordings.
 
     What a model misses of all of a recording its residual does not show: where two fits differ by more than
@@ -112,7 +114,7 @@ def failed_transfer_checks(entries: Sequence[TransferCheck]) -> tuple[TransferCh
     return tuple(entry for entry in entries if not entry.is_consistent)
 
 
-def has_gap(
+def has_significant_gap(
     before: NullTestResult,
     held_out: NullTestResult,
     limits: Thresholds,
@@ -126,7 +128,7 @@ def has_gap(
     many, at the end of a tail that is known by asymptotics only. An offset of a torque beyond what was stated needs no
     such channel where `offsets` are stated: it is one number among thousands, and all others follow it.
     """
-    if exceeds_noise((before, held_out), limits.gap_limits):
+    if residuals_exceed_noise((before, held_out), limits.null_test_limits):
         return True
     stated = [score.p_value for score in ranked if score.effect.kind == "effort_offset"] if offsets else []
     if stated and min(stated) * len(ranked) < limits.candidate_significance_level:
@@ -156,7 +158,7 @@ def decide_verdict(
     gap: bool,
     enough: bool,
     visible: Sequence[CandidateDetectability],
-    reason: UnknownReason,
+    reason: UnknownVerdictReason,
     added: Sequence[SelectedEffect],
 ) -> str:
     """Return the verdict: insufficient_data, no_gap, unknown, confusable or effect.
@@ -172,19 +174,19 @@ def decide_verdict(
     return "confusable" if len(added[0].equivalent_effects) > 1 else "effect"
 
 
-def assumption_count(added: Sequence[SelectedEffect]) -> int:
+def independent_assumption_count(added: Sequence[SelectedEffect]) -> int:
     """Count independent assumptions: one law at several locations counts once, local effects count each."""
     return len({entry.effect.label if entry.effect.is_local else entry.effect.kind for entry in added})
 
 
 def required_explained_fraction(added: Sequence[SelectedEffect], limits: Thresholds) -> float:
     """Return the fraction of the smoother's explained chi2 that the effects are required to explain."""
-    return 1.0 - (1.0 - limits.min_explained_fraction) ** assumption_count(added)
+    return 1.0 - (1.0 - limits.min_explained_fraction) ** independent_assumption_count(added)
 
 
-def find_unknown_reason(
+def find_unknown_verdict_reason(
     added: Sequence[SelectedEffect], total: GapClosure, limits: Thresholds, explained: float, carried: bool
-) -> UnknownReason:
+) -> UnknownVerdictReason:
     """Return why a gap has no accepted effect; empty if it has one.
 
     Effects have to explain the part `required_explained_fraction` of what the smoother explains where the model was
@@ -196,14 +198,14 @@ def find_unknown_reason(
         return "none"
     if not (total.ci_low > limits.min_gap_closed or total.is_decisive):
         return "unsure"
-    elsewhere = assumption_count(added) == 1 and total.ci_low >= limits.min_explained_fraction
+    elsewhere = independent_assumption_count(added) == 1 and total.ci_low >= limits.min_explained_fraction
     if explained < required_explained_fraction(added, limits) and not elsewhere:
         return "little"
     return "" if carried else "stand_in"
 
 
-def compute_explained_fraction(
-    nominal: RefitModel, added: Sequence[SelectedEffect], smoothed: SmootherResult | None
+def compute_explained_chi2_fraction(
+    nominal: RefittedModel, added: Sequence[SelectedEffect], smoothed: SmootherResult | None
 ) -> float:
     """Return the decrease of r'r by the effects divided by that of the smoother, both corrected for degrees of freedom.
 

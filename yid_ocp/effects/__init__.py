@@ -17,7 +17,7 @@ from yid_ocp.effects.base import ReportedParameter as ReportedParameter
 from yid_ocp.errors import ModelError, UnknownNameDetails, unknown_name_details
 from yid_ocp.model.system import System
 
-SENSOR_KINDS = ("joints.position", "joints.effort", "camera", "nominal_clock")
+_SENSOR_KINDS = ("joints.position", "joints.effort", "camera", "nominal_clock")
 """Kinds of recorded signals on which candidates depend; `nominal_clock` is a sample index times a nominal period."""
 
 # every file of this folder registers its kinds when it is imported
@@ -26,7 +26,7 @@ for _family in iter_modules(__path__):
 
 
 def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
-    """An effect of a kind at a location, to be added with `System.with_effects`; see `candidate_effects`.
+    """An effect of a kind at a location, to be added with `System.with_effects`; see `candidate_kinds_and_locations`.
 
     Its parameters are named `kind@location.parameter`. `values` holds what is not neutral, by parameter; a compliance
     may be given as its `stiffness`.
@@ -47,12 +47,12 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
 
 
 def sensor_kinds() -> frozenset[str]:
-    """`SENSOR_KINDS` and what effects of one's own require."""
-    return frozenset(SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
+    """`_SENSOR_KINDS` and what effects of one's own require."""
+    return frozenset(_SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
 
 
-def candidate_effects(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
-    """Every (kind, location) that is possible in a system and visible in a recording, by kind.
+def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
+    """Every pair (effect kind, location) possible in a system and visible in its recorded signals, ordered by kind.
 
     Parameters
     ----------

@@ -17,13 +17,13 @@ from yid_ocp.effects.base import (
     EFFECTS,
     EffectBase,
     ParameterDefinition,
-    compliance,
-    force_on_joint,
-    joints_by_arm,
-    relative_effort_limit,
-    robot_joints,
+    arm_joint_names,
+    compliance_parameter_definition,
+    effort_limit_over_baxter,
+    generalized_force_at_joint,
+    joint_names_by_arm,
 )
-from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, UNLIMITED_EFFORT, PositionServo
+from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD, PositionServo
 from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 
 _PLAY_TORQUE = 0.2
@@ -37,7 +37,7 @@ _MIN_LIMIT_FRACTION = 0.1
 def _recorded_joints(system: System) -> tuple[str, ...]:
     """Names of arm joints that are driven or prescribed."""
     known = {*system.driven, *system.prescribed}
-    return tuple(name for name in robot_joints(system) if name in known)
+    return tuple(name for name in arm_joint_names(system) if name in known)
 
 
 def _effort_joints(system: System) -> tuple[str, ...]:
@@ -47,7 +47,7 @@ def _effort_joints(system: System) -> tuple[str, ...]:
 
 def _servo_joints(system: System) -> tuple[str, ...]:
     """Names of arm joints with a servo."""
-    return tuple(name for name in robot_joints(system) if name in system.servos)
+    return tuple(name for name in arm_joint_names(system) if name in system.servos)
 
 
 def _geared_joints(system: System) -> tuple[str, ...]:
@@ -58,7 +58,7 @@ def _geared_joints(system: System) -> tuple[str, ...]:
 def _effort_arms(system: System) -> tuple[str, ...]:
     """Names of arms with a joint whose recorded effort drives it or is compared."""
     known = set(_effort_joints(system))
-    return tuple(name for name, joints in joints_by_arm(system).items() if known & set(joints))
+    return tuple(name for name, joints in joint_names_by_arm(system).items() if known & set(joints))
 
 
 class _DistortedReading(EffectBase):
@@ -112,7 +112,7 @@ class SeriesElasticity(_DistortedReading):
     equation = "measured angle = q + effort/stiffness"
     required_excitation = "how hard it pulls at its ends"
     required_sensors = frozenset({"joints.position", "joints.effort"})
-    declared_parameters = (compliance("rad/(N m)", 0.02, (1 / 2000, 1 / 100), "gear", "N m/rad"),)
+    declared_parameters = (compliance_parameter_definition("rad/(N m)", 0.02, (1 / 2000, 1 / 100), "gear", "N m/rad"),)
 
     def _error(self, effort: ca.SX) -> ca.SX:
         return self["compliance"] * effort
@@ -150,7 +150,7 @@ class Backlash(_DistortedReading):
         free, geared = (servo.torque(command, state.q[index] + give, state.v[index]) for give in (0, play))
         taken = play - self["width"] / 2 * ca.tanh(geared / _PLAY_TORQUE)
         return StepTerms(
-            generalized_force=force_on_joint(state.system, self.location, geared - free),
+            generalized_force=generalized_force_at_joint(state.system, self.location, geared - free),
             internal_equations={name: taken},
         )
 
@@ -232,7 +232,7 @@ class EffortOffset(_DistortedEffort):
             10.0,
             (-1.5, 1.5),
             "measured less true effort",
-            range_scale=relative_effort_limit,
+            range_scale=effort_limit_over_baxter,
         ),
     )
 
@@ -266,7 +266,7 @@ class EffortDelay(_LateTorque):
         ParameterDefinition("delay", "s", 0.0, -0.2, 0.2, (0.0, 0.1), "how late recorded torque acts"),
     )
 
-    def added_delay(self, channel: str, camera: bool) -> ca.SX:
+    def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """The delay for torques that drive the arm's joints, its negative for their measured efforts, else zero [s]."""
         return self._lateness(channel, self.arm_joints, self["delay"])
 
@@ -289,7 +289,7 @@ class EffortLag(_LateTorque):
         least, text = -0.5 if location in system.prescribed else 0.0, "with which torque follows its command"
         return (ParameterDefinition("time_constant", "s", 0.0, least, 0.5, (0.0, 0.05), text),)
 
-    def lag_time_constant(self, channel: str) -> ca.SX:
+    def channel_lag_time_constant(self, channel: str) -> ca.SX:
         """The time constant for the joint's driving torque, its negative for its measured effort, else zero [s]."""
         return self._lateness(channel, (self.location,), self["time_constant"])
 
@@ -334,7 +334,7 @@ class ServoDelay(_ServoChange):
         ParameterDefinition("delay", "s", 0.0, -0.2, 0.5, (0.0, 0.2), "how late commands act beyond the servo's delay"),
     )
 
-    def added_delay(self, channel: str, camera: bool) -> ca.SX:
+    def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """The added delay for the joint's command, zero for other channels [s]."""
         return self["delay"] if channel == f"torque.{self.location}" else ca.SX(0)
 
@@ -353,9 +353,9 @@ class ServoSaturation(_ServoChange):
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definition of tightness = limit^-16, reported as limit, from `_MIN_LIMIT_FRACTION` of the effort limit."""
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
-        known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT else _DEFAULT_EFFORT_LIMIT
+        known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD else _DEFAULT_EFFORT_LIMIT
         torque = "N m" if joint.coordinate_unit == "rad" else "N"
-        highest = (_MIN_LIMIT_FRACTION * known) ** -TORQUE_LIMIT_POWER
+        highest = (_MIN_LIMIT_FRACTION * known) ** -TORQUE_SATURATION_EXPONENT
         return (
             ParameterDefinition(
                 "tightness",
@@ -366,7 +366,7 @@ class ServoSaturation(_ServoChange):
                 (0.0, highest),
                 "largest torque of the servo, to the power -16",
                 reported_reciprocal=f"limit {torque}",
-                reciprocal_power=TORQUE_LIMIT_POWER,
+                reciprocal_power=TORQUE_SATURATION_EXPONENT,
             ),
         )
 

@@ -15,11 +15,11 @@ from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT
+from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 from yid_ocp.registry import Registry
 
-EXCITATIONS = (
+EXCITATION_DESCRIPTIONS = (
     "how fast it moves",
     "how long it is held",
     "how hard it accelerates",
@@ -87,7 +87,7 @@ class ParameterDefinition:
         name, _, unit = self.reported_reciprocal.partition(" ")
         return (name, unit) if self.reported_reciprocal else (self.name, self.unit)
 
-    def to_reported(self, value: float) -> float:
+    def _to_reported(self, value: float) -> float:
         """The reported value for a nonzero internal value; the internal value itself where there is no reciprocal."""
         if not self.reported_reciprocal:
             return value
@@ -124,8 +124,8 @@ class EffectBase:
     equation : str
         Equation that the kind adds, as text.
     required_excitation : str
-        What a motion has to vary to distinguish the kind from others: one of `EXCITATIONS`, or words that continue
-        "vary ...".
+        What a motion has to vary to distinguish the kind from others: one of `EXCITATION_DESCRIPTIONS`, or words that
+        continue "vary ...".
     required_sensors : frozenset of str
         Sensors without which the effect is not observable.
     is_local : bool
@@ -164,8 +164,8 @@ class EffectBase:
         return ()
 
     @property
-    def unknown_initial_state_bounds(self) -> Mapping[str, float]:
-        """Internal coordinates with unknown initial value, which is estimated: name to largest absolute value."""
+    def max_abs_unknown_initial_states(self) -> Mapping[str, float]:
+        """Largest absolute initial value by name, of internal coordinates whose initial value is estimated."""
         return {}
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
@@ -191,7 +191,7 @@ class EffectBase:
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if not q.is_shape_parameter)
 
     @property
-    def shape_names(self) -> tuple[str, ...]:
+    def shape_parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters without influence while the amplitudes are neutral, such as a relaxation time."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if q.is_shape_parameter)
 
@@ -218,14 +218,14 @@ class EffectBase:
             std = float((stds or {}).get(entry.name, math.nan))
             name, unit = definition.reported_name_and_unit
             if definition.reported_reciprocal:
-                reported = definition.to_reported(value) if value else math.inf
+                reported = definition._to_reported(value) if value else math.inf
                 std = abs(reported * std / (definition.reciprocal_power * value)) if value else math.nan
                 value = reported
             result[name] = ReportedParameter(value, std, unit)
         return result
 
-    def with_expected_ranges(self, largest: Mapping[str, float]) -> EffectBase:
-        """The effect with expected ranges that fit the segments' largest joint angles in the data [rad]."""
+    def with_prior_ranges_for_angles(self, largest: Mapping[str, float]) -> EffectBase:
+        """The effect with prior ranges of its parameters for the largest joint angles by segment in the data [rad]."""
         return self
 
     def apply_to_system(self, system: System) -> System:
@@ -241,14 +241,14 @@ class EffectBase:
         return output
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """The true value for a recorded input value."""
+        """The true value for a recorded reading that the effect distorts, at the true `effort`."""
         return reading
 
-    def added_delay(self, channel: str, camera: bool) -> ca.SX:
+    def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """How long before its recorded time a sample was true [s]; for a driving torque, how much later it acts."""
         return ca.SX(0)
 
-    def lag_time_constant(self, channel: str) -> ca.SX:
+    def channel_lag_time_constant(self, channel: str) -> ca.SX:
         """Time constant with which a torque follows its command, or a recorded effort the true one [s]."""
         return ca.SX(0)
 
@@ -280,7 +280,7 @@ def build_effect(kind: str, location: str, system: System, values: Mapping[str, 
     )
     inner = (f"{label}.{name}" for name in cls.internal_coordinate_names(location, system))
     internal = {name: ca.SX.sym(name) for name in inner}
-    joints = joints_by_arm(system).get(location, ())
+    joints = joint_names_by_arm(system).get(location, ())
     return cls(kind, location, definitions, Parameters(entries), internal, joints)
 
 
@@ -292,7 +292,7 @@ def segment_names(system: System) -> tuple[str, ...]:
     return tuple(segment.name for segment in system.segment_layouts)
 
 
-def object_joints(system: System) -> tuple[str, ...]:
+def object_joint_names(system: System) -> tuple[str, ...]:
     """Names of the joints of the object's segments."""
     return tuple(joint for segment in system.segment_layouts for link in segment.link_joints for joint in link)
 
@@ -304,10 +304,10 @@ def clamp_names(system: System) -> tuple[str, ...]:
     return tuple(clamp for clamp in found if all(f"{clamp}_{axis}" in names for axis in _CLAMP_AXES))
 
 
-def robot_joints(system: System) -> tuple[str, ...]:
+def arm_joint_names(system: System) -> tuple[str, ...]:
     """Names of the arms' joints: all but those of the object, of clamps and of compliant mounts."""
     clamps = {f"{clamp}_{axis}" for clamp in clamp_names(system) for axis in _CLAMP_AXES}
-    other = {*object_joints(system), *system.joint_compliances, *clamps}
+    other = {*object_joint_names(system), *system.joint_compliances, *clamps}
     return tuple(name for name in system.mechanism.joint_names if name not in other)
 
 
@@ -316,12 +316,12 @@ def grasp_names(system: System) -> tuple[str, ...]:
     return tuple(grasp.name for grasp in system.grasps)
 
 
-def joints_by_arm(system: System) -> dict[str, tuple[str, ...]]:
+def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
     """Joint names of every arm, by the arm's name: its grasp, else the prefix left or right, else `gripper`."""
-    joints, tree = robot_joints(system), system.mechanism
+    joints, tree = arm_joint_names(system), system.mechanism
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:
-        chain = {tree.joints[i].name for i in tree.ancestor_joints(tree.frame(grasp.holder_frame).joint_index)}
+        chain = {tree.joints[i].name for i in tree.ancestor_joint_indices(tree.frame(grasp.holder_frame).joint_index)}
         held = tuple(name for name in joints if name in chain)
         if held:
             found[grasp.name] = held
@@ -340,7 +340,7 @@ def _arm_tip_frames(system: System) -> tuple[str, ...]:
     """Names of one frame at the end of every arm without a grasp, a gripper's or hand's where there is one."""
     tree = system.mechanism
     tips = []
-    for name, joints in joints_by_arm(system).items():
+    for name, joints in joint_names_by_arm(system).items():
         if name in grasp_names(system):
             continue
         last = max(tree.joint_index(joint) for joint in joints)
@@ -350,19 +350,19 @@ def _arm_tip_frames(system: System) -> tuple[str, ...]:
     return tuple(tips)
 
 
-def relative_effort_limit(system: System, joint: str) -> float:
-    """A joint's effort limit over Baxter's; 1 for a smaller limit and for none."""
+def effort_limit_over_baxter(system: System, joint: str) -> float:
+    """A joint's effort limit divided by that of Baxter's joints; 1 for a smaller limit and for none."""
     limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
-    return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT else 1.0
+    return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT_THRESHOLD else 1.0
 
 
-def link_end_frames(system: System) -> tuple[str, ...]:
+def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
     """Names of frames at the ends of the arms' links: at the next joint or at the tip, each point once.
 
     A point on an axis that no other joint moves is left out.
     """
     tree = system.mechanism
-    own = {tree.joint_index(name) for name in robot_joints(system)}
+    own = {tree.joint_index(name) for name in arm_joint_names(system)}
     if not own:
         return ()
     # a link's own frame is where the link before it ends
@@ -381,7 +381,7 @@ def link_end_frames(system: System) -> tuple[str, ...]:
     return tuple(found)
 
 
-def link_frames(system: System) -> tuple[str, ...]:
+def arm_link_frame_names(system: System) -> tuple[str, ...]:
     """Names of one frame on every arm link with mass: the grasp's, else a gripper's, else the first.
 
     What slides on a link and carries nothing else, a finger for example, counts as part of that link.
@@ -390,7 +390,7 @@ def link_frames(system: System) -> tuple[str, ...]:
     preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]
     parents = {joint.parent_index for joint in tree.joints}
     found = []
-    for name in robot_joints(system):
+    for name in arm_joint_names(system):
         index = tree.joint_index(name)
         joint = tree.joints[index]
         finger = joint.kind == "prismatic" and index not in parents and joint.parent_index >= 0
@@ -411,7 +411,7 @@ def _paths(system: System, names: Sequence[str]) -> dict[str, np.ndarray]:
     return {name: np.stack([place[:, i] for place in at]) for i, name in enumerate(names)}
 
 
-def segment_of_frame(system: System, frame: str) -> str | None:
+def segment_name_of_frame(system: System, frame: str) -> str | None:
     """Name of the segment whose link carries a frame; None for other frames."""
     index = system.mechanism.frame(frame).joint_index
     if index < 0:
@@ -423,34 +423,38 @@ def segment_of_frame(system: System, frame: str) -> str | None:
 # -- helpers for the kinds --------------------------------------------------------------------------------------------
 
 
-def segment_springs(system: System, segment: str) -> tuple[ElasticJoint, ...]:
-    """Elastic joints of a segment."""
+def segment_elastic_joints(system: System, segment: str) -> tuple[ElasticJoint, ...]:
+    """The elastic joints (spring and damper) that belong to a segment."""
     return tuple(spring for spring in system.elastic_joints if spring.segment_name == segment)
 
 
-def joint_parameter(name: str, unit: str, upper: float, expected: float, description: str) -> ParameterDefinition:
-    """A parameter of an arm joint from zero, which is neutral, up to a size that grows with the effort limit."""
-    prior, scale = (0.0, expected), relative_effort_limit
+def effort_scaled_parameter_definition(
+    name: str, unit: str, upper: float, expected: float, description: str
+) -> ParameterDefinition:
+    """Definition of an arm joint's parameter, from zero (neutral) to a bound that grows with the effort limit."""
+    prior, scale = (0.0, expected), effort_limit_over_baxter
     return ParameterDefinition(name, unit, 0.0, 0.0, upper, prior, description, range_scale=scale)
 
 
-def compliance(unit: str, upper: float, prior: tuple[float, float], place: str, reported: str) -> ParameterDefinition:
-    """The compliance of a place, neutral at zero, that is reported as a stiffness in another unit."""
+def compliance_parameter_definition(
+    unit: str, upper: float, prior: tuple[float, float], place: str, reported: str
+) -> ParameterDefinition:
+    """Definition of a compliance parameter, neutral at zero, that is reported as a stiffness in another unit."""
     text, said = f"compliance of the {place}", f"stiffness {reported}"
     return ParameterDefinition("compliance", unit, 0.0, 0.0, upper, prior, text, reported_reciprocal=said)
 
 
-def force_on_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
-    """Generalized force with one nonzero entry, at a joint, shape (n, 1)."""
+def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
+    """Generalized force that is `value` at one joint and zero elsewhere, shape (n, 1)."""
     force = ca.SX(system.n_coordinates, 1)
     force[system.mechanism.joint_index(joint)] = value
     return force
 
 
-def with_bodies(
+def with_changed_joint_bodies(
     system: System, joints: Collection[str], change: Callable[[tuple[Inertia, ...]], Iterable[Inertia]]
 ) -> System:
-    """The system with the bodies of some joints changed."""
+    """The system with `change` applied to the rigid bodies of the named joints."""
     tree = system.mechanism
     changed = tuple(replace(j, bodies=tuple(change(j.bodies))) if j.name in joints else j for j in tree.joints)
     return replace(system, mechanism=replace(tree, joints=changed))

@@ -11,9 +11,9 @@ from yid_ocp.effects.base import (
     EFFECTS,
     EffectBase,
     ParameterDefinition,
-    force_on_joint,
-    joint_parameter,
-    robot_joints,
+    arm_joint_names,
+    effort_scaled_parameter_definition,
+    generalized_force_at_joint,
 )
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
@@ -29,7 +29,7 @@ class _JointFriction(EffectBase):
     """Friction of an arm joint as a function of its speed."""
 
     required_excitation = "how fast it moves"
-    possible_locations = robot_joints
+    possible_locations = arm_joint_names
 
     def _friction(self, v: ca.SX) -> ca.SX:
         """The torque that works against the speed v."""
@@ -38,7 +38,7 @@ class _JointFriction(EffectBase):
     def step_terms(self, state: MidpointState) -> StepTerms:
         """The friction of the joint."""
         v = state.v[state.system.mechanism.joint_index(self.location)]
-        return StepTerms(dissipative_force=force_on_joint(state.system, self.location, -self._friction(v)))
+        return StepTerms(dissipative_force=generalized_force_at_joint(state.system, self.location, -self._friction(v)))
 
 
 @EFFECTS.register("joint_viscous")
@@ -46,7 +46,7 @@ class JointViscous(_JointFriction):
     """Viscous friction F = -b v in addition to the model's damping."""
 
     equation = "F = -b v"
-    declared_parameters = (joint_parameter("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
+    declared_parameters = (effort_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["b"] * v
@@ -57,7 +57,7 @@ class JointCoulomb(_JointFriction):
     """Coulomb friction F = -tau_c tanh(v/v_s), v_s = `_SIGN_SMOOTHING_SPEED`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
-    declared_parameters = (joint_parameter("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
+    declared_parameters = (effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["tau_c"] * ca.tanh(v / _SIGN_SMOOTHING_SPEED)
@@ -65,11 +65,11 @@ class JointCoulomb(_JointFriction):
 
 @EFFECTS.register("joint_stribeck")
 class JointStribeck(_JointFriction):
-    """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s) beside Coulomb friction, v_s as there."""
+    """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), v_s as in Coulomb friction, which it adds to."""
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     declared_parameters = (
-        joint_parameter("tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"),
+        effort_scaled_parameter_definition("tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"),
         ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", True),
     )
 
@@ -99,9 +99,9 @@ class JointPresliding(EffectBase):
 
     equation = "F = -tau_c s, ds/dt = (v - |v| s) / yield_angle"
     required_excitation = "how fast it moves"
-    possible_locations = robot_joints
+    possible_locations = arm_joint_names
     declared_parameters = (
-        joint_parameter("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
+        effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
         ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", True),
     )
 
@@ -111,8 +111,8 @@ class JointPresliding(EffectBase):
         return ("s",)
 
     @property
-    def unknown_initial_state_bounds(self) -> Mapping[str, float]:
-        """`s` with the bound 1: its value at the start of a recording is estimated."""
+    def max_abs_unknown_initial_states(self) -> Mapping[str, float]:
+        """`s` with the largest absolute value 1: its value at the start of a recording is estimated."""
         return dict.fromkeys(self.internal_coordinates, 1.0)
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -127,7 +127,7 @@ class JointPresliding(EffectBase):
         # e^-x by what is left over x^2, so that nothing is lost next to zero, where an arm that rests stays
         change = turned / width * (1 - x * _left(x)) - before * rounded * (1 - rounded * _left(rounded))
         mean = turned / width * _left(x) + before * (1 - rounded * _left(rounded))
-        force = force_on_joint(state.system, self.location, -self["tau_c"] * mean)
+        force = generalized_force_at_joint(state.system, self.location, -self["tau_c"] * mean)
         return StepTerms(
             generalized_force=force, internal_equations={name: state.h * rate - change}, static_equations={name: s}
         )
@@ -146,9 +146,9 @@ class JointSpring(EffectBase):
 
     equation = "V += 1/2 stiffness (q - rest_angle)^2"
     required_excitation = "how far it bends"
-    possible_locations = robot_joints
+    possible_locations = arm_joint_names
     declared_parameters = (
-        joint_parameter("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
+        effort_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
         ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
     )
 

@@ -6,7 +6,14 @@ from dataclasses import replace
 
 import casadi as ca
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, object_joints, segment_names, with_bodies
+from yid_ocp.effects.base import (
+    EFFECTS,
+    EffectBase,
+    ParameterDefinition,
+    object_joint_names,
+    segment_names,
+    with_changed_joint_bodies,
+)
 from yid_ocp.model.kinematics import Kinematics, cross_product, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.rotations import symbolic_rotation_from_rpy
@@ -80,7 +87,7 @@ class GravityScale(EffectBase):
             nominal = 1 if body.gravity_fraction is None else body.gravity_fraction
             return replace(body, gravity_fraction=nominal + self["fraction"])
 
-        return with_bodies(system, object_joints(system), lambda bodies: map(scaled, bodies))
+        return with_changed_joint_bodies(system, object_joint_names(system), lambda bodies: map(scaled, bodies))
 
 
 @EFFECTS.register("gravity_tilt")

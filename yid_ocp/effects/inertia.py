@@ -14,15 +14,15 @@ from yid_ocp.effects.base import (
     EffectBase,
     ParameterDefinition,
     ReportedParameter,
-    joint_parameter,
-    link_end_frames,
-    link_frames,
-    object_joints,
-    relative_effort_limit,
-    robot_joints,
+    arm_joint_names,
+    arm_link_end_frame_names,
+    arm_link_frame_names,
+    effort_limit_over_baxter,
+    effort_scaled_parameter_definition,
+    object_joint_names,
+    segment_name_of_frame,
     segment_names,
-    segment_of_frame,
-    with_bodies,
+    with_changed_joint_bodies,
 )
 from yid_ocp.model.mechanism import Inertia, merge_bodies
 from yid_ocp.model.system import MidpointState, StepTerms, System
@@ -74,7 +74,9 @@ class _ScaledBodies(EffectBase):
 
     def apply_to_system(self, system: System) -> System:
         """The system with the scaled bodies."""
-        return with_bodies(system, self._joints(system), lambda bodies: (b.scaled_by(self["scale"]) for b in bodies))
+        return with_changed_joint_bodies(
+            system, self._joints(system), lambda bodies: (b.scaled_by(self["scale"]) for b in bodies)
+        )
 
 
 @EFFECTS.register("density")
@@ -94,7 +96,7 @@ class Density(_ScaledBodies):
 def _joints_with_mass(system: System) -> tuple[str, ...]:
     """Names of arm joints whose child link has mass."""
     tree = system.mechanism
-    return tuple(name for name in robot_joints(system) if tree.joints[tree.joint_index(name)].bodies)
+    return tuple(name for name in arm_joint_names(system) if tree.joints[tree.joint_index(name)].bodies)
 
 
 @EFFECTS.register("link_mass")
@@ -118,7 +120,7 @@ def _moving_frames(system: System) -> tuple[str, ...]:
 def _tips_and_link_ends(system: System) -> tuple[str, ...]:
     """Names of segment tips, junctions and ends of arm links."""
     ends = (f"{prefix}_{s.name}" for s in system.segment_layouts for prefix in ("w", "junction"))
-    return (*(name for name in ends if name in system.mechanism.frames), *link_end_frames(system))
+    return (*(name for name in ends if name in system.mechanism.frames), *arm_link_end_frame_names(system))
 
 
 @EFFECTS.register("point_mass")
@@ -142,7 +144,7 @@ class PointMass(EffectBase):
         frame = system.mechanism.frame(self.location)
         point = Inertia(self["mass"], frame.placement.translation, ca.SX(ca.DM.zeros(3, 3)))
         joint = system.mechanism.joints[frame.joint_index].name
-        return with_bodies(system, [joint], lambda bodies: (*bodies, point))
+        return with_changed_joint_bodies(system, [joint], lambda bodies: (*bodies, point))
 
 
 @EFFECTS.register("payload")
@@ -169,7 +171,7 @@ class Payload(EffectBase):
     is_local = True
     possible_locations = _moving_frames
     # payloads at two frames of one link are equivalent
-    candidate_locations = link_frames
+    candidate_locations = arm_link_frame_names
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
@@ -223,7 +225,7 @@ class Payload(EffectBase):
             Inertia(ca.SX(1), centre + first, ca.densify(tensor)),
             Inertia(mass - 1, centre, ca.SX(ca.DM.zeros(3, 3))),
         )
-        return with_bodies(system, [joint.name], lambda bodies: (*bodies, *pair))
+        return with_changed_joint_bodies(system, [joint.name], lambda bodies: (*bodies, *pair))
 
 
 def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
@@ -250,11 +252,11 @@ def _bearable(system: System, frame: str) -> tuple[float, float]:
     """Upper bound and expected maximum of a mass at a frame [kg]."""
     tree = system.mechanism
     joint = tree.frame(frame).joint_index
-    if segment_of_frame(system, frame) is not None:
-        whole = sum(_carried_body(system, tree.joint_index(name)).mass for name in object_joints(system))
+    if segment_name_of_frame(system, frame) is not None:
+        whole = sum(_carried_body(system, tree.joint_index(name)).mass for name in object_joint_names(system))
         return max(0.5, whole), max(0.05, whole)
-    moving = set(robot_joints(system)) & {tree.joints[i].name for i in tree.ancestor_joints(joint)}
-    size = max((relative_effort_limit(system, name) for name in moving), default=1.0)
+    moving = set(arm_joint_names(system)) & {tree.joints[i].name for i in tree.ancestor_joint_indices(joint)}
+    size = max((effort_limit_over_baxter(system, name) for name in moving), default=1.0)
     return 10.0 * size, 3.0 * size
 
 
@@ -290,8 +292,10 @@ class RotorInertia(EffectBase):
 
     equation = "T += 1/2 armature v^2"
     required_excitation = "how hard it accelerates"
-    possible_locations = robot_joints
-    declared_parameters = (joint_parameter("armature", "kg m^2", 5.0, 1.0, "inertia of the rotor at the joint"),)
+    possible_locations = arm_joint_names
+    declared_parameters = (
+        effort_scaled_parameter_definition("armature", "kg m^2", 5.0, 1.0, "inertia of the rotor at the joint"),
+    )
 
     def step_terms(self, state: MidpointState) -> StepTerms:
         """The kinetic energy of the rotor."""

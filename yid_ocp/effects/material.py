@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segment_names, segment_springs
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segment_elastic_joints, segment_names
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
@@ -22,7 +22,7 @@ _MIN_LARGEST_ANGLE = 0.02
 
 def _bending_stiffness(system: System, segment: str) -> float:
     """Mean nominal bending stiffness of a segment's joints, at least 1e-6 [N m/rad]."""
-    springs = segment_springs(system, segment)
+    springs = segment_elastic_joints(system, segment)
     chosen = [s.stiffness for s in springs if s.deformation == "bend"] or [s.stiffness for s in springs]
     if not chosen:
         return 1.0
@@ -43,7 +43,7 @@ class _SegmentEffect(EffectBase):
     def _springs(self, state: MidpointState) -> list[tuple[ElasticJoint, int]]:
         """The segment's elastic joints with their indices."""
         index = state.system.mechanism.joint_index
-        return [(spring, index(spring.joint_name)) for spring in segment_springs(state.system, self.location)]
+        return [(spring, index(spring.joint_name)) for spring in segment_elastic_joints(state.system, self.location)]
 
 
 class _SegmentMemory(_SegmentEffect):
@@ -54,7 +54,7 @@ class _SegmentMemory(_SegmentEffect):
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
         """Names of the segment's elastic joints."""
-        return tuple(spring.joint_name for spring in segment_springs(system, location))
+        return tuple(spring.joint_name for spring in segment_elastic_joints(system, location))
 
 
 class _SpringChange(_SegmentEffect):
@@ -160,7 +160,7 @@ class CubicStiffness(_SegmentEffect):
     """Springs of a segment that stiffen (k3 > 0) or soften (k3 < 0) with angle: V += 1/4 k3 q^4 on every joint.
 
     k3 is expected within -0.5 to 1 times stiffness over the squared largest angle, which is `_REFERENCE_ANGLE` until
-    `with_expected_ranges` is given the one in the data.
+    `with_prior_ranges_for_angles` is given the one in the data.
     """
 
     equation = "V += 1/4 k3 q^4"
@@ -178,7 +178,7 @@ class CubicStiffness(_SegmentEffect):
         ),
     )
 
-    def with_expected_ranges(self, largest: Mapping[str, float]) -> CubicStiffness:
+    def with_prior_ranges_for_angles(self, largest: Mapping[str, float]) -> CubicStiffness:
         """The effect with the expected range of k3 scaled to the segment's largest angle in the data."""
         if self.location not in largest:
             return self
@@ -201,7 +201,7 @@ class RestCurvature(_SpringChange):
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
         """Definitions of the rest angles qx and qy [rad] that are added at every joint that bends about x or y."""
-        axes = {spring.axis for spring in segment_springs(system, location)}
+        axes = {spring.axis for spring in segment_elastic_joints(system, location)}
         text = "rest angle of every joint about"
         return tuple(
             ParameterDefinition(f"q{axis}", "rad", 0.0, -1.0, 1.0, (-0.3, 0.3), f"{text} {axis}")

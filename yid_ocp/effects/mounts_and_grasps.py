@@ -7,8 +7,15 @@ from typing import Any
 
 import casadi as ca
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, clamp_names, compliance, grasp_names
-from yid_ocp.model.flexible import UNIT_AXES
+from yid_ocp.effects.base import (
+    EFFECTS,
+    EffectBase,
+    ParameterDefinition,
+    clamp_names,
+    compliance_parameter_definition,
+    grasp_names,
+)
+from yid_ocp.model.flexible import AXIS_UNIT_VECTORS
 from yid_ocp.model.mechanism import Joint, Placement
 from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System
 
@@ -21,7 +28,9 @@ def _root_joints_by_base(system: System) -> dict[str, tuple[str, ...]]:
     tree, clamps = system.mechanism, clamp_names(system)
     found: dict[str, tuple[str, ...]] = {}
     for first in (s.link_joints[0][0] for s in system.segment_layouts if s.parent_segment is None):
-        below = {tree.joints[i].name for i in tree.ancestor_joints(tree.joints[tree.joint_index(first)].parent_index)}
+        below = {
+            tree.joints[i].name for i in tree.ancestor_joint_indices(tree.joints[tree.joint_index(first)].parent_index)
+        }
         place = next((clamp for clamp in clamps if f"{clamp}_rz" in below), "base")
         found[place] = (*found.get(place, ()), first)
     return found
@@ -33,7 +42,7 @@ def _branch_joints_by_junction(system: System) -> dict[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     for segment in (s for s in system.segment_layouts if s.parent_segment is not None):
         first, tip = segment.link_joints[0][0], f"w_{segment.parent_segment}"
-        at_tip = tree.frame(tip).joint_index in tree.ancestor_joints(tree.joint_index(first))
+        at_tip = tree.frame(tip).joint_index in tree.ancestor_joint_indices(tree.joint_index(first))
         place = tip if at_tip else f"junction_{segment.name}"
         found[place] = (*found.get(place, ()), first)
     return found
@@ -43,7 +52,9 @@ class _JointInsertion(EffectBase):
     """A massless two-axis rotational spring in what is rigid in the model."""
 
     required_excitation = "how hard it pulls at its ends"
-    declared_parameters = (compliance("rad/(N m)", 1.0, (1 / 500, 1 / 5), "two-axis spring", "N m/rad"),)
+    declared_parameters = (
+        compliance_parameter_definition("rad/(N m)", 1.0, (1 / 500, 1 / 5), "two-axis spring", "N m/rad"),
+    )
 
     def _sprung(self, system: System, hung: tuple[str, ...], at: Placement | None, label: str) -> System:
         """The system with joints `LABEL_x` and `LABEL_y` under some others, at a placement of what they hang on."""
@@ -54,8 +65,8 @@ class _JointInsertion(EffectBase):
         if at is not None:
             place, inverse = at, Placement(at.rotation.T, -(at.rotation.T @ at.translation))
         chain = [
-            Joint(f"{label}_x", "revolute", carrier, place, UNIT_AXES["x"]),
-            Joint(f"{label}_y", "revolute", carrier, Placement.identity(), UNIT_AXES["y"]),
+            Joint(f"{label}_x", "revolute", carrier, place, AXIS_UNIT_VECTORS["x"]),
+            Joint(f"{label}_y", "revolute", carrier, Placement.identity(), AXIS_UNIT_VECTORS["y"]),
         ]
         tree = tree.with_inserted_joints(first, chain)
         joints = list(tree.joints)
@@ -66,7 +77,10 @@ class _JointInsertion(EffectBase):
         return replace(
             system,
             mechanism=replace(tree, joints=tuple(joints)),
-            joint_compliances={**system.joint_compliances, **dict.fromkeys(names, self["compliance"])},
+            joint_compliances={
+                **system.joint_compliances,
+                **dict.fromkeys(names, self["compliance"]),
+            },
             joint_relaxation_times={**system.joint_relaxation_times, **dict.fromkeys(names, _SPRING_RELAXATION_TIME)},
         )
 
@@ -146,7 +160,7 @@ class GraspCompliance(_GraspChange):
 
     equation = "phi + C damping dphi/dt = C force"
     declared_parameters = (
-        compliance("m/N", 0.1, (1e-4, 1e-2), "grasp", "N/m"),
+        compliance_parameter_definition("m/N", 0.1, (1e-4, 1e-2), "grasp", "N/m"),
         ParameterDefinition("damping", "N s/m", 0.0, 0.0, 100.0, (0.1, 20.0), "damping of the grasp", True),
     )
 
@@ -183,7 +197,7 @@ class GraspSlip(_GraspChange):
         [name] = self.internal_coordinates
         row, grasps = state.internal_rows[name], state.system.grasps
         at = grasp_names(state.system).index(self.location)
-        first = sum(grasp.n_equations for grasp in grasps[:at])
+        first = sum(grasp.n_constraint_equations for grasp in grasps[:at])
         axis = state.kinematics.frame_pose(grasps[at].held_frame).rotation[:, 2]
         load = ca.dot(axis, state.constraint_force[first : first + 3])
         return StepTerms(

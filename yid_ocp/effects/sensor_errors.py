@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import casadi as ca
 
-from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segment_of_frame
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segment_name_of_frame
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.rotations import symbolic_rotation_from_rpy
 from yid_ocp.model.system import NodeState, System
@@ -95,7 +95,7 @@ class SurfaceOffset(_CameraEffect):
     )
 
     def _seen(self, point: ca.SX, camera: Placement, state: NodeState) -> ca.SX:
-        segment = None if state.marked_frame is None else segment_of_frame(state.system, state.marked_frame)
+        segment = None if state.marked_frame is None else segment_name_of_frame(state.system, state.marked_frame)
         if segment is None:
             return point
         ray = camera.translation - point
@@ -112,7 +112,7 @@ class CameraLatency(_CameraEffect):
         ParameterDefinition("delay", "s", 0.0, 0.0, 0.5, (0.0, 0.15), "how long ago the point was there"),
     )
 
-    def added_delay(self, channel: str, camera: bool) -> ca.SX:
+    def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """The delay for cameras, zero for other sensors [s]."""
         return self["delay"] if camera else ca.SX(0)
 

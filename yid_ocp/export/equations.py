@@ -10,7 +10,7 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from yid_ocp.analysis.step_diagnostics import with_numeric_parameters
+from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.analysis.step_symbols import (
     FormulaText,
     StepSymbols,
@@ -22,7 +22,7 @@ from yid_ocp.analysis.step_symbols import (
 from yid_ocp.arrays import Array
 from yid_ocp.files import atomic_write, make_folder, write_json, write_text
 from yid_ocp.integrator.codegen import casadi_c_source, parameter_jacobian_function
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import merge_bodies
 from yid_ocp.model.system import System
 
@@ -69,7 +69,7 @@ def _exported_step_functions(symbols: StepSymbols) -> tuple[ca.Function, ...]:
     made = [ca.Function(name, e.arguments, out, list(_ARGUMENT_NAMES), list(o)) for name, (out, o) in parts.items()]
     q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
-    rigid = rigid_body_derivatives(kinematics, v, system.gravity)
+    rigid = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
     places = [kinematics.frame_position(name) for name in system.point_frames]
     mechanics = [mass_matrix(rigid, system.mechanism), rigid.lagrangian_by_q, rigid.lagrangian_by_v]
     internal = ca.vertcat(*system.internal_coordinates.values()) if system.internal_coordinates else ca.SX(0, 1)
@@ -153,7 +153,7 @@ def _rules(symbols: StepSymbols, time_step: float) -> list[str]:
 
 def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
     """Joints with their placements, and bodies with their masses, all in numbers."""
-    built = with_numeric_parameters(system, system.parameters.vector(values))
+    built = system_with_numeric_parameters(system, system.parameters.vector(values))
     mechanism = built.mechanism
     roles = dict.fromkeys(system.driven, "driven") | dict.fromkeys(system.prescribed, "prescribed")
     joints, bodies = [], []

@@ -17,20 +17,20 @@ from yid_ocp.model.rotations import rpy_from_rotation
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import mechanism_to_urdf
 from yid_ocp.virtual.mjcf import (
-    EMULATED_ASPECTS,
-    MODEL_ASPECTS,
-    JointDynamics,
+    MODEL_ASPECT_DESCRIPTIONS,
+    MUJOCO_APPROXIMATED_ASPECTS,
+    JointDynamicsTerms,
     ParameterEvaluator,
-    aspects_of_parameters,
-    effect_terms_and_aspects,
-    joint_dynamics,
-    xml_numbers,
+    effect_joint_terms_and_aspects,
+    format_xml_numbers,
+    joint_dynamics_terms,
+    model_aspects_of_parameters,
 )
 
 _SupportStatus = Literal["native", "emulated", "not representable"]
 _ORDER: tuple[_SupportStatus, ...] = ("native", "emulated", "not representable")
 
-EXPORT_FORMAT = "yid-export/1"
+EXPORT_MANIFEST_FORMAT = "yid-export/1"
 
 _MIN_LINK_MASS, _MIN_LINK_INERTIA = 1e-9, 1e-12
 """Mass [kg] and inertia [kg m^2] given to massless links, for engines that require them."""
@@ -44,14 +44,14 @@ def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
     tree, terms = _tree(system, values)
     root = ElementTree.fromstring(mechanism_to_urdf(tree))
     mujoco = Element("mujoco")
-    sizes = {"boundmass": xml_numbers([_MIN_LINK_MASS]), "boundinertia": xml_numbers([_MIN_LINK_INERTIA])}
+    sizes = {"boundmass": format_xml_numbers([_MIN_LINK_MASS]), "boundinertia": format_xml_numbers([_MIN_LINK_INERTIA])}
     sizes["fusestatic"] = "false"
     SubElement(mujoco, "compiler", sizes)
     root.insert(0, mujoco)
     for joint in root.findall("joint"):
         own = terms.get(joint.get("name", ""))
         if own is not None and joint.get("type") != "fixed":
-            sizes = {"damping": xml_numbers([own.damping]), "friction": xml_numbers([own.dry_friction])}
+            sizes = {"damping": format_xml_numbers([own.damping]), "friction": format_xml_numbers([own.dry_friction])}
             SubElement(joint, "dynamics", sizes)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
@@ -63,11 +63,11 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
     root = Element("sdf", version="1.10")
     world = SubElement(root, "world", name="world")
     gravity = SubElement(world, "gravity")
-    gravity.text = xml_numbers(ParameterEvaluator(system, values)(system.gravity))
+    gravity.text = format_xml_numbers(ParameterEvaluator(system, values)(system.gravity))
     model = SubElement(world, "model", name="model")
     for i, joint in enumerate(tree.joints):
         _sdf_link(model, tree, i)
-        _sdf_joint(model, tree, joint, terms.get(joint.name, JointDynamics()))
+        _sdf_joint(model, tree, joint, terms.get(joint.name, JointDynamicsTerms()))
     for name, frame in tree.frames.items():
         on = "world" if frame.joint_index < 0 else f"{tree.joints[frame.joint_index].name}_link"
         # what stands in the world is placed from the model, which stands at its origin
@@ -78,11 +78,11 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, JointDynamics]]:
+def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, JointDynamicsTerms]]:
     """The tree in numbers, its bodies without weights of their own, and what its joints have."""
     tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
     joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
-    return replace(tree, joints=joints), joint_dynamics(system, ParameterEvaluator(system, values))
+    return replace(tree, joints=joints), joint_dynamics_terms(system, ParameterEvaluator(system, values))
 
 
 def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
@@ -101,13 +101,13 @@ def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
         _sdf_number(inertia, key, tensor[at])
 
 
-def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: JointDynamics) -> None:
+def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: JointDynamicsTerms) -> None:
     element = SubElement(model, "joint", name=joint.name, type=joint.kind)
     parent = "world" if joint.parent_index < 0 else f"{tree.joints[joint.parent_index].name}_link"
     for tag, text in (("parent", parent), ("child", f"{joint.name}_link")):
         SubElement(element, tag).text = text
     axis = SubElement(element, "axis")
-    SubElement(axis, "xyz").text = xml_numbers(joint.axis)
+    SubElement(axis, "xyz").text = format_xml_numbers(joint.axis)
     limit = SubElement(axis, "limit")
     for key in ("lower", "upper", "effort", "velocity"):
         size = getattr(joint, f"{key}_limit")
@@ -124,16 +124,16 @@ def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: JointDynami
 def _sdf_pose(element: Element, placement: Placement, attributes: Mapping[str, str] | None = None) -> None:
     turn, at = np.array(ca.DM(placement.rotation)), np.array(ca.DM(placement.translation)).ravel()
     pose = SubElement(element, "pose", dict(attributes or {}))
-    pose.text = xml_numbers([*at, *rpy_from_rotation(turn)])
+    pose.text = format_xml_numbers([*at, *rpy_from_rotation(turn)])
 
 
 def _sdf_number(element: Element, tag: str, value: float) -> None:
-    SubElement(element, tag).text = xml_numbers([value])
+    SubElement(element, tag).text = format_xml_numbers([value])
 
 
 @dataclass(frozen=True)
 class FormatSupport:
-    """Support of a format for one parameter or effect, with its means or the reason against."""
+    """Whether an export format can express one parameter or effect, and by what element or why not."""
 
     status: _SupportStatus
     how: str
@@ -184,19 +184,19 @@ _SUPPORT_BY_FORMAT: Mapping[str, Mapping[str, FormatSupport]] = {
     name: {
         aspect: FormatSupport("not representable", f"{name.upper()} has nothing for {words}")
         if aspect not in table
-        else FormatSupport("emulated" if aspect in EMULATED_ASPECTS else "native", table[aspect])
-        for aspect, words in MODEL_ASPECTS.items()
+        else FormatSupport("emulated" if aspect in MUJOCO_APPROXIMATED_ASPECTS else "native", table[aspect])
+        for aspect, words in MODEL_ASPECT_DESCRIPTIONS.items()
     }
     for name, table in (("mjcf", _MJCF), ("urdf", _URDF), ("sdf", _SDF))
 }
 
-_READING = FormatSupport("not representable", f"{MODEL_ASPECTS['reading']}: correct the readings instead")
+_READING = FormatSupport("not representable", f"{MODEL_ASPECT_DESCRIPTIONS['reading']}: correct the readings instead")
 _NEUTRAL = FormatSupport("native", "neutral: it changes nothing and is left out")
 _UNUSED = FormatSupport("native", "it enters nothing in this model")
 
 
-def effect_support(system: System, values: Mapping[str, float], form: str) -> dict[str, FormatSupport]:
-    """Support of a format (`mjcf`, `urdf` or `sdf`) for every effect of a system, by label."""
+def effect_format_support(system: System, values: Mapping[str, float], form: str) -> dict[str, FormatSupport]:
+    """Whether an export format (`mjcf`, `urdf`, `sdf`) can express each effect of a system, by effect label."""
     value, found = ParameterEvaluator(system, values), dict[str, FormatSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
@@ -205,17 +205,19 @@ def effect_support(system: System, values: Mapping[str, float], form: str) -> di
         if amplitudes and all(theta[name] == neutral[name] for name in amplitudes):
             found[label] = _NEUTRAL
         else:
-            _, aspects = effect_terms_and_aspects(system, effect, value)
+            _, aspects = effect_joint_terms_and_aspects(system, effect, value)
             parts = [_READING if x == "reading" else _SUPPORT_BY_FORMAT[form][x] for x in sorted(aspects)]
             found[label] = _worst(parts)
     return found
 
 
-def parameter_support(system: System, effects: Mapping[str, FormatSupport], form: str) -> dict[str, FormatSupport]:
-    """Support of a format for every parameter; an effect's parameters have the support of the effect."""
+def parameter_format_support(
+    system: System, effects: Mapping[str, FormatSupport], form: str
+) -> dict[str, FormatSupport]:
+    """Whether an export format can express each parameter; an effect's parameters are as the effect."""
     found = {}
     for entry in system.parameters:
-        owner, aspects = entry.name.rpartition(".")[0], sorted(aspects_of_parameters(system, entry.symbol))
+        owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_of_parameters(system, entry.symbol))
         parts = [_SUPPORT_BY_FORMAT[form][aspect] for aspect in aspects] or [_UNUSED]
         found[entry.name] = effects[owner] if owner in effects else _worst(parts)
     return found

@@ -29,7 +29,7 @@ _WORLD_FRAME = "world"
 
 
 @dataclass(frozen=True)
-class TopicSignal:
+class RosTopicTimeSeries:
     """Time series of one ROS topic.
 
     Attributes
@@ -51,7 +51,7 @@ class TopicSignal:
     frame: str = _WORLD_FRAME
 
 
-def export_mcap(signals: Sequence[TopicSignal], path: str | os.PathLike[str]) -> float:
+def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[str]) -> float:
     """Write signals into one MCAP file, with the definitions of their messages, in the order of time.
 
     Returns
@@ -95,9 +95,9 @@ def export_mcap(signals: Sequence[TopicSignal], path: str | os.PathLike[str]) ->
     return shift
 
 
-def signals_from_recording(recording: Recording) -> list[TopicSignal]:
+def ros_signals_from_recording(recording: Recording) -> list[RosTopicTimeSeries]:
     """The signals of a recording: `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/GROUP/POINT`."""
-    found: list[TopicSignal] = []
+    found: list[RosTopicTimeSeries] = []
     for group in recording.groups:
         if isinstance(group, JointGroup):
             own = group.channels
@@ -108,15 +108,15 @@ def signals_from_recording(recording: Recording) -> list[TopicSignal]:
             }
             for topic, channels in parts.items():
                 values = {name: own[channel] for name, channel in channels.items() if channel in own}
-                found += [TopicSignal(topic, "joints", group.t, values, group.names)] if values else []
+                found += [RosTopicTimeSeries(topic, "joints", group.t, values, group.names)] if values else []
         else:
             for i, name in enumerate(group.names):
                 topic, place = f"/points/{group.name}/{name}", {"xyz": group.position[:, i]}
-                found.append(TopicSignal(topic, "point", group.t, place, frame=group.frame or _WORLD_FRAME))
+                found.append(RosTopicTimeSeries(topic, "point", group.t, place, frame=group.frame or _WORLD_FRAME))
     return found
 
 
-def _messages(signal: TopicSignal, shift: float, store: Any) -> Iterator[tuple[int, Any]]:
+def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[tuple[int, Any]]:
     """Stamp [ns] and message of every time at which there is a number."""
     types = store.types
 

@@ -18,7 +18,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.model_functions import ModelFunctions, NodeValues
+from yid_ocp.problem.model_functions import ModelFunctions, NodeStateValues
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class NominalTrajectory:
     rollout: Rollout
     measurements: Sequence[Measurements]
     tracking_feedback: TrackingFeedback | None
-    node_values: NodeValues
+    node_values: NodeStateValues
     initial_state_by_angles: Array
     initial_state_by_torque: Array
 
@@ -43,14 +43,14 @@ def nominal_trajectory(
     predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
 ) -> NominalTrajectory:
     """Trajectory of an episode about which its residual is linearized."""
-    own, rest, sizes = predictor.episode_theta(episode, theta), result.equilibrium, predictor.step.sizes
+    own, rest, sizes = predictor.theta_with_episode_values(episode, theta), result.equilibrium, predictor.step.sizes
     none = np.zeros((sizes["nx"], sizes["nu"]))
     by_angles = none if rest is None else rest.state_by_known_coordinates[:, : sizes["nu"]]
     return NominalTrajectory(
         predictor.model_functions,
         own,
         result.rollout,
-        [predictor.measurements_at_true_times(samples, own) for samples in episode.measurements],
+        [predictor.delay_corrected_measurements(samples, own) for samples in episode.measurements],
         episode.tracking_feedback,
         predictor.node_values(result.rollout),
         by_angles,
@@ -59,8 +59,8 @@ def nominal_trajectory(
 
 
 @dataclass(frozen=True)
-class ResidualSlopes:
-    """Slopes of a recording's residual, in units of the sensors' noise, at the two nodes about each of its r rows.
+class ResidualDerivativesAtNodes:
+    """Derivatives of a recording's r residuals [sensor noise] by the states of the two nodes around each sample.
 
     They are by the states (r, nx) of the node before the row and of the next, their shares of the interpolation
     included, and by the efforts of prescribed joints there (r, nc).
@@ -73,15 +73,15 @@ class ResidualSlopes:
     by_effort_after: Array
 
     @staticmethod
-    def along(course: NominalTrajectory) -> ResidualSlopes:
-        """From the sensors' own derivatives along the trajectory."""
+    def along(course: NominalTrajectory) -> ResidualDerivativesAtNodes:
+        """The residual's derivatives from those of the sensors along a nominal trajectory."""
         step, theta = course.model_functions.step, course.theta
-        n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_indices)
+        n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)
         found: list[IntArray] = []
         parts: list[tuple[Array, ...]] = []
         for samples in course.measurements:
             used = samples.evaluation_nodes
-            function = course.model_functions.compiled_sensor(samples.sensor)
+            function = course.model_functions.compiled_sensor_function(samples.sensor)
             read = function(course.node_values.at(used), theta)
             if read.needs_neighbours:
                 raise DataError(
@@ -91,7 +91,7 @@ class ResidualSlopes:
                 )
             slopes = np.zeros((*read.output.shape, nx))
             slopes[:, :, :n], slopes[:, :, 2 * n :] = read.by_q, read.by_z
-            sample, column = np.nonzero(samples.is_used)
+            sample, column = np.nonzero(samples.used_output_mask)
             at = (sample, column) if samples.node.ndim > 1 else (sample,)
             node, fraction, weight = samples.node[at], samples.fraction[at], samples.weight[sample, column]
             place = np.searchsorted(used, node)
@@ -102,24 +102,24 @@ class ResidualSlopes:
             found.append(np.minimum(node, len(course.rollout.torque)))
             parts.append((*by_state, *by_effort))
         arrays = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        return ResidualSlopes(np.concatenate(found), *arrays)
+        return ResidualDerivativesAtNodes(np.concatenate(found), *arrays)
 
     @property
-    def visible_states(self) -> BoolArray:
-        """States that a residual depends on, shape (nx,)."""
+    def visible_state_mask(self) -> BoolArray:
+        """Mask of the states that any of the residuals depends on, shape (nx,)."""
         return np.any(self.before != 0, axis=0) | np.any(self.after != 0, axis=0)
 
-    def by_some_states(self, kept: IntArray) -> ResidualSlopes:
-        """The slopes by some of the states alone."""
+    def select_states(self, kept: IntArray) -> ResidualDerivativesAtNodes:
+        """The derivatives by the states at the indices `kept` alone."""
         return replace(self, before=self.before[:, kept], after=self.after[:, kept])
 
-    def some_rows(self, rows: IntArray) -> ResidualSlopes:
-        """Some of the rows alone."""
+    def select_residual_rows(self, rows: IntArray) -> ResidualDerivativesAtNodes:
+        """The derivatives of the residuals at the indices `rows` alone."""
         slopes = (self.before, self.after, self.by_effort_before, self.by_effort_after)
-        return ResidualSlopes(self.node[rows], *(array[rows] for array in slopes))
+        return ResidualDerivativesAtNodes(self.node[rows], *(array[rows] for array in slopes))
 
-    def response(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Slopes of the rows by d directions (r, d), from those of states (K, nx, d) and prescribed efforts (K, nc, d).
+    def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
+        """Derivatives of the residuals in d directions (r, d), from those of states (K, nx, d) and efforts (K, nc, d).
 
         They are of K nodes from `first` on; a row beyond them is read at the last.
         """
@@ -133,8 +133,8 @@ class ResidualSlopes:
                 found[used] += np.einsum("rx,rxd->rd", by_effort[used], effort[local])
         return found
 
-    def rows_by_node(self, last: int) -> list[IntArray]:
-        """Rows of each node from 0 to `last`."""
+    def residual_rows_by_node(self, last: int) -> list[IntArray]:
+        """Indices of the residuals that belong to each node, from node 0 to `last`."""
         order = np.argsort(self.node, kind="stable")
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))
 
@@ -143,17 +143,20 @@ class ResidualSlopes:
 _MAX_RELATIVE_REDUCTION, _MAX_NOISE_UNIT_REDUCTION = 1e-3, 1e-2
 
 
-def residual_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
+def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, Array]:
     """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
     rows = problem.residual_rows
-    residual, jacobian = evaluation.residual[rows.without_weak_priors], evaluation.jacobian[rows.without_weak_priors]
+    residual, jacobian = (
+        evaluation.residual[rows.slice_without_weak_priors],
+        evaluation.jacobian[rows.slice_without_weak_priors],
+    )
     units = np.ones(len(residual))
-    units[rows.data] = problem.data_noise_unit
+    units[rows.data] = problem.data_residual_noise_std
     return residual / units, jacobian / units[:, None]
 
 
-def bounded_least_squares_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
+def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
     """Solve min |J d + r|^2 + mu c |d|^2 with lower <= d <= upper, c the largest squared column norm."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
@@ -173,18 +176,20 @@ def bounded_least_squares_step(jacobian: Array, residual: Array, mu: float, lowe
     return step
 
 
-def predicted_reduction(jacobian: Array, residual: Array, step: Array) -> float:
+def predicted_cost_reduction(jacobian: Array, residual: Array, step: Array) -> float:
     """Reduction of 1/2 |r|^2 that the linear model predicts for a step."""
     return -float((jacobian.T @ residual) @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
 
 
-def is_stationary(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
+def is_stationary_point(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
     """Whether a point (evaluated with its Jacobian) is stationary: no step promises a relevant cost reduction."""
-    worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * problem.data_noise_unit**2)
-    return achievable_reduction(problem, x, evaluation) <= worth
+    worth = max(
+        _MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * problem.data_residual_noise_std**2
+    )
+    return achievable_cost_reduction(problem, x, evaluation) <= worth
 
 
-def achievable_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
+def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
     """Cost reduction that the linear model predicts for a step up to the unknowns' size; infinite without a Jacobian.
 
     The step is undamped and within the bounds; size is the larger of value and typical size.
@@ -197,5 +202,5 @@ def achievable_reduction(problem: EstimationProblem, x: Array, evaluation: Evalu
     size = np.maximum(np.abs(x), problem.unknown_scales)
     scaled = evaluation.jacobian * size
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
-    step = bounded_least_squares_step(scaled, evaluation.residual, 1e-14, low, high)
-    return predicted_reduction(scaled, evaluation.residual, step)
+    step = bounded_levenberg_marquardt_step(scaled, evaluation.residual, 1e-14, low, high)
+    return predicted_cost_reduction(scaled, evaluation.residual, step)

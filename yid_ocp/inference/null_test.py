@@ -20,13 +20,13 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
 
-RESIDUAL_WINDOW_LENGTH = 0.5
+RESIDUAL_WINDOW_SECONDS = 0.5
 """Length of the time windows in which a residual is tested [s]."""
 
 
 @dataclass(frozen=True)
-class GapCriteria:
-    """Criteria for a residual that exceeds noise.
+class ExcessResidualCriteria:
+    """Significance level and smallest excess chi2 at which a residual counts as exceeding its noise.
 
     It does where it is significant at the level and chi2/n - 1 is at least `min_excess_chi2`; of the stated standard
     deviations `noise_fraction` is noise, the rest represents model error.
@@ -37,12 +37,12 @@ class GapCriteria:
     noise_fraction: float = 1.0
 
 
-DEFAULT_GAP_CRITERIA = GapCriteria()
+DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 
 @dataclass(frozen=True)
-class ResidualChannel:
-    """One scalar sensor output of one recording: times since its start (M,) [s] and indices in the residual (M,).
+class ResidualChannelSamples:
+    """Samples of one scalar sensor output of a recording: times from its start (M,) [s], residual indices (M,).
 
     The autocorrelation of its noise is at lags 0 to L samples, shape (L + 1,).
     """
@@ -100,7 +100,7 @@ def channel_noise_levels(problem: EstimationProblem) -> tuple[ChannelNoiseLevel,
     units: dict[str, str] = {}
     for episode in problem.episodes:
         for samples in episode.measurements:
-            for column, channel in enumerate(samples.channel_of_column):
+            for column, channel in enumerate(samples.output_channel_names):
                 found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
                 units[channel] = samples.sensor.unit
     joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
@@ -113,11 +113,11 @@ def _variance_inflation(colour: Array) -> float:
 
 
 def run_null_test(
-    series: Sequence[ResidualChannel],
+    series: Sequence[ResidualChannelSamples],
     residual: Array,
     parameters: int,
-    level: float = DEFAULT_GAP_CRITERIA.significance_level,
-    window: float = RESIDUAL_WINDOW_LENGTH,
+    level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
+    window: float = RESIDUAL_WINDOW_SECONDS,
 ) -> NullTestResult:
     """Test a whitened residual (nr,), with a number of free parameters, against the hypothesis of noise alone.
 
@@ -150,15 +150,17 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
     return np.asarray(residual + columns @ ((1 / np.hypot(1.0, sizes) - 1) * (columns.T @ residual)))
 
 
-def exceeds_noise(tests: Sequence[NullTestResult], limits: GapCriteria = DEFAULT_GAP_CRITERIA) -> bool:
+def residuals_exceed_noise(
+    tests: Sequence[NullTestResult], limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA
+) -> bool:
     """Whether residuals of one model, fitted or held out, exceed noise, both significantly and by a relevant size."""
     return (
-        bonferroni_p_value(tests) < limits.significance_level
+        min_bonferroni_p_value(tests) < limits.significance_level
         and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2
     )
 
 
-def bonferroni_p_value(tests: Sequence[NullTestResult]) -> float:
+def min_bonferroni_p_value(tests: Sequence[NullTestResult]) -> float:
     """Bonferroni-corrected smallest p-value of several tests."""
     return min(1.0, len(tests) * min(test.p_value for test in tests))
 
@@ -180,11 +182,11 @@ def _whiteness(parts: Sequence[Array], lags: int = 10) -> float:
 
 
 def _windows(
-    series: Sequence[ResidualChannel], residual: Array, level: float, length: float
+    series: Sequence[ResidualChannelSamples], residual: Array, level: float, length: float
 ) -> tuple[_ResidualWindow, ...]:
     raw: list[tuple[str, str, float, float, float]] = []
     p_values: list[float] = []
-    merged: dict[tuple[str, str], list[ResidualChannel]] = {}
+    merged: dict[tuple[str, str], list[ResidualChannelSamples]] = {}
     for s in series:
         merged.setdefault((s.recording, s.channel), []).append(s)
     for (recording, channel), own in merged.items():
@@ -216,25 +218,25 @@ def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: floa
     return real.tolist()
 
 
-def sample_times(episode: Episode, samples: Measurements) -> Array:
+def times_since_recording_start(episode: Episode, samples: Measurements) -> Array:
     """Sample times since the start of the recording, shape (M,) [s]."""
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
-def residual_channels(problem: EstimationProblem) -> tuple[ResidualChannel, ...]:
-    """Channels of a problem's residual: one entry for each scalar output of each recording."""
-    series: list[ResidualChannel] = []
+def residual_channel_samples(problem: EstimationProblem) -> tuple[ResidualChannelSamples, ...]:
+    """Where each scalar sensor output of each recording stands in a problem's residual: times and indices."""
+    series: list[ResidualChannelSamples] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):
         for samples, rows in zip(episode.measurements, groups, strict=True):
-            t = sample_times(episode, samples)
-            place = np.full(samples.is_used.shape, -1)
-            place[samples.is_used] = np.arange(rows.start, rows.stop)
+            t = times_since_recording_start(episode, samples)
+            place = np.full(samples.used_output_mask.shape, -1)
+            place[samples.used_output_mask] = np.arange(rows.start, rows.stop)
             colour = _sensor_noise_autocorrelation(problem, episode, samples)
-            for column, channel in enumerate(samples.channel_of_column):
-                seen = samples.is_used[:, column]
+            for column, channel in enumerate(samples.output_channel_names):
+                seen = samples.used_output_mask[:, column]
                 if seen.any():
                     text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
-                    series.append(ResidualChannel(*text, t[seen], place[seen, column], colour))
+                    series.append(ResidualChannelSamples(*text, t[seen], place[seen, column], colour))
     return tuple(series)
 
 

@@ -24,12 +24,12 @@ import scipy.optimize
 import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
+from yid_ocp.inference.kalman import FilterStateTransition, KalmanStep, kalman_step_and_covariance
 from yid_ocp.inference.smoother_model import (
     DEFAULT_SMOOTHER_THRESHOLDS,
     LinearResidualModel,
+    SmoothedUnknownGroup,
     SmootherThresholds,
-    UnknownGroup,
     linear_residual_models,
 )
 from yid_ocp.parallel import map_in_threads
@@ -54,7 +54,7 @@ class SmoothedUnknowns:
     recording: str
     interval_edges: Array
     unknown_names: tuple[str, ...]
-    unknown_groups: tuple[UnknownGroup, ...]
+    unknown_groups: tuple[SmoothedUnknownGroup, ...]
     reference_std: Array
     posterior_mean: Array
     posterior_std: Array
@@ -66,11 +66,11 @@ class SmootherResult:
 
     Attributes
     ----------
-    group_variance : dict of UnknownGroup to float
+    group_variance : dict of SmoothedUnknownGroup to float
         Of every group, in units of its squared reference, at the largest evidence.
-    log_evidence_drop : dict of UnknownGroup to float
+    log_evidence_drop : dict of SmoothedUnknownGroup to float
         Fall of the log evidence when the group is left out.
-    detectable_std : dict of UnknownGroup to float
+    detectable_std : dict of SmoothedUnknownGroup to float
         Smallest standard deviation of every group's unknowns that would be noticed, in units of the reference, from the
         model alone.
     chi2_before, chi2_after : float
@@ -82,24 +82,24 @@ class SmootherResult:
         neither ("none" is 0).
     min_log_bayes_factor : float
         Rise of the log evidence that is more than chance.
-    alternative_groups : dict of UnknownGroup to tuple of UnknownGroup
+    alternative_groups : dict of SmoothedUnknownGroup to tuple of SmoothedUnknownGroup
         Groups that would do nearly as well in the place of each group at work.
     """
 
     smoothed_unknowns: tuple[SmoothedUnknowns, ...]
-    group_variance: dict[UnknownGroup, float]
-    log_evidence_drop: dict[UnknownGroup, float]
-    detectable_std: dict[UnknownGroup, float]
+    group_variance: dict[SmoothedUnknownGroup, float]
+    log_evidence_drop: dict[SmoothedUnknownGroup, float]
+    detectable_std: dict[SmoothedUnknownGroup, float]
     chi2_before: float
     chi2_after: float
     dof_before: float
     dof_after: float
     log_evidence: dict[str, float]
     min_log_bayes_factor: float = DEFAULT_SMOOTHER_THRESHOLDS.min_log_bayes_factor
-    alternative_groups: Mapping[UnknownGroup, tuple[UnknownGroup, ...]] = field(default_factory=dict)
+    alternative_groups: Mapping[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]] = field(default_factory=dict)
 
     @property
-    def explainable_fraction(self) -> float:
+    def explainable_gap_fraction(self) -> float:
         """Fraction of the gap G = max(0, chi2/n - 1) that unknown forces, offsets and biases can explain."""
         gap = self.chi2_before / self.dof_before - 1
         rest = max(self.chi2_after / self.dof_after - 1, 0.0)
@@ -181,7 +181,9 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
         design = np.hstack([interval.state_jacobian, interval.unknown_jacobian[:, used]])
         products += interval.unreachable_products
         move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
-        step, later, own = kalman_step(p, design, Transition(move, np.full(nd, model.interval_correlation)))
+        step, later, own = kalman_step_and_covariance(
+            p, design, FilterStateTransition(move, np.full(nd, model.interval_correlation))
+        )
         if math.isinf(own):
             return _Filtered(model, begin, products, math.inf, ())
         white, after = step.update(mean, interval.negative_residual_jacobian)
@@ -207,9 +209,9 @@ def _backwards(done: _Filtered) -> _Smoothed:
         update = updates[j]
         if j + 1 < count:
             score[j + 1], information[j + 1] = gain * r[ns:], gain**2 * np.diag(n)[ns:]
-        noise, r = update.step.backward(update.white, r)
+        noise, r = update.step.smooth_backward(update.white, r)
         left.append(noise)
-        n = update.step.backward_information(n)
+        n = update.step.costate_covariance_before_step(n)
         smoothed[j] = (update.mean + update.p @ r)[ns:]
         own = update.p[ns:]
         covariance[j] = np.diag(update.p)[ns:] - np.sum((own @ n) * own, axis=1)
@@ -230,11 +232,11 @@ class _State:
     log_evidence: float
 
 
-def _run(models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float]) -> _State:
+def _run(models: Sequence[LinearResidualModel], variance: Mapping[SmoothedUnknownGroup, float]) -> _State:
     """All recordings at given variances; without smoothed unknowns where rounding shows."""
 
     def run(model: LinearResidualModel) -> tuple[_Filtered, _Smoothed | None]:
-        done = _forwards(model, model.unknown_variance(variance), True)
+        done = _forwards(model, model.unknown_variances_from_groups(variance), True)
         return done, _backwards(done) if done.updates else None
 
     filtered, smoothed = zip(*map_in_threads(run, models), strict=True)
@@ -255,9 +257,9 @@ def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tupl
     return -0.5 * (quadratic + log_determinant + determinant), shift, factor
 
 
-def _scores(models: Sequence[LinearResidualModel], state: _State) -> dict[UnknownGroup, tuple[float, float]]:
+def _scores(models: Sequence[LinearResidualModel], state: _State) -> dict[SmoothedUnknownGroup, tuple[float, float]]:
     """|score|^2 of every group's unknowns and its expectation, whatever their variance is."""
-    found: dict[UnknownGroup, tuple[float, float]] = {}
+    found: dict[SmoothedUnknownGroup, tuple[float, float]] = {}
     for model, done in zip(models, state.recordings, strict=True):
         by_theta = done.score[:, :, 1:]
         score = done.score[:, :, 0] - by_theta @ state.shift
@@ -269,8 +271,8 @@ def _scores(models: Sequence[LinearResidualModel], state: _State) -> dict[Unknow
 
 
 def _refined(
-    models: Sequence[LinearResidualModel], variance: dict[UnknownGroup, float]
-) -> tuple[dict[UnknownGroup, float], _State]:
+    models: Sequence[LinearResidualModel], variance: dict[SmoothedUnknownGroup, float]
+) -> tuple[dict[SmoothedUnknownGroup, float], _State]:
     """Variances of the groups at work by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
     state = _run(models, variance)
     for _ in range(_MAX_ITERATIONS):
@@ -285,11 +287,11 @@ def _refined(
 
 def _selected(
     models: Sequence[LinearResidualModel],
-    sources: Sequence[UnknownGroup],
-    variance: dict[UnknownGroup, float],
+    sources: Sequence[SmoothedUnknownGroup],
+    variance: dict[SmoothedUnknownGroup, float],
     state: _State,
     limits: SmootherThresholds,
-) -> tuple[dict[UnknownGroup, float], _State]:
+) -> tuple[dict[SmoothedUnknownGroup, float], _State]:
     """Add group after group, that which raises the evidence most, while it rises by more than chance."""
     while sum(v > 0 for v in variance.values()) < limits.max_unknown_groups:
         found = _scores(models, state)
@@ -309,12 +311,14 @@ def _selected(
 
 
 def _largest_evidences(
-    models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float], sources: Sequence[UnknownGroup]
+    models: Sequence[LinearResidualModel],
+    variance: Mapping[SmoothedUnknownGroup, float],
+    sources: Sequence[SmoothedUnknownGroup],
 ) -> list[tuple[float, float]]:
     """`_largest_evidence` of several groups, each on top of the same variances."""
     if not sources:
         return []
-    bases = map_in_threads(lambda model: _forwards(model, model.unknown_variance(variance), True), models)
+    bases = map_in_threads(lambda model: _forwards(model, model.unknown_variances_from_groups(variance), True), models)
     return map_in_threads(lambda source: _largest_evidence(bases, source), sources)
 
 
@@ -334,17 +338,17 @@ def _responses(base: _Filtered, chosen: IntArray) -> Array:
         unknown[:, :k] *= model.interval_correlation
         unknown[:, k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
         left = behind.reshape(len(kept), u * count)
-        shaped, move = update.step.normalized_observation, update.step.transition
+        shaped, move = update.step.normalized_observation_matrix, update.step.transition
         rows = shaped[:, kept] @ left
         rows += (shaped[:, ns + chosen][:, :, None] * unknown).reshape(rows.shape)
         found.append(rows)
-        follow = Transition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
-        behind = follow.forward(left - update.step.projected_covariance[:, kept].T @ rows).reshape(behind.shape)
+        follow = FilterStateTransition(move.state_rows[:, kept], move.decay[kept[ns:] - ns])
+        behind = follow.propagate_state(left - update.step.projected_covariance[:, kept].T @ rows).reshape(behind.shape)
         behind[:ns] += move.state_rows[:, ns + chosen][:, :, None] * unknown
     return np.vstack(found)
 
 
-def _largest_evidence(bases: Sequence[_Filtered], source: UnknownGroup) -> tuple[float, float]:
+def _largest_evidence(bases: Sequence[_Filtered], source: SmoothedUnknownGroup) -> tuple[float, float]:
     """The largest log evidence over the variance that one group gets on top, and that variance.
 
     With W the innovations by its disturbances, those of the base have the covariance I + s^2 W W', whose inverse and
@@ -372,7 +376,7 @@ def _largest_evidence(bases: Sequence[_Filtered], source: UnknownGroup) -> tuple
     return -float(outcome.fun), 10.0 ** float(outcome.x)
 
 
-def run_smoother(
+def select_and_smooth_unknowns(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
@@ -390,7 +394,7 @@ def run_smoother(
         nothing = _run(models, none)
         sides = {"both": sources, "plant": tuple(s for s in sources if s.kind != "bias")}
         sides["sensor"] = tuple(s for s in sources if s.kind == "bias")
-        found: dict[str, tuple[dict[UnknownGroup, float], _State]] = {}
+        found: dict[str, tuple[dict[SmoothedUnknownGroup, float], _State]] = {}
         for side, own in sides.items():
             done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
             found[side] = done[0] if done else _selected(models, own, none, nothing, limits)
@@ -416,8 +420,8 @@ def run_smoother(
         )
 
 
-def force_likelihood_terms(
-    model: LinearResidualModel, variance: Mapping[UnknownGroup, float], unknown: int
+def force_log_likelihood_coefficients(
+    model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknown: int
 ) -> tuple[Array, Array]:
     """Return g (J,) and L (J, J) of the log likelihood g'f - f'L f / 2 of one unknown f over a recording's intervals.
 
@@ -435,7 +439,9 @@ def force_likelihood_terms(
         jacobian = np.hstack([interval.negative_residual_jacobian, seen])
         rest = np.pad(interval.unreachable_products, (0, count))
         intervals.append(replace(interval, negative_residual_jacobian=jacobian, unreachable_products=rest))
-    products = _forwards(replace(model, intervals=tuple(intervals)), model.unknown_variance(variance), False).products
+    products = _forwards(
+        replace(model, intervals=tuple(intervals)), model.unknown_variances_from_groups(variance), False
+    ).products
     split = 1 + parameters
     free = products[1:split, 1:split] + np.eye(parameters) / 9.0
     cross = products[split:, 1:split]
@@ -456,7 +462,7 @@ def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> Smooth
 
 
 def _explained(
-    models: Sequence[LinearResidualModel], variance: Mapping[UnknownGroup, float], plain: _State, state: _State
+    models: Sequence[LinearResidualModel], variance: Mapping[SmoothedUnknownGroup, float], plain: _State, state: _State
 ) -> tuple[float, float, float, int]:
     """r'r without and with the unknowns, degrees of freedom that they take, and the number of samples."""
     before = after = taken = 0.0
@@ -475,10 +481,10 @@ def _explained(
 
 def _alternatives(
     models: Sequence[LinearResidualModel],
-    variance: dict[UnknownGroup, float],
+    variance: dict[SmoothedUnknownGroup, float],
     state: _State,
     limits: SmootherThresholds,
-) -> tuple[dict[UnknownGroup, float], dict[UnknownGroup, tuple[UnknownGroup, ...]]]:
+) -> tuple[dict[SmoothedUnknownGroup, float], dict[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]]]:
     """Fall of the log evidence without each group, and those that would keep most of it, or all but what is chance."""
     drop, found = dict.fromkeys(variance, 0.0), {}
     for source in [s for s, v in variance.items() if v]:

@@ -25,14 +25,19 @@ import scipy.sparse
 from annotated_types import Ge, Gt, Le
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.effects.base import robot_joints
-from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualSlopes, nominal_trajectory
-from yid_ocp.integrator.rollout import AdditionalLoads, active_state_mask, applied_joint_torque, linearized_steps
+from yid_ocp.effects.base import arm_joint_names
+from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualDerivativesAtNodes, nominal_trajectory
+from yid_ocp.integrator.rollout import (
+    AdditionalLoadDerivatives,
+    active_state_mask,
+    applied_joint_torque,
+    linearized_steps,
+)
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal
+from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal_at_zero
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.sensors import Sensor
 
@@ -69,8 +74,8 @@ DEFAULT_SMOOTHER_THRESHOLDS = SmootherThresholds()
 
 
 @dataclass(frozen=True)
-class UnknownGroup:
-    """Group of unknowns that share a location and a standard deviation.
+class SmoothedUnknownGroup:
+    """Group of unknown forces, offsets or biases that share a location and a standard deviation.
 
     `is_confounded_with_bias`: a bias of an effort sensor would be the same, as for a force at a prescribed joint whose
     effort is measured.
@@ -100,7 +105,7 @@ class _SmootherUnknowns:
     """Unknown forces at coordinates, offsets of constraints, pushes on segments, biases of (samples, column)."""
 
     names: tuple[str, ...]
-    sources: tuple[UnknownGroup, ...]
+    sources: tuple[SmoothedUnknownGroup, ...]
     reference: Array
     forced: IntArray
     grasped: IntArray
@@ -125,13 +130,13 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
     for grasp in course.system.grasps:
         grasped += [row, row + 1, row + 2]
         names += [f"{grasp.name}.{axis}" for axis in "xyz"]
-        sources += [UnknownGroup(grasp.name, "offset")] * 3
+        sources += [SmoothedUnknownGroup(grasp.name, "offset")] * 3
         reference += [limits.grasp_offset_prior_std] * 3
-        row += grasp.n_equations
+        row += grasp.n_constraint_equations
     pushed = _segment_weights(course.system, course.nominal.theta)
     for segment, weight in pushed.items():
         names += [f"{segment}.push_{axis}" for axis in "xyz"]
-        sources += [UnknownGroup(segment, "push")] * 3
+        sources += [SmoothedUnknownGroup(segment, "push")] * 3
         reference += [limits.force_prior_std * weight] * 3
     biased = []
     for k, samples in enumerate(course.episode.measurements):
@@ -139,12 +144,12 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
         if sensor.effort_joints:
             continue  # at a prescribed joint a bias and a force are the same
         for column, name in enumerate(sensor.output_names):
-            if not np.any(samples.is_used[:, column]):
+            if not np.any(samples.used_output_mask[:, column]):
                 continue
             frame = sensor.output_frames[column]
             biased.append((k, column))
             names.append(name)
-            sources.append(UnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
+            sources.append(SmoothedUnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
             reference.append(limits.bias_prior_std * float(np.nanmedian(samples.std[:, column])))
     held, biases = np.array(grasped, int), tuple(biased)
     return _SmootherUnknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), biases)
@@ -152,13 +157,13 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
 
 def _unknown_forces(
     course: _LinearizedEpisode, part: float
-) -> tuple[list[str], list[UnknownGroup], list[float], IntArray]:
+) -> tuple[list[str], list[SmoothedUnknownGroup], list[float], IntArray]:
     """Names, sources, reference sizes and coordinates of the unknown forces."""
     system, joint_names = course.system, course.system.mechanism.joint_names
     place = {joint: s.name for s in system.segment_layouts for link in s.link_joints for joint in link}
-    place |= {joint: joint for joint in robot_joints(system)}
+    place |= {joint: joint for joint in arm_joint_names(system)}
     measured = {joint for samples in course.episode.measurements for joint in samples.sensor.effort_joints}
-    silent = {joint_names[i] for i in course.system.prescribed_indices} - measured
+    silent = {joint_names[i] for i in course.system.prescribed_coordinate_indices} - measured
     names = [n for n in joint_names if n in place and n not in silent and n not in system.joint_compliances]
     forced = np.array([joint_names.index(name) for name in names], int)
     load = _loads(course)
@@ -167,7 +172,7 @@ def _unknown_forces(
         of_place.setdefault(place[name], []).append(load[index])
     largest = max((max(v) for v in of_place.values()), default=1.0)
     size = {p: part * max(float(np.sqrt(np.mean(np.square(v)))), 1e-2 * largest) for p, v in of_place.items()}
-    sources = [UnknownGroup(place[name], "force", name in measured) for name in names]
+    sources = [SmoothedUnknownGroup(place[name], "force", name in measured) for name in names]
     return names, sources, [size[place[name]] for name in names], forced
 
 
@@ -193,7 +198,10 @@ def _loads(course: _LinearizedEpisode) -> Array:
         for (index, _), stiffness, rest in zip(springs, values[::2], values[1::2], strict=True):
             load[index] = stiffness * float(np.sqrt(np.mean((q[:, index] - rest) ** 2)))
     torque = applied_joint_torque(course.problem.step, course.nominal.theta, rollout)
-    for indices, force in ((system.driven_indices, torque), (system.prescribed_indices, rollout.effort)):
+    for indices, force in (
+        (system.driven_coordinate_indices, torque),
+        (system.prescribed_coordinate_indices, rollout.effort),
+    ):
         if len(indices):
             load[list(indices)] = np.sqrt(np.mean(force**2, axis=0))
     return load
@@ -276,15 +284,15 @@ class LinearResidualModel:
     intervals: tuple[_IntervalModel, ...]
     interval_edges: Array
     unknown_names: tuple[str, ...]
-    unknown_groups: tuple[UnknownGroup, ...]
+    unknown_groups: tuple[SmoothedUnknownGroup, ...]
     reference_std: Array
     initial_state_jacobian: Array
     initial_state_std: Array
     interval_correlation: float
     torque_noise_variance: Array
 
-    def unknown_variance(self, group_variance: Mapping[UnknownGroup, float]) -> Array:
-        """Variance of every unknown from that of its group, shape (nd,) [squared reference]."""
+    def unknown_variances_from_groups(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
+        """Variances of all unknowns from those of their groups and torque noise, shape (nd,) [squared reference]."""
         return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
 
@@ -323,7 +331,7 @@ def linear_residual_models(
 # -- the slopes of single steps ---------------------------------------------------------------------------------------
 
 
-def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> AdditionalLoads:
+def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> AdditionalLoadDerivatives:
     """What unknown forces and grasp offsets of their reference size add to every step."""
     step = course.problem.step
     n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
@@ -335,11 +343,11 @@ def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Additi
     rows[unknowns.forced, np.arange(forces)] = first_share * impulse
     momentum[unknowns.forced, np.arange(forces)] = (1 - first_share) * impulse
     rows[n + nz + unknowns.grasped, np.arange(forces, loading)] = unknowns.reference[forces:loading]
-    return AdditionalLoads(rows, momentum)
+    return AdditionalLoadDerivatives(rows, momentum)
 
 
 def _steps(
-    course: _LinearizedEpisode, loads: AdditionalLoads, pushes: Array, moving: IntArray, first: int, last: int
+    course: _LinearizedEpisode, loads: AdditionalLoadDerivatives, pushes: Array, moving: IntArray, first: int, last: int
 ) -> tuple[Array, Array, Array]:
     """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps.
 
@@ -387,7 +395,7 @@ def _recording(
     linear = partial(linearized_steps, course.problem.step, course.nominal.theta, course.nominal.rollout, loads)
     ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
     moving = np.flatnonzero(active_state_mask(course.problem.step, ends))
-    slopes = ResidualSlopes.along(course.nominal).by_some_states(moving)
+    slopes = ResidualDerivativesAtNodes.along(course.nominal).select_states(moving)
     by_bias = _bias_slopes(course, unknowns)
     interval_of_row = np.clip(np.searchsorted(edges, slopes.node, side="right") - 1, 0, len(edges) - 2)
     rests = course.problem.options.initial_state != "fitted_to_points"
@@ -401,7 +409,7 @@ def _recording(
             at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - made[0][0], made[1][0], rcond=1e-6)[0]
         rows = np.flatnonzero(interval_of_row == j)
         own = factor[rows, None] * by_bias[rows]
-        state, drive, moved = _interval_response(made, slopes.some_rows(rows), int(edges[j]))
+        state, drive, moved = _interval_response(made, slopes.select_residual_rows(rows), int(edges[j]))
         moved *= factor[rows, None]
         by_unknown = np.hstack([moved[:, ns:], own])
         drive = np.pad(drive, ((0, 0), (0, own.shape[1])))
@@ -441,9 +449,9 @@ def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span:
 
 def _loose_start(course: _LinearizedEpisode) -> Array:
     """Standard deviation of a start that was fitted to points, shape (nx,)."""
-    problem, free = course.problem, np.array(course.system.free_indices, int)
+    problem, free = course.problem, np.array(course.system.unprescribed_coordinate_indices, int)
     options, joints = problem.options, course.system.mechanism.joint_names
-    inertia = mass_matrix_diagonal(problem.step, course.nominal.theta, tuple(joints[i] for i in free))
+    inertia = mass_matrix_diagonal_at_zero(problem.step, course.nominal.theta, tuple(joints[i] for i in free))
     loose = np.zeros(problem.step.sizes["nx"])
     loose[free] = options.start_configuration_std
     loose[course.system.n_coordinates + free] = options.start_velocity_std * np.abs(inertia)
@@ -451,7 +459,7 @@ def _loose_start(course: _LinearizedEpisode) -> Array:
 
 
 def _interval_response(
-    steps: tuple[Array, Array, Array], slopes: ResidualSlopes, first: int
+    steps: tuple[Array, Array, Array], slopes: ResidualDerivativesAtNodes, first: int
 ) -> tuple[Array, Array, Array]:
     """An interval's end by its beginning and by unknowns, its rows by both, from (A_k, E_k, effort's slopes)."""
     a, e, by_effort = steps
@@ -465,7 +473,7 @@ def _interval_response(
         effort[k] = by_effort[k][:, :ns] @ node[k]
         effort[k][:, ns:] += by_effort[k][:, ns:]
     effort[-1] = effort[-2]
-    return node[-1][:, :ns], node[-1][:, ns:], slopes.response(node, effort, first)
+    return node[-1][:, :ns], node[-1][:, ns:], slopes.directional_residual_derivatives(node, effort, first)
 
 
 def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Array:
@@ -473,7 +481,7 @@ def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Arr
     reference, found = unknowns.reference[unknowns.driving :], []
     group, output = np.array(unknowns.biased, int).reshape(-1, 2).T
     for k, samples in enumerate(course.episode.measurements):
-        sample, column = np.nonzero(samples.is_used)
+        sample, column = np.nonzero(samples.used_output_mask)
         own = reference * ((group == k) & (output == column[:, None]))
         found.append(samples.decorrelate(samples.weight[sample, column][:, None] * own))
     return np.concatenate(found)

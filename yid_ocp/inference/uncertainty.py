@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.null_test import (
-    DEFAULT_GAP_CRITERIA,
-    GapCriteria,
-    exceeds_noise,
-    residual_channels,
+    DEFAULT_EXCESS_RESIDUAL_CRITERIA,
+    ExcessResidualCriteria,
+    residual_channel_samples,
+    residuals_exceed_noise,
     run_null_test,
 )
 from yid_ocp.problem.estimation_problem import EstimationProblem
@@ -47,7 +47,7 @@ class GoodnessOfFit:
 
     `chi2_per_dof` is the mean square of the residual in standard deviations of the noise, NaN where there is none, and
     `p_value` the probability of one this large under noise alone; `explains` is by the null test of a diagnosis
-    (`exceeds_noise`). Data are `believed` without a grave quality issue (`ProblemOptions.data_issues`).
+    (`residuals_exceed_noise`). Data are `believed` without a grave quality issue (`ProblemOptions.data_issues`).
     """
 
     chi2_per_dof: float
@@ -76,7 +76,7 @@ class ParameterEstimate:
     interval: ConfidenceInterval | None = None
 
     @property
-    def interval_ends(self) -> tuple[float, float]:
+    def confidence_interval_ends(self) -> tuple[float, float]:
         """Both ends of the 95 % interval, infinite where there is none."""
         if self.interval is None:
             return self.value - 1.96 * self.std, self.value + 1.96 * self.std
@@ -88,7 +88,9 @@ class ParameterEstimate:
 
 
 def assess_goodness_of_fit(
-    problem: EstimationProblem, evaluation: Evaluation, limits: GapCriteria = DEFAULT_GAP_CRITERIA
+    problem: EstimationProblem,
+    evaluation: Evaluation,
+    limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> GoodnessOfFit:
     """Null test of a fit on its own recordings, with residuals in noise units whatever the weighting."""
     if not evaluation.ok:
@@ -96,37 +98,39 @@ def assess_goodness_of_fit(
     residual = evaluation.residual
     if problem.options.weighting == "paper":
         parts = [
-            ((predicted - samples.value) / samples.std)[samples.is_used]
+            ((predicted - samples.value) / samples.std)[samples.used_output_mask]
             for episode, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
             for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True)
         ]
         residual = np.concatenate(parts) if parts else np.zeros(0)
-    found = run_null_test(residual_channels(problem), residual / limits.noise_fraction, len(problem.unknown_names))
-    explains = not exceeds_noise((found,), limits)
-    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_trusted_data)
+    found = run_null_test(
+        residual_channel_samples(problem), residual / limits.noise_fraction, len(problem.unknown_names)
+    )
+    explains = not residuals_exceed_noise((found,), limits)
+    return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_no_serious_data_issues)
 
 
 # -- how sure ---------------------------------------------------------------------------------------------------------
 
 
-def covariance_and_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
+def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
     """Return the covariance of the unknowns, from data and stated priors, and chi2 per degree of freedom.
 
     Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one.
     """
     if evaluation.jacobian is None or not evaluation.ok:
         return np.full((len(problem.initial_unknowns), len(problem.initial_unknowns)), np.nan), math.nan
-    spread, chi2 = noise_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
+    spread, chi2 = unknowns_covariance_factor(problem, evaluation), _chi2_per_dof(problem, evaluation)
     return spread @ spread.T * max(1.0, chi2), chi2
 
 
-def noise_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
-    """Factor F of the covariance F F' of the unknowns under noise alone, shape (nx, nx).
+def unknowns_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
+    """Square-root factor F of the covariance F F' that noise alone gives the unknowns, shape (nx, nx).
 
     The factor keeps the digits that a covariance with uninformed directions loses.
     """
     count, scale = len(problem.initial_unknowns), problem.unknown_scales
-    _, jacobian = residual_without_weak_priors(problem, evaluation)
+    _, jacobian = linearization_without_weak_priors(problem, evaluation)
     _, singular, vectors = np.linalg.svd(jacobian * scale, full_matrices=False)
     if len(vectors) < count:
         rest = np.linalg.svd(np.eye(count) - vectors.T @ vectors)[0][:, : count - len(vectors)]
@@ -136,7 +140,7 @@ def noise_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) 
 
 def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
     """Of the data, stated priors counting as observations."""
-    residual, _ = residual_without_weak_priors(problem, evaluation)
+    residual, _ = linearization_without_weak_priors(problem, evaluation)
     data = residual[problem.residual_rows.data]
     return float(data @ data) / max(len(residual) - len(problem.initial_unknowns), 1)
 
@@ -157,7 +161,7 @@ def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluati
     if evaluation.jacobian is None or not len(covariance):
         return covariance
     scale = problem.unknown_scales
-    residual, jacobian = residual_without_weak_priors(problem, evaluation)
+    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
     jacobian = jacobian * scale
     inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
     scores = jacobian * residual[:, None]
@@ -179,7 +183,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     blocks: dict[tuple[str, int], list[IntArray]] = {}
     recordings: dict[str, list[IntArray]] = {}
     channels: list[list[IntArray]] = []
-    for series in residual_channels(problem):
+    for series in residual_channel_samples(problem):
         channels.append([series.residual_indices])
         recordings.setdefault(series.recording, []).append(series.residual_indices)
         at = (series.t / length).astype(int)
@@ -195,9 +199,9 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     return found
 
 
-def covariance_of_fit(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
+def misfit_widened_covariance(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
     """Covariance of the unknowns at a fit, widened for misfit where the model does not explain the data."""
-    covariance, _ = covariance_and_chi2(problem, evaluation)
+    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, evaluation)
     return covariance if fit.explains else _misfit_sandwich_covariance(problem, evaluation, covariance)
 
 
@@ -249,7 +253,7 @@ def std_from_covariance(covariance: Array, x: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Names and covariance of parameters for result.json: correlations of a matrix (n, n), scaled to given deviations.
+    """Names and covariance of parameters for result.json: correlations of `matrix` (n, n), deviations `std`.
 
     Those that are not finite and positive are left out: nothing is known of their parameters.
     """
@@ -265,7 +269,7 @@ def _informed_cost(problem: EstimationProblem, evaluation: Evaluation) -> float:
         0.5 * float(np.sum(evaluation.residual[rows] ** 2))
         for rows in (problem.residual_rows.weak_priors, problem.residual_rows.stated_priors)
     )
-    return (evaluation.cost - weak - stated) / problem.data_noise_unit**2 + stated
+    return (evaluation.cost - weak - stated) / problem.data_residual_noise_std**2 + stated
 
 
 # -- what may be said -------------------------------------------------------------------------------------------------
@@ -308,7 +312,7 @@ def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str
 
 
 def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval, scale: float) -> ParameterEstimate:
-    """Estimate with its profile-likelihood interval, and standard deviation and verdict consistent with it.
+    """Copy of an estimate with a profile-likelihood interval, and with std and verdict consistent with it.
 
     Open on both sides it is not_identifiable, on one side at best weak and without a ±. An end that is not met before
     a bound within `scale` is that bound. Else the wider side is two standard deviations (`verdict_by_relative_std`),
@@ -339,7 +343,7 @@ def is_std_sufficient(entry: ParameterEstimate) -> bool:
     return entry.verdict == "identifiable" and entry.std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry.value)
 
 
-def typical_parameter_sizes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
+def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
     """Plausible size of each free parameter: by its prior, its bounds, similar parameters, or its initial value.
 
     A prior counts with its standard deviation, finite bounds with half of what lies between them, the others of the
@@ -382,7 +386,7 @@ def parameter_estimates(
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else std_from_covariance(covariance, x)
-    sizes, theta = typical_parameter_sizes(problem, x), problem.split(x, 0)[0]
+    sizes, theta = typical_parameter_magnitudes(problem, x), problem.split(x, 0)[0]
     scales, (lower, upper) = problem.unknown_scales, problem.bounds
     result: dict[str, ParameterEstimate] = {}
     free = {name: problem.unknown_names.index(name) for name in parameter_unknown_names(problem)}
@@ -408,8 +412,8 @@ def parameter_estimates(
     return result
 
 
-def mark_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
-    """Estimates with the verdict not_trusted in place of any but fixed and not_identifiable."""
+def estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
+    """Copies of estimates with the verdict not_trusted, but for fixed and not identifiable parameters."""
     return {
         name: replace(entry, verdict="not_trusted") if entry.free and entry.verdict != "not_identifiable" else entry
         for name, entry in known.items()
@@ -425,7 +429,7 @@ def _one_sided_interval(value: float, std: float, side: int, slope: float) -> Co
 
 def _pull(problem: EstimationProblem, evaluation: Evaluation, at: int) -> float:
     """Size of the gradient of the cost by one unknown, in units of the noise that the misfit makes."""
-    residual, jacobian = residual_without_weak_priors(problem, evaluation)
+    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
     scale = max(1.0, _chi2_per_dof(problem, evaluation))
     return abs(float(jacobian[:, at] @ residual)) / scale
 
@@ -441,11 +445,13 @@ VERDICT_PREDICATES: Mapping[str, str] = {
     "not_trusted": "is not to be trusted",
 }
 """Sentence predicate for a parameter of each verdict."""
-VERDICT_WORDS: Mapping[str, str] = {verdict: text.removeprefix("is ") for verdict, text in VERDICT_PREDICATES.items()}
+VERDICT_TABLE_TEXTS: Mapping[str, str] = {
+    verdict: text.removeprefix("is ") for verdict, text in VERDICT_PREDICATES.items()
+}
 """Table text of each verdict."""
 
 
-def fit_message(chi2_per_dof: float | None, explains: bool) -> str:
+def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     """Sentence that tells whether a model explains its recordings, with advice where it does not."""
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "whether the model explains the recordings is not known"
@@ -456,7 +462,7 @@ def fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     return f"{said}: no number is to be trusted; run `yid-ocp diagnose`"
 
 
-def parameter_text(value: float, std: float | None, interval: tuple[float | None, float | None] | None) -> str:
+def parameter_value_text(value: float, std: float | None, interval: tuple[float | None, float | None] | None) -> str:
     """Format a value with its 95 % interval, or else its standard deviation where the data inform it."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"

@@ -7,8 +7,8 @@ a recording; encoders by v. Along a rollout the error d of its state, model less
     d_{k+1} = (A_k - B_k K_k) d_k + B_k (G_k (w_k + b) - K_k v_k)      where they are not,
 
 with the correction du_k that the tracking filter K_k added to the recorded torque, and G_k what an error of the torque
-comes to with the momentum that the filter follows (`torque_error_feedthrough`). In the first form du is known, and
-the outcome does not depend on the filter; in the second the filter is part of the model, as its reference is no
+comes to with the momentum that the filter follows (`applied_torque_error_feedthrough`). In the first form du is known,
+and the outcome does not depend on the filter; in the second the filter is part of the model, as its reference is no
 measurement. Residuals are r = H d + v, so that with the filter's prediction m of (d, w, b)
 
     innovations = S^(-1/2) (r - H m),    |innovations|^2 = r' Sigma^-1 r,
@@ -38,15 +38,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import KalmanStep, Transition, kalman_step
-from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualSlopes, nominal_trajectory
+from yid_ocp.inference.kalman import FilterStateTransition, KalmanStep, kalman_step_and_covariance
+from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualDerivativesAtNodes, nominal_trajectory
 from yid_ocp.integrator.rollout import LinearizedStep, active_state_mask, linearized_steps
 from yid_ocp.integrator.step_model import TrackingFeedback
-from yid_ocp.integrator.tracking_feedback import torque_error_feedthrough
+from yid_ocp.integrator.tracking_feedback import applied_torque_error_feedthrough
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.episode_prediction import EpisodePredictor
-from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrors
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.evaluation import ResidualWhitener
 from yid_ocp.problem.measurements import subtract_estimated_biases
 
@@ -98,7 +98,7 @@ class WhiteningFilter:
     ----------
     filter_steps : tuple
         One for every node.
-    input_errors : InputErrors
+    input_errors : InputErrorModel
         With the values of b and w about which it is linearised.
     initial_covariance : ndarray, shape (na, na)
         Of (d, w, b) before all measurements.
@@ -109,13 +109,13 @@ class WhiteningFilter:
     """
 
     filter_steps: tuple[_FilterStep, ...]
-    input_errors: InputErrors
+    input_errors: InputErrorModel
     initial_covariance: Array
     state_mask: BoolArray
     torque_bias_std: Array
 
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Normalized innovations (r, c) of the Kalman filter, and the estimate of b from all rows (nu, c) [N m].
+        """Normalized innovations (r, c) of the Kalman filter, and the torque biases from all rows (nu, c) [N m].
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class WhiteningFilter:
         return result, bias
 
     def smooth(self, rows: Array, push: Array | None) -> _SmoothedInputErrors:
-        """Smooth torque and state errors from all measurements; arguments as in `whiten` (Bryson and Frazier 1963)."""
+        """Smoothed torque and state errors given all measurements; arguments as in `whiten` (Bryson, Frazier 1963)."""
         errors, last = self.input_errors, len(self.filter_steps) - 1
         nu, ns = len(errors.torque_bias), int(np.count_nonzero(self.state_mask))
         torque = slice(ns, ns + nu)
@@ -146,7 +146,7 @@ class WhiteningFilter:
             step = self.filter_steps[k]
             if not step.holds_noise:
                 white[k + 1] = errors.torque_std**2 * costate[torque, 0]
-            noise[step.rows], costate = step.kalman.backward(noise[step.rows], costate)
+            noise[step.rows], costate = step.kalman.smooth_backward(noise[step.rows], costate)
         mean = self._expected(1) + self.initial_covariance @ costate
         white[0] = errors.torque_noise[0] + mean[torque, 0]
         error = np.zeros((last + 1, len(self.state_mask)))
@@ -176,22 +176,26 @@ class WhiteningFilter:
         return white, later
 
 
-def _build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> WhiteningFilter:
+def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) -> WhiteningFilter:
     """Build the whitening Kalman filter along a trajectory."""
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
     linear = partial(linearized_steps, step, course.theta, course.rollout)
-    slopes = ResidualSlopes.along(course)
+    slopes = ResidualDerivativesAtNodes.along(course)
     ends = [*linear(chosen=slice(0, 1)), *linear(chosen=slice(count - 1, count))]
-    live = active_state_mask(step, ends, slopes.visible_states)
+    live = active_state_mask(step, ends, slopes.visible_state_mask)
     kept = np.flatnonzero(live)
-    rows_of_node, slopes = slopes.rows_by_node(count), slopes.by_some_states(kept)
+    rows_of_node, slopes = slopes.residual_rows_by_node(count), slopes.select_states(kept)
     start = np.hstack([course.initial_state_by_angles, course.initial_state_by_torque, course.initial_state_by_torque])[
         kept
     ]
     unit = np.vstack([start, np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.torque_bias_std])
     covariance = first = unit @ unit.T
-    made, steps, momentum = [], linear(), course.model_functions.momentum_shift.momentum_by_torque(course.theta)
+    made, steps, momentum = (
+        [],
+        linear(),
+        course.model_functions.momentum_shift.momentum_derivative_by_torque(course.theta),
+    )
     for k in range(count + 1):
         fresh = k + 1 < count and errors.sample_of_step[k + 1] != errors.sample_of_step[k]
         here, rows = next(steps, None), rows_of_node[k]
@@ -204,8 +208,8 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrors) -> W
         if effort is not None:
             observe += (slopes.by_effort_before[rows] + slopes.by_effort_after[rows]) @ effort
         # another w where it is fresh, and the same b
-        transition = Transition(move, np.repeat([0.0 if fresh else 1.0, 1.0], nu))
-        kalman, covariance, _ = kalman_step(covariance, observe, transition)
+        transition = FilterStateTransition(move, np.repeat([0.0 if fresh else 1.0, 1.0], nu))
+        kalman, covariance, _ = kalman_step_and_covariance(covariance, observe, transition)
         made.append(_FilterStep(rows, kalman, by_torque))
         if shaken is not None:
             covariance[: len(kept), : len(kept)] += shaken @ shaken.T
@@ -222,7 +226,7 @@ def _error_step(
     kept: IntArray,
     feedback: TrackingFeedback | None,
     momentum: Array,
-    errors: InputErrors,
+    errors: InputErrorModel,
     k: int,
 ) -> tuple[Array, Array | None, Array | None]:
     """How (d, w, b) comes through step k: d after it (ns, na), prescribed efforts at the node before it, noise of d.
@@ -240,7 +244,7 @@ def _error_step(
         # an error of the angles that the filter follows; that of the momenta as their slope averages out
         shaken = by_error @ feedback.gain[k][:, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         # that as half the impulse of the step before does not
-        known = torque_error_feedthrough(feedback.gain[k], momentum)
+        known = applied_torque_error_feedthrough(feedback.gain[k], momentum)
         by_error, effort_by_error = by_error @ known, effort_by_error @ known
     effort = np.hstack([effort_by_state[:, kept], effort_by_error, effort_by_error]) if len(effort_by_state) else None
     return np.hstack([by_state[np.ix_(kept, kept)], by_error, by_error]), effort, shaken
@@ -249,9 +253,9 @@ def _error_step(
 # -- about an episode -------------------------------------------------------------------------------------------------
 
 
-def estimate_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ResidualWhitener) -> Array:
+def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ResidualWhitener) -> Array:
     """Constant torque error of each driven joint, estimated from all measurements of an episode, (nu,) [N m]."""
-    return whitening.whiten(_plain(episode, result)[:, None], result.torque_correction_columns)[1][:, 0]
+    return whitening.whiten(_plain(episode, result)[:, None], result.torque_correction_and_sensitivity)[1][:, 0]
 
 
 def _plain(episode: Episode, result: EpisodePrediction) -> Array:
@@ -290,20 +294,24 @@ def _about_smoothed(
     """The episode about what all measurements say of its torques and, where encoders are among them, its motion."""
     errors, feedback = episode.input_errors, episode.tracking_feedback
     assert errors is not None
-    found = before.smooth(_plain(episode, result), result.torque_correction_columns)
-    own = predictor.episode_theta(episode, theta)
+    found = before.smooth(_plain(episode, result), result.torque_correction_and_sensitivity)
+    own = predictor.theta_with_episode_values(episode, theta)
     errors = replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
     errors = _behind_effects(predictor, episode, own, errors)
     if errors.has_encoder_measurements and feedback is not None:
-        inputs = predictor.tracking_inputs(episode, own, (), result.rollout.state[0])
-        guided = inputs.corrected_feedback(feedback, predictor.system.driven_indices, episode.measured_driven_angles)
+        inputs = predictor.corrected_inputs_with_momentum_shift(episode, own, (), result.rollout.state[0])
+        guided = inputs.corrected_feedback(
+            feedback, predictor.system.driven_coordinate_indices, episode.measured_driven_angles
+        )
         assert guided is not None
         true = (result.rollout.state - found.state_error)[:-1, feedback.state_indices]
         errors = replace(errors, smoothed_reference=true - (guided.reference - feedback.reference))
     return replace(episode, input_errors=errors)
 
 
-def _behind_effects(predictor: EpisodePredictor, episode: Episode, theta: Array, errors: InputErrors) -> InputErrors:
+def _behind_effects(
+    predictor: EpisodePredictor, episode: Episode, theta: Array, errors: InputErrorModel
+) -> InputErrorModel:
     """The same errors with what of the readings is noise: by which readings are multiplied, w is divided."""
     corrections, nu = predictor.model_functions.input_corrections, errors.torque_noise.shape[1]
     read = errors.torque_noise
@@ -313,7 +321,7 @@ def _behind_effects(predictor: EpisodePredictor, episode: Episode, theta: Array,
         # a reading of which hardly anything acts says nothing of what is wrong with it
         seen = np.abs(by_reading) > _MIN_TORQUE_GAIN
         read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
-    plain = errors.with_bias_only
+    plain = errors.with_torque_bias_only
     none, without = (
         predictor.corrected_inputs(replace(episode, input_errors=own), theta, ()).torque
         for own in (plain, replace(plain, recorded_torque_noise=read))
@@ -324,7 +332,7 @@ def _behind_effects(predictor: EpisodePredictor, episode: Episode, theta: Array,
 # -- about a problem --------------------------------------------------------------------------------------------------
 
 
-def whitened_at(
+def problem_whitened_at(
     problem: EstimationProblem, x: ArrayLike, equilibrium_guesses: EquilibriumGuesses | None = None, rounds: int = 1
 ) -> EstimationProblem:
     """The same problem with residuals whitened by sensor and process noise, linearized at `x`.
@@ -346,16 +354,16 @@ def whitened_at(
     if any(m is None and e.input_errors is not None for m, e in zip(made, episodes, strict=True)):
         return problem
     found = problem.with_episodes(episodes, problem.held_out, made)
-    return found if rounds < 2 else whitened_at(found, x, equilibrium_guesses, rounds - 1)
+    return found if rounds < 2 else problem_whitened_at(found, x, equilibrium_guesses, rounds - 1)
 
 
-def held_out_whitened_at(problem: EstimationProblem, x: ArrayLike) -> EstimationProblem:
-    """The same problem with held-out residuals whitened by all noise at `x` as well, for `held_out_residual`.
+def problem_with_whitened_held_out(problem: EstimationProblem, x: ArrayLike) -> EstimationProblem:
+    """The same problem with held-out residuals whitened by all noise at `x` as well, for `whitened_held_out_residual`.
 
     A recording whose rollout fails is whitened by sensor noise alone.
     """
     x, episodes, made = np.asarray(x, float), [], []
-    for held, (episode, theta, offset) in zip(problem.held_out, problem.held_out_evaluation_points(x), strict=True):
+    for held, (episode, theta, offset) in zip(problem.held_out, problem.held_out_prediction_inputs(x), strict=True):
         own, whitening = _whitened_episode(problem.predictor, episode, (theta, offset), None, None)
         own, whitening = _whitened_episode(problem.predictor, own, (theta, offset), None, whitening)
         episodes.append(replace(held, input_errors=own.input_errors))
@@ -363,7 +371,7 @@ def held_out_whitened_at(problem: EstimationProblem, x: ArrayLike) -> Estimation
     return problem.with_episodes(problem.episodes, episodes, problem.whitening_filters, made)
 
 
-def relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
+def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
     """The same problem, its filters relinearized from the torque offsets estimated at `frozen` to those at `x`.
 
     Their weights are unchanged.
@@ -373,25 +381,27 @@ def relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Ar
     return problem.with_episodes(episodes, problem.held_out, made, problem.held_out_whitening_filters)
 
 
-def held_out_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
+def problem_with_relinearized_held_out(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
     """The same problem with held-out filters relinearized from the torque offsets at `frozen` to those at `x`."""
     before = problem.held_out_theta(frozen)
-    at = [(*own, before) for own in problem.held_out_evaluation_points(x)]
+    at = [(*own, before) for own in problem.held_out_prediction_inputs(x)]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
     return problem.with_episodes(problem.episodes, held_out, problem.whitening_filters, made)
 
 
-def whitened_by_sensor_noise(problem: EstimationProblem) -> EstimationProblem:
+def problem_whitened_by_sensor_noise(problem: EstimationProblem) -> EstimationProblem:
     """The same problem whitened by sensor noise alone, with the torque offsets estimated so far."""
-    return _with_errors(problem, lambda errors: errors.with_bias_only)
+    return _with_errors(problem, lambda errors: errors.with_torque_bias_only)
 
 
-def without_input_errors(problem: EstimationProblem) -> EstimationProblem:
+def problem_without_input_errors(problem: EstimationProblem) -> EstimationProblem:
     """The same problem with the recorded torques and angles taken as exact."""
     return _with_errors(problem, lambda errors: None)
 
 
-def _with_errors(problem: EstimationProblem, changed: Callable[[InputErrors], InputErrors | None]) -> EstimationProblem:
+def _with_errors(
+    problem: EstimationProblem, changed: Callable[[InputErrorModel], InputErrorModel | None]
+) -> EstimationProblem:
     own, held = (
         [replace(e, input_errors=e.input_errors and changed(e.input_errors)) for e in group]
         for group in (problem.episodes, problem.held_out)
@@ -399,10 +409,10 @@ def _with_errors(problem: EstimationProblem, changed: Callable[[InputErrors], In
     return problem.with_episodes(own, held)
 
 
-def estimate_torque_biases(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
+def estimate_recording_torque_biases(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
     """Estimate each recording's constant torque errors at `x`: values and standard deviations (nu,) [N m].
 
-    None where torques are taken as exact, or where no whitening filter is set (`whitened_at`).
+    None where torques are taken as exact, or where no whitening filter is set (`problem_whitened_at`).
     """
     x = np.asarray(x, float)
     found: list[tuple[Array, Array] | None] = []
@@ -412,7 +422,7 @@ def estimate_torque_biases(problem: EstimationProblem, x: ArrayLike) -> list[tup
         if whitening is None or isinstance(result, str):
             found.append(None)
         else:
-            found.append((estimate_torque_bias(episode, result, whitening), whitening.torque_bias_std))
+            found.append((estimate_episode_torque_bias(episode, result, whitening), whitening.torque_bias_std))
     return found
 
 
@@ -439,7 +449,8 @@ def _settled(
 ) -> WhiteningFilter:
     # what an effect on inputs takes from a torque, its offset no longer has to: that is known without a rollout
     now, before = (
-        predictor.corrected_inputs(episode, predictor.episode_theta(episode, t), ()).torque for t in (theta, frozen)
+        predictor.corrected_inputs(episode, predictor.theta_with_episode_values(episode, t), ()).torque
+        for t in (theta, frozen)
     )
 
     def about(offset: Array) -> WhiteningFilter:
@@ -451,13 +462,15 @@ def _settled(
         result = predictor.predict_episode(own, theta, start, False)
         if isinstance(result, str):
             break
-        made, trial = trial, about(estimate_torque_bias(own, result, trial))
+        made, trial = trial, about(estimate_episode_torque_bias(own, result, trial))
         if _apart(trial, made) < _TORQUE_BIAS_TOLERANCE:
             break
     return made
 
 
-def torque_bias_distance(some: Sequence[ResidualWhitener | None], others: Sequence[ResidualWhitener | None]) -> float:
+def max_normalized_torque_bias_difference(
+    some: Sequence[ResidualWhitener | None], others: Sequence[ResidualWhitener | None]
+) -> float:
     """Largest difference of the torque offsets of two sets of filters, in stated standard deviations."""
     pairs = zip(some, others, strict=True)
     return max((_apart(one, other) for one, other in pairs if one and other), default=0.0)

@@ -66,13 +66,13 @@ def step_functions(equations: DiscreteEquations) -> StepFunctions:
     """The CasADi functions that the stepping kernel calls.
 
     The bodies' part of the Jacobians comes as vectors per joint, from which the kernel forms the entries pair by pair
-    (`RigidBodyDerivatives`), everything else as sparse nonzeros from automatic differentiation.
+    (`RigidBodyLagrangianDerivatives`), everything else as sparse nonzeros from automatic differentiation.
     """
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
     bodies = [e.row_scale * (e.h / 2 * rigid.lagrangian_by_q + sign * rigid.lagrangian_by_v) for sign in (-1, 1)]
-    if e.closed_form_impulses is not None:
-        bodies = [part + push for part, push in zip(bodies, e.closed_form_impulses, strict=True)]
+    if e.closed_form_force_impulses is not None:
+        bodies = [part + push for part, push in zip(bodies, e.closed_form_force_impulses, strict=True)]
     balance, p1 = e.balance_remainder + e.p0 + bodies[0], e.p1_remainder + bodies[1]
     rest, rest_p, by_unknown = _rest_jacobians(e, *bodies)
     by_z = ca.jacobian(pulls.before_jacobian.T @ e.lam, e.z0)
@@ -152,7 +152,7 @@ def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[st
     """CasADi function of the sparse derivatives of (residual, p1, prescribed effort) by the named parameters."""
     e = equations
     chosen = ca.vertcat(*(e.system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
-    prescribed = list(e.system.prescribed_indices)
+    prescribed = list(e.system.prescribed_coordinate_indices)
     rows = ca.vertcat(e.momentum_balance, e.internal_residual, e.constraint_residual)
     effort = -e.momentum_balance[prescribed] / e.h
     outputs = [ca.jacobian(expression, chosen) for expression in (rows, e.p1, effort)]
@@ -160,7 +160,7 @@ def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[st
 
 
 @dataclass(frozen=True)
-class StepIndexTables:
+class StepSparsityTables:
     """Sparsity, elimination order and fill-in of a step's Jacobians, the same at every state.
 
     Attributes
@@ -184,7 +184,7 @@ class StepIndexTables:
     p1_new_columns: tuple[_Indices, ...]
 
 
-def step_index_tables(functions: StepFunctions) -> StepIndexTables:
+def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
     """The index tables of a step: sparsity, elimination order and fill-in."""
     e = functions.equations
     system = e.system
@@ -195,7 +195,7 @@ def step_index_tables(functions: StepFunctions) -> StepIndexTables:
         return nonzero_indices(functions.sparsity_patterns[key])
 
     related = np.zeros((n, n), bool)
-    ancestors = tuple(np.array(system.mechanism.ancestor_joints(j), np.int32) for j in range(n))
+    ancestors = tuple(np.array(system.mechanism.ancestor_joint_indices(j), np.int32) for j in range(n))
     for j, chain in enumerate(ancestors):
         related[j, chain] = related[chain, j] = True
     rows_new, rows_old = np.zeros((nt, nt), bool), np.zeros((nt, nqz), bool)
@@ -218,7 +218,7 @@ def step_index_tables(functions: StepFunctions) -> StepIndexTables:
     p1_new[at("after_curve")] = True
     rows_old[at("pull")] = True
 
-    free = np.array(system.free_indices, np.int32)
+    free = np.array(system.unprescribed_coordinate_indices, np.int32)
     unknown_row = np.concatenate([free, np.arange(n, nt, dtype=np.int32)]).astype(np.int32)
     nf = len(free)
     order = np.concatenate([np.arange(nf, nf + nz), np.arange(nf)[::-1], np.arange(nf + nz, nf + nz + m)])
@@ -235,16 +235,16 @@ def step_index_tables(functions: StepFunctions) -> StepIndexTables:
         return tuple(np.flatnonzero(line).astype(np.int32) for line in matrix)
 
     varying = (columns(matrix) for matrix in (rows_old, p1_old, p1_new))
-    return StepIndexTables(unknown_row, order, tuple(fill), ancestors, *varying)
+    return StepSparsityTables(unknown_row, order, tuple(fill), ancestors, *varying)
 
 
-def kernel_source(functions: StepFunctions, tables: StepIndexTables, batched: bool = False) -> str | None:
+def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:
     """C source of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables, then `kernel.c`.
 
     With `batched` for several rollouts at once, as many as `yid_simd_width` returns; then None where a function has no
     SIMD form.
     """
-    made = simd_c_source(functions.all_functions) if batched else _step_source(functions.all_functions)
+    made = _simd_c_source(functions.all_functions) if batched else _step_source(functions.all_functions)
     if made is None:
         return None
     sizes = [f"#define {name} {value}" for name, value in _kernel_sizes(functions, tables).items()]
@@ -254,7 +254,7 @@ def kernel_source(functions: StepFunctions, tables: StepIndexTables, batched: bo
     return "\n".join(parts)
 
 
-def _kernel_sizes(functions: StepFunctions, tables: StepIndexTables) -> dict[str, float]:
+def _kernel_sizes(functions: StepFunctions, tables: StepSparsityTables) -> dict[str, float]:
     e, system = functions.equations, functions.equations.system
     n, nz, m, nc = system.n_coordinates, e.z0.numel(), e.lam.numel(), len(system.prescribed)
     left, right = e.closed_form_force_shares
@@ -270,7 +270,7 @@ def _kernel_sizes(functions: StepFunctions, tables: StepIndexTables) -> dict[str
     }
 
 
-def _kernel_tables(functions: StepFunctions, tables: StepIndexTables) -> list[str]:
+def _kernel_tables(functions: StepFunctions, tables: StepSparsityTables) -> list[str]:
     system = functions.equations.system
     lines: list[str] = []
 
@@ -282,8 +282,8 @@ def _kernel_tables(functions: StepFunctions, tables: StepIndexTables) -> list[st
         table(f"{name}_start", np.concatenate([[0], np.cumsum([len(entries) // width for entries in lists])]))
         table(f"{name}_{suffix}", np.concatenate(lists) if lists else [])
 
-    table("free_index", system.free_indices)
-    table("prescribed_index", system.prescribed_indices)
+    table("free_index", system.unprescribed_coordinate_indices)
+    table("prescribed_index", system.prescribed_coordinate_indices)
     table("unknown_row", tables.unknown_rows)
     table("order", tables.elimination_order)
     ragged("ancestor", "run", [_runs(entries) for entries in tables.joint_ancestors], 2)
@@ -301,7 +301,7 @@ def _kernel_tables(functions: StepFunctions, tables: StepIndexTables) -> list[st
 def _step_source(functions: Sequence[ca.Function]) -> str:
     """C source of a step's functions: CasADi's own, but for long ones, which no compiler takes whole."""
     long = [function for function in functions if _is_long_function(function)]
-    ours = simd_c_source(long)
+    ours = _simd_c_source(long)
     if not long or ours is None:
         return casadi_c_source("step", functions)
     return "\n".join([casadi_c_source("step", [f for f in functions if not _is_long_function(f)]), ours])
@@ -375,7 +375,7 @@ def _is_long_function(function: ca.Function) -> bool:
     return int(function.n_instructions()) > _LONG_INSTRUCTION_COUNT
 
 
-def simd_c_source(functions: Sequence[ca.Function]) -> str | None:
+def _simd_c_source(functions: Sequence[ca.Function]) -> str | None:
     """SIMD C source of SX functions with CasADi's signatures; None if one uses an operation without a SIMD form.
 
     A long one is written as functions of some instructions, which hand on what later ones need in the work vector.

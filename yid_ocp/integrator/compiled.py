@@ -23,15 +23,15 @@ from yid_ocp.integrator.step_model import (
     NewtonStatus,
     Rollout,
     RolloutInputs,
-    StepLinearization,
+    StepEquationLinearizations,
     StepModel,
     TrackingFeedback,
     allocate_linearization,
-    allocate_rollout,
+    allocate_nan_rollout,
     out_of_memory_error,
     rollout_with_status,
 )
-from yid_ocp.parallel import LockedCache, batched_call, map_in_threads
+from yid_ocp.parallel import CasadiLockedCache, batched_call, map_in_threads
 
 _BATCH_COST, _BATCH_COST_PER_COLUMN = 1.7, 0.11
 """Cost of a batch in rollouts of one member, whatever its size, and the extra cost per sensitivity column."""
@@ -112,10 +112,12 @@ class CompiledKernel:
         self._model = model
         self._library = library
         self._wished = 0  # steps for which a batch would have been the better way
-        self._batched = LockedCache[None, tuple[ctypes.CDLL, int] | None](lambda _: _batched_library(model))
-        self._theta_columns = LockedCache[tuple[str, ...], _ThetaColumns](lambda x: _theta_columns(model, library, x))
+        self._batched = CasadiLockedCache[None, tuple[ctypes.CDLL, int] | None](lambda _: _batched_library(model))
+        self._theta_columns = CasadiLockedCache[tuple[str, ...], _ThetaColumns](
+            lambda x: _theta_columns(model, library, x)
+        )
 
-    def with_model(self, model: StepModel) -> CompiledKernel:
+    def with_step_model(self, model: StepModel) -> CompiledKernel:
         """A compiled kernel of the same library with another step model."""
         other = CompiledKernel(model, self._library)
         other._theta_columns, other._batched = self._theta_columns, self._batched
@@ -175,7 +177,7 @@ class CompiledKernel:
         sizes = self._model.sizes
         outs, motions, trajectories, sensitivities = [], [], [], []
         for m in members:
-            out = allocate_rollout(sizes, len(m.torque), None if m.directions is None else m.directions.count)
+            out = allocate_nan_rollout(sizes, len(m.torque), None if m.directions is None else m.directions.count)
             out.state[0] = m.initial_state
             directions = None
             if m.directions is not None and out.state_sensitivity is not None:
@@ -225,7 +227,7 @@ class CompiledKernel:
 
     def linearize(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
-    ) -> StepLinearization:
+    ) -> StepEquationLinearizations:
         """Residuals and Jacobians of many steps, evaluated in C."""
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         # in the order of the struct
@@ -241,7 +243,7 @@ class CompiledKernel:
         )
         return out
 
-    def step_jacobians(
+    def state_transition_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
         """Jacobians of single steps, solved in C."""
@@ -257,11 +259,11 @@ class CompiledKernel:
             raise np.linalg.LinAlgError(f"the equations of step {outcome.step} are singular")
         return after, effort
 
-    def find_equilibrium(
+    def find_static_equilibrium(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
         """Static equilibrium by Newton's iteration in C."""
-        nu, driven = len(held), np.array(self._model.system.driven_indices, np.int32)
+        nu, driven = len(held), np.array(self._model.system.driven_coordinate_indices, np.int32)
         hold = _filled(_Feedback, nu, driven, stiffness * np.eye(nu), _doubles(given[:nu])) if nu else None
         inputs = (_doubles(theta), _doubles(held), _doubles(given[nu:]))
         motion = _filled(_Motion, 1, EQUILIBRIUM_ITERATION_LIMIT, self._model.time_step, tolerance, *inputs, hold, None)
@@ -326,8 +328,8 @@ def _width(member: RolloutInputs) -> int:
 
 def _batched_library(model: StepModel) -> tuple[ctypes.CDLL, int] | None:
     """The kernel of a batch and how many members it takes; None where compiler or machine have no vectors for it."""
-    source = codegen.kernel_source(model.functions, model.index_tables, batched=True)
-    library = None if source is None else compiler.compile_library(source)
+    source = codegen.kernel_c_source(model.functions, model.index_tables, batched=True)
+    library = None if source is None else compiler.compiled_shared_library(source)
     count = 0 if library is None else int(library.yid_simd_width())
     return None if library is None or not count else (library, count)
 
@@ -345,7 +347,7 @@ def _theta_columns(model: StepModel, kernel: ctypes.CDLL, names: tuple[str, ...]
 
     places = [str(model.system.parameters.index(name)) for name in names]
     told = "\0".join([file_sha256(Path(codegen.__file__)), Path(kernel._name).name, *places])
-    library = compiler.compile_library(told, source)
+    library = compiler.compiled_shared_library(told, source)
     if library is None:
         raise ModelError("the compiler worked for the step but not for its derivatives", hint="set CC=none")
     function = ca.external("by_theta", library._name)

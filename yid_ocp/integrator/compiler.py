@@ -99,8 +99,8 @@ def _machine() -> str:
     return f"{version}|{platform.system()}|{processor}"
 
 
-def compile_library(source: str, make: Callable[[], str] | None = None) -> ctypes.CDLL | None:
-    """Shared library of a C source, from the cache if present; None if no compiler works.
+def compiled_shared_library(source: str, make: Callable[[], str] | None = None) -> ctypes.CDLL | None:
+    """Load the shared library of a C source, compiled or from the cache; None if no compiler works.
 
     The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version. With `make`,
     which returns the C text and is called only if the library is not in the cache, `source` is what determines it.
@@ -115,7 +115,7 @@ def compile_library(source: str, make: Callable[[], str] | None = None) -> ctype
         return None
 
 
-def compiled_function(function: ca.Function) -> ca.Function:
+def compiled_casadi_function(function: ca.Function) -> ca.Function:
     """The function compiled to C, or unchanged if no compiler works; it cannot be differentiated.
 
     Without optimisation: for functions of many operations with a total run time of seconds.
@@ -204,7 +204,7 @@ class MappedFunction:
         self.shared_inputs = frozenset(shared_inputs)
         self._inputs = [function.numel_in(i) for i in range(function.n_in())]
         self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
-        self._library = compile_library(self._source()) if use_compiler else None
+        self._library = compiled_shared_library(self._source()) if use_compiler else None
 
     def _source(self) -> str:
         name, f = self.function.name(), self.function

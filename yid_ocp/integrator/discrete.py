@@ -28,10 +28,10 @@ import casadi as ca
 from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import (
     Kinematics,
-    RigidBodyDerivatives,
+    RigidBodyLagrangianDerivatives,
     cross_product,
     forward_kinematics,
-    rigid_body_derivatives,
+    rigid_body_lagrangian_derivatives,
 )
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.system import ForceWithDerivatives, Grasp, MidpointState, System
@@ -90,7 +90,7 @@ class DiscreteEquations:
         phi(q_{k+1}) - C lam / h.
     constraint_relaxation_gain : casadi.SX or None, shape (m, 1)
         Where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint_residual`; phi(q_k) has 1 minus it.
-    rigid_body_terms : RigidBodyDerivatives
+    rigid_body_terms : RigidBodyLagrangianDerivatives
         Closed-form derivatives of the bodies' Lagrangian at the midpoint.
     balance_remainder, p1_remainder : casadi.SX, shape (n, 1)
         `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force;
@@ -122,7 +122,7 @@ class DiscreteEquations:
     constraint_residual: ca.SX
     constraint_relaxation_gain: ca.SX | None
     p1: ca.SX
-    rigid_body_terms: RigidBodyDerivatives
+    rigid_body_terms: RigidBodyLagrangianDerivatives
     balance_remainder: ca.SX
     p1_remainder: ca.SX
     closed_form_force: ForceWithDerivatives | None
@@ -138,19 +138,19 @@ class DiscreteEquations:
     @property
     def residual(self) -> ca.SX:
         """Residual of the step's unknowns: free rows of the balance, internal and constraint equations."""
-        balance = self.momentum_balance[list(self.system.free_indices), 0]
+        balance = self.momentum_balance[list(self.system.unprescribed_coordinate_indices), 0]
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
-    def closed_form_impulses(self) -> tuple[ca.SX, ca.SX] | None:
-        """Impulse of the closed force in `momentum_balance` and in `p1`, shape (n, 1) [N m s]; None without one."""
+    def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
+        """Impulses of the closed-form force in `momentum_balance` and `p1`, shape (n, 1) [N m s]; None without one."""
         if self.closed_form_force is None:
             return None
         force, (left, right) = self.closed_form_force.force, self.closed_form_force_shares
         return left * self.h * self.row_scale * force, right * self.h * self.row_scale * force
 
     @property
-    def constraint_violation(self) -> ca.SX:
+    def end_of_step_constraint_violation(self) -> ca.SX:
         """Constraint violation phi(q) - C lam / h at (q1, z1), without relaxation, shape (m, 1)."""
         if self.constraint_relaxation_gain is None:
             return self.constraint_residual
@@ -158,8 +158,8 @@ class DiscreteEquations:
 
     @property
     def unknowns(self) -> ca.SX:
-        """Unknowns of the step: free coordinates of q1, then z1, then lam."""
-        return ca.vertcat(self.q1[list(self.system.free_indices), 0], self.z1, self.lam)
+        """Symbolic unknowns of a step: free coordinates of q1, internal coordinates z1, multipliers lam."""
+        return ca.vertcat(self.q1[list(self.system.unprescribed_coordinate_indices), 0], self.z1, self.lam)
 
 
 def discrete_equations(
@@ -192,7 +192,7 @@ def discrete_equations(
     at = _Symbols.from_system(system)
     lam, h, qm, vm = at.lam, at.h, at.qm, at.vm
     kinematics = forward_kinematics(system.mechanism, qm)
-    rigid = rigid_body_derivatives(kinematics, vm, system.gravity)
+    rigid = rigid_body_lagrangian_derivatives(kinematics, vm, system.gravity)
     lagrangian, force, internal, closed = _summed_terms(system, at, kinematics)
     extra_q, extra_v = ca.gradient(lagrangian, qm), ca.gradient(lagrangian, vm)
 
@@ -223,7 +223,9 @@ def discrete_equations(
         constraint_residual=constraint,
         constraint_relaxation_gain=gain,
         p1=at.placed(p1),
-        rigid_body_terms=RigidBodyDerivatives(**{name: at.placed(value) for name, value in vars(rigid).items()}),
+        rigid_body_terms=RigidBodyLagrangianDerivatives(
+            **{name: at.placed(value) for name, value in vars(rigid).items()}
+        ),
         balance_remainder=at.placed(balance_rest),
         p1_remainder=at.placed(p1_rest),
         closed_form_force=closed,
@@ -322,7 +324,7 @@ def _constraint(system: System, at: _Symbols) -> tuple[ca.SX, ca.SX | None]:
     if relaxation is not None:
         gain = 1 + relaxation / at.h
         closure = gain * closure + (1 - gain) * phi(at.q0, at.z0)
-    return ca.densify(closure - system.constraint_compliance() * at.lam / at.h), gain
+    return ca.densify(closure - system.constraint_compliance_diagonal() * at.lam / at.h), gain
 
 
 def _constraint_pulls(system: System, at: _Symbols, middle: Kinematics, share_m: float) -> _ConstraintImpulses:
@@ -353,14 +355,14 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
             hessian[j, i] += entry
 
     for grasp in system.grasps:
-        part = lam[row : row + grasp.n_equations]
-        row += grasp.n_equations
+        part = lam[row : row + grasp.n_constraint_equations]
+        row += grasp.n_constraint_equations
         holder, held = _grasped(system, grasp, "holder"), _grasped(system, grasp, "held")
         block = ca.SX(3, n)
         for frame, sign in ((holder, 1.0), (held, -1.0)):
             jacobian = kinematics.position_jacobian(frame)
             block += sign * jacobian
-            chain = system.mechanism.ancestor_joints(frame.joint_index)
+            chain = system.mechanism.ancestor_joint_indices(frame.joint_index)
             for above, i in enumerate(chain):
                 if not turning[i]:
                     continue
@@ -376,7 +378,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
         for a, b in [(part[3 + k] * a, b) for k, pairs in enumerate(rows) for a, b in pairs]:
             turns: list[dict[int, ca.SX]] = []
             for frame, vector, other in ((holder, a, b), (held, b, a)):
-                chain = tuple(j for j in system.mechanism.ancestor_joints(frame.joint_index) if turning[j])
+                chain = tuple(j for j in system.mechanism.ancestor_joint_indices(frame.joint_index) if turning[j])
                 turns.append({j: cross_product(kinematics.joint_screws[j][:3], vector) for j in chain})
                 for above, i in enumerate(chain):
                     turned = cross_product(other, kinematics.joint_screws[i][:3])
@@ -435,7 +437,14 @@ class EquilibriumEquations:
 def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
     """The static equilibrium equations: a step from a configuration to itself with unchanged momentum."""
     system, h, nu = e.system, e.h, e.u.numel()
-    free, fixed, driven = (list(i) for i in (system.free_indices, system.prescribed_indices, system.driven_indices))
+    free, fixed, driven = (
+        list(i)
+        for i in (
+            system.unprescribed_coordinate_indices,
+            system.prescribed_coordinate_indices,
+            system.driven_coordinate_indices,
+        )
+    )
     given, sought = ca.SX.sym("given", nu + len(fixed)), ca.SX.sym("sought", len(free))
     z, force = ca.SX.sym("z", e.z0.numel()), ca.SX.sym("force", e.lam.numel())
     held, stiffness = ca.SX.sym("held", nu), ca.SX.sym("stiffness")

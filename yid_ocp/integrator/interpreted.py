@@ -24,14 +24,14 @@ from yid_ocp.integrator.step_model import (
     Rollout,
     RolloutInputs,
     SensitivityDirections,
-    StepLinearization,
+    StepEquationLinearizations,
     StepModel,
     TrackingFeedback,
     allocate_linearization,
-    allocate_rollout,
+    allocate_nan_rollout,
     rollout_with_status,
 )
-from yid_ocp.parallel import LockedCache
+from yid_ocp.parallel import CasadiLockedCache
 
 _PointEvaluator = Callable[[Array], Array]
 
@@ -45,20 +45,23 @@ class InterpretedKernel:
 
     def __init__(self, model: StepModel) -> None:
         self._model = model
-        self._functions: LockedCache[None, list[ca.Function]] = LockedCache(self._made)
-        self._rest: LockedCache[None, ca.Function] = LockedCache(self._rest_made)
+        self._functions: CasadiLockedCache[None, list[ca.Function]] = CasadiLockedCache(self._made)
+        self._rest: CasadiLockedCache[None, ca.Function] = CasadiLockedCache(self._rest_made)
         system, sizes = model.system, model.sizes
         names = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
         ends = np.cumsum([0, *(argument.numel() for argument in model.equations.arguments)])
         self._at = {name: np.arange(*ends[i : i + 2]) for i, name in enumerate(names)}
-        free, fixed = (np.array(index, int) for index in (system.free_indices, system.prescribed_indices))
+        free, fixed = (
+            np.array(index, int)
+            for index in (system.unprescribed_coordinate_indices, system.prescribed_coordinate_indices)
+        )
         self._fixed, self._coordinates = self._at["q1"][fixed], len(free) + sizes["nz"]
         self._unknown = np.concatenate([self._at["q1"][free], self._at["z1"], self._at["lam"]])
         self._rows = sizes["n"] + sizes["nz"] + sizes["m"]
         self._residual = np.concatenate([free, np.arange(sizes["n"], self._rows)])
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
-    def with_model(self, model: StepModel) -> InterpretedKernel:
+    def with_step_model(self, model: StepModel) -> InterpretedKernel:
         """An interpreted kernel of the same functions with another step model."""
         other = InterpretedKernel(model)
         other._functions, other._rest = self._functions, self._rest
@@ -70,7 +73,7 @@ class InterpretedKernel:
 
     def _made(self, _: None) -> list[ca.Function]:
         e, point = self._model.equations, ca.vertcat(*self._model.equations.arguments)
-        effort = -e.momentum_balance[list(self._model.system.prescribed_indices), 0] / e.h
+        effort = -e.momentum_balance[list(self._model.system.prescribed_coordinate_indices), 0] / e.h
         outputs = ca.cse(ca.vertcat(e.momentum_balance, e.internal_residual, e.constraint_residual, e.p1, effort))
         slope = ca.jacobian(outputs[self._residual.tolist()], e.unknowns)
         wanted = (outputs, slope, ca.jacobian(outputs, point))
@@ -132,7 +135,7 @@ class InterpretedKernel:
         theta, torque, path = inputs.theta, inputs.torque, inputs.prescribed_path
         feedback, wanted = inputs.feedback, inputs.directions
         (value, slope, slopes), n, lam = self._evaluators(), self._model.sizes["n"], np.zeros(self._model.sizes["m"])
-        out = allocate_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
+        out = allocate_nan_rollout(self._model.sizes, len(torque), None if wanted is None else wanted.count)
         state, by = out.state, [getattr(out, f"{name}_sensitivity") for name in ("state", "multipliers", "effort")]
         state[0] = inputs.initial_state
         if wanted is not None:
@@ -229,12 +232,12 @@ class InterpretedKernel:
             costate = np.concatenate([by_point[at[name]] for name in ("q0", "p0", "z0")]) + by_state[k]
             if feedback is not None:
                 np.subtract.at(costate, feedback.state_indices, feedback.gain[k].T @ by_torque[k])
-        by_path[0] = costate[list(self._model.system.prescribed_indices)]
+        by_path[0] = costate[list(self._model.system.prescribed_coordinate_indices)]
         return CostGradient(by_theta, costate, by_torque, by_path)
 
     def linearize(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
-    ) -> StepLinearization:
+    ) -> StepEquationLinearizations:
         """Residuals of len(torque) steps along a trajectory and, with `derivatives`, their Jacobians, one by one."""
         (value, _, slopes), at = self._evaluators(), self._at
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
@@ -251,7 +254,7 @@ class InterpretedKernel:
                     getattr(out, f"p1_by_{key}")[k] = jacobian[self._p1, index]
         return out
 
-    def step_jacobians(
+    def state_transition_jacobians(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
     ) -> tuple[Array, Array]:
         """Derivatives of the steps of a finished rollout by (q, p, z), torque and loads (implicit function theorem).
@@ -265,7 +268,10 @@ class InterpretedKernel:
         h = float(self._model.functions.row_scale_and_time_step(*(point[index] for index in self._at.values()))[1])
         n, nz, nx, nu, count = sizes["n"], sizes["nz"], sizes["nx"], sizes["nu"], len(torque)
         system = self._model.system
-        free, fixed = (np.array(index, int) for index in (system.free_indices, system.prescribed_indices))
+        free, fixed = (
+            np.array(index, int)
+            for index in (system.unprescribed_coordinate_indices, system.prescribed_coordinate_indices)
+        )
         found = self.linearize(theta, state, multipliers, torque, (), True)
         width = nx + nu + load_rows.shape[1]
         top, bottom = np.zeros((count, self._rows, width)), np.zeros((count, n, width))
@@ -284,7 +290,7 @@ class InterpretedKernel:
         after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
         return after, -(top[:, fixed] + found.residual_by_new[:, fixed[:, None], solved] @ moved) / h
 
-    def find_equilibrium(
+    def find_static_equilibrium(
         self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
     ) -> tuple[Array, float, bool]:
         """Solve `EquilibriumEquations` by `damped_newton`, beginning at `unknowns`, shape (ny,).
@@ -299,7 +305,7 @@ class InterpretedKernel:
 def damped_newton(
     function: Callable[[Array], Sequence[ca.DM]], w: Array, tolerance: float
 ) -> tuple[Array, float, bool]:
-    """A root, its error, and whether it is one: Newton, natural monotonicity test (Deuflhard 2011, section 3.3).
+    """Root, its error and whether converged, by damped Newton, natural monotonicity test (Deuflhard 2011, 3.3).
 
     A damped step is also accepted if it reduces the residual; `function` gives the residual and its Jacobian.
     """

@@ -61,16 +61,16 @@ class NlpStage:
 def nlp_stage(equations: DiscreteEquations, time_step: float) -> NlpStage:
     """The constraint rows of one step and their derivatives for a time step [s].
 
-    The bodies' second derivatives have a closed form (`RigidBodyDerivatives`) with a quarter of the operations of
-    automatic differentiation, which gives all others.
+    The bodies' second derivatives have a closed form (`RigidBodyLagrangianDerivatives`) with a quarter of the
+    operations of automatic differentiation, which gives all others.
     """
     e, h, system = equations, time_step, equations.system
-    free, fixed = list(system.free_indices), list(system.prescribed_indices)
+    free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
     p1 = ca.SX.sym("p1", e.p0.numel())
     x0, x1 = ca.vertcat(e.q0, e.p0, e.z0), ca.vertcat(e.q1, p1, e.z1)
     names = [f"del[{system.mechanism.joint_names[i]}]" for i in free]
     names += [f"internal[{name}]" for name in system.internal_coordinates]
-    names += [f"constraint[{name}]" for grasp in system.grasps for name in grasp.equation_names]
+    names += [f"constraint[{name}]" for grasp in system.grasps for name in grasp.constraint_equation_names]
     names += [f"p1[{name}]" for name in system.mechanism.joint_names]
     rows = ca.vertcat(e.momentum_balance[free] / h, e.internal_residual, e.constraint_residual, (p1 - e.p1) / h)
     effort = -e.momentum_balance[fixed] / e.h
@@ -104,7 +104,7 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         -1: {"q0": pulls.start_share * pulls.before_force_by_q + bent, "q1": bent},
         1: {"q0": bent, "q1": bent - pulls.midpoint_share * pulls.after_force_by_q},
     }
-    impulses = e.closed_form_impulses or (ca.SX(n, 1), ca.SX(n, 1))
+    impulses = e.closed_form_force_impulses or (ca.SX(n, 1), ca.SX(n, 1))
     found = []
     apart_and_rows = (e.balance_remainder, pulls.left_jacobian), (e.p1_remainder, pulls.right_jacobian)
     for side, impulse, (rest, rows) in zip((-1, 1), impulses, apart_and_rows, strict=True):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.step import Step, float_array_of_shape
+from yid_ocp.integrator.step import Step, checked_float_array
 from yid_ocp.integrator.step_model import CostGradient, Rollout, RolloutInputs, SensitivityDirections, TrackingFeedback
 from yid_ocp.parallel import CASADI_LOCK
 
@@ -53,15 +53,17 @@ def simulate(
     ModelError
         An array of the wrong shape.
     """
-    return simulate_batch(step, [rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)])[0]
+    return simulate_batch(
+        step, [checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)]
+    )[0]
 
 
 def simulate_batch(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
-    """Simulate several `rollout_inputs`, in batches where that is faster; equal to `simulate` but for rounding."""
+    """Simulate several `checked_rollout_inputs`, in batches where faster; equal to `simulate` but for rounding."""
     return step.kernel.rollout_batch(members)
 
 
-def rollout_inputs(
+def checked_rollout_inputs(
     step: Step,
     theta: ArrayLike,
     start: ArrayLike,
@@ -71,13 +73,13 @@ def rollout_inputs(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> RolloutInputs:
-    """The inputs of one rollout with checked shapes; arguments and errors as in `simulate`."""
-    sizes, check = step.sizes, float_array_of_shape
+    """`RolloutInputs` of one rollout, with shapes checked; arguments and errors as in `simulate`."""
+    sizes, check = step.sizes, checked_float_array
     nx, nu, nc = sizes["nx"], sizes["nu"], sizes["nc"]
     if steps < 1:
         raise ModelError(f"steps = {steps}", allowed="a whole number from 1")
     begin = check("start", start, (nx,)).copy()
-    fixed = list(step.system.prescribed_indices)
+    fixed = list(step.system.prescribed_coordinate_indices)
     inputs = np.zeros((steps, nu)) if torque is None else check("torque", torque, (steps, nu))
     course = np.tile(begin[fixed], (steps + 1, 1)) if path is None else check("path", path, (steps + 1, nc))
     begin[fixed] = course[0]
@@ -100,7 +102,7 @@ def applied_joint_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> Arra
     system, h = step.system, step.time_step
     if not system.servos:
         return rollout.torque
-    e, driven = step.equations, list(system.driven_indices)
+    e, driven = step.equations, list(system.driven_coordinate_indices)
     q = rollout.state[:, : system.n_coordinates]
     with CASADI_LOCK:
         force = ca.densify(system.input_force(e.u, e.q0, e.q1)[driven])
@@ -132,7 +134,7 @@ def adjoint_gradient(
     by_state, by_multipliers, by_effort : array_like, shape (N + 1, nx), (N, m) and (N, nc)
         Partial derivatives of the cost.
     """
-    sizes, steps, check = step.sizes, len(rollout.multipliers), float_array_of_shape
+    sizes, steps, check = step.sizes, len(rollout.multipliers), checked_float_array
     outer = check("by_state", by_state, (steps + 1, sizes["nx"]))
     last = None if by_multipliers is None else check("by_multipliers", by_multipliers, (steps, sizes["m"]))
     effort = None if by_effort is None else check("by_effort", by_effort, (steps, sizes["nc"]))
@@ -158,7 +160,7 @@ def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLik
 
 @dataclass(frozen=True)
 class LinearizedStep:
-    """Jacobians of one step by the implicit function theorem, at the applied torque.
+    """Derivatives of a step's next state and prescribed effort by state, torque and loads, at the applied torque.
 
     A_k = dx_{k+1}/dx_k (nx, nx), B_k = dx_{k+1}/du_k (nx, nu), E_k = dx_{k+1}/d(additional loads) (nx, e), and the same
     of the effort that the prescribed coordinates need at node k (nc, ...).
@@ -173,8 +175,8 @@ class LinearizedStep:
 
 
 @dataclass(frozen=True)
-class AdditionalLoads:
-    """First-order effect of e additional loads on every step: added to its equations (nt, e) and to p_{k+1} (n, e)."""
+class AdditionalLoadDerivatives:
+    """Derivatives of a step's equations (nt, e) and next momentum (n, e) by e loads, equal in all steps."""
 
     residual: Array
     next_momentum: Array
@@ -189,7 +191,7 @@ def active_state_mask(step: Step, steps: Sequence[LinearizedStep], seen: BoolArr
     by_state = np.max([np.abs(one.state_by_state) for one in steps], axis=0)
     by_input = np.max([np.abs(np.hstack([one.state_by_torque, one.state_by_load])) for one in steps], axis=0)
     moved = np.any(by_state > 0, axis=1) | np.any(by_input > 0, axis=1)
-    moved[list(step.system.prescribed_indices)] = False
+    moved[list(step.system.prescribed_coordinate_indices)] = False
     felt = np.arange(len(moved)) < 2 * step.sizes["n"]
     felt |= False if seen is None else seen
     felt |= np.any([np.any(np.abs(one.effort_by_state) > _MIN_SLOPE, axis=0) for one in steps], axis=0)
@@ -199,7 +201,11 @@ def active_state_mask(step: Step, steps: Sequence[LinearizedStep], seen: BoolArr
 
 
 def linearized_steps(
-    step: Step, theta: Array, rollout: Rollout, loads: AdditionalLoads | None = None, chosen: slice = _ALL_STEPS
+    step: Step,
+    theta: Array,
+    rollout: Rollout,
+    loads: AdditionalLoadDerivatives | None = None,
+    chosen: slice = _ALL_STEPS,
 ) -> Iterator[LinearizedStep]:
     """Iterate over the linearized steps of a finished rollout, with prescribed coordinates unchanged.
 
@@ -207,17 +213,21 @@ def linearized_steps(
     """
     sizes = step.sizes
     if loads is None:
-        loads = AdditionalLoads(np.zeros((sizes["n"] + sizes["nz"] + sizes["m"], 0)), np.zeros((sizes["n"], 0)))
+        loads = AdditionalLoadDerivatives(
+            np.zeros((sizes["n"] + sizes["nz"] + sizes["m"], 0)), np.zeros((sizes["n"], 0))
+        )
     begin, end, _ = chosen.indices(len(rollout.torque))
     for first in range(begin, end, _STEPS_PER_CHUNK):
         yield from _chunk(step, theta, rollout, loads, slice(first, min(first + _STEPS_PER_CHUNK, end)))
 
 
-def _chunk(step: Step, theta: Array, rollout: Rollout, loads: AdditionalLoads, span: slice) -> list[LinearizedStep]:
+def _chunk(
+    step: Step, theta: Array, rollout: Rollout, loads: AdditionalLoadDerivatives, span: slice
+) -> list[LinearizedStep]:
     nx, nu = step.sizes["nx"], step.sizes["nu"]
     state = rollout.state[span.start : span.stop + 1]
     along = (theta, state, rollout.multipliers[span], rollout.torque[span])
-    after, effort = step.kernel.step_jacobians(*along, loads.residual, loads.next_momentum)
+    after, effort = step.kernel.state_transition_jacobians(*along, loads.residual, loads.next_momentum)
     parts = (slice(0, nx), slice(nx, nx + nu), slice(nx + nu, after.shape[2]))
     return [
         LinearizedStep(*(a[:, part] for part in parts), *(e[:, part] for part in parts))

@@ -15,9 +15,9 @@ from yid_ocp.arrays import Array
 from yid_ocp.integrator.codegen import nonzero_indices
 from yid_ocp.integrator.discrete import EquilibriumEquations, equilibrium_equations
 from yid_ocp.integrator.interpreted import damped_newton
-from yid_ocp.integrator.step import Step, float_array_of_shape
+from yid_ocp.integrator.step import Step, checked_float_array
 from yid_ocp.model.system import System
-from yid_ocp.parallel import CASADI_LOCK, LockedCache
+from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,10 @@ class EquilibriumSolver:
     def __init__(self, step: Step) -> None:
         self.step = step
         system, e = step.system, step.equations
-        self.known_coordinates = (*system.driven_indices, *system.prescribed_indices)
-        self.free_coordinates = system.free_indices
-        self._equations = LockedCache[None, EquilibriumEquations](lambda _: equilibrium_equations(e))
-        self._inner_slopes: LockedCache[None, ca.Function] = LockedCache(
+        self.known_coordinates = (*system.driven_coordinate_indices, *system.prescribed_coordinate_indices)
+        self.free_coordinates = system.unprescribed_coordinate_indices
+        self._equations = CasadiLockedCache[None, EquilibriumEquations](lambda _: equilibrium_equations(e))
+        self._inner_slopes: CasadiLockedCache[None, ca.Function] = CasadiLockedCache(
             lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_residual_at_rest, e.theta)])
         )
         potential = system.elastic_energy(e.q0) + e.rigid_body_terms.potential_energy + _servo_energy(system, e.u, e.q0)
@@ -117,16 +117,18 @@ class EquilibriumSolver:
             `is_converged` is False, with the best point found, where Newton's iteration does not succeed.
         """
         step, system = self.step, self.step.system
-        given = float_array_of_shape("posture", posture, (len(self.known_coordinates),))
-        theta = float_array_of_shape("theta", theta, (len(system.parameters),))
+        given = checked_float_array("posture", posture, (len(self.known_coordinates),))
+        theta = checked_float_array("theta", theta, (len(system.parameters),))
         stiffness = holding_spring_stiffness(system, torque is not None)
         nu, nz = step.sizes["nu"], step.sizes["nz"]
-        held = np.zeros(nu) if torque is None else float_array_of_shape("torque", torque, (nu,))
+        held = np.zeros(nu) if torque is None else checked_float_array("torque", torque, (nu,))
         hold = _Hold(given, held, stiffness)
         count = len(self.free_coordinates) + nz
         best: tuple[bool, float, float, Array] | None = None
         for start in self._guesses(given, guess):
-            w, error, converged = step.kernel.find_equilibrium(theta, start, given, held, stiffness, _REST_TOLERANCE)
+            w, error, converged = step.kernel.find_static_equilibrium(
+                theta, start, given, held, stiffness, _REST_TOLERANCE
+            )
             inner = w[count - nz : count]
             energy = float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta))
             found = (not converged, energy if converged else error, error, w)
@@ -235,7 +237,7 @@ class EquilibriumSolver:
         step = self.step
         n, nz, m, nu = (step.sizes[key] for key in ("n", "nz", "m", "nu"))
         free, system = len(self.free_coordinates), step.system
-        driven, fixed = list(system.driven_indices), list(system.prescribed_indices)
+        driven, fixed = list(system.driven_coordinate_indices), list(system.prescribed_coordinate_indices)
         z, u = w[free : free + nz], hold.held + hold.stiffness * hold.give(q, step.system)
         none = np.zeros(n)
         h = float(step.functions.row_scale_and_time_step(q, q, none, z, z, np.zeros(m), u, theta, step.time_step)[1])
@@ -289,10 +291,10 @@ class EquilibriumSolver:
         if not system.grasps or not np.all(np.isfinite(state)):
             return text
         with CASADI_LOCK:
-            phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.constraint_violation])
+            phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], [e.end_of_step_constraint_violation])
         gap = np.array(phi(state[:n], state[2 * n :], 0, theta, step.time_step)).ravel()
         for grasp in system.grasps:
-            distance, gap = float(np.linalg.norm(gap[:3])), gap[grasp.n_equations :]
+            distance, gap = float(np.linalg.norm(gap[:3])), gap[grasp.n_constraint_equations :]
             if distance > 1e-4:
                 text += f"; grasp '{grasp.name}' is out of reach by {1e3 * distance:.3g} mm"
         return text
@@ -301,7 +303,7 @@ class EquilibriumSolver:
 def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
     """Sum of 1/2 gain (u - q)^2 over all servos [J]; their limits tell which of several equilibria is lowest as little
     as their dampers do."""
-    at = zip(system.driven, system.driven_indices, ca.vertsplit(u), strict=True) if system.servos else ()
+    at = zip(system.driven, system.driven_coordinate_indices, ca.vertsplit(u), strict=True) if system.servos else ()
     return sum((0.5 * system.servos[name].gain * (part - q[i]) ** 2 for name, i, part in at), ca.SX(0))
 
 
@@ -322,7 +324,7 @@ class _Hold:
 
     def give(self, q: Any, system: System) -> Any:
         """By how much the driven joints are away from where they should be."""
-        return self.given[: len(self.held)] - q[list(system.driven_indices)]
+        return self.given[: len(self.held)] - q[list(system.driven_coordinate_indices)]
 
 
 def _solved(matrix: Array, right: Array) -> Array:

@@ -47,7 +47,7 @@ class Step(ReprMixin):
 
     @property
     def time_step(self) -> float:
-        """h [s]."""
+        """Time step h [s]."""
         return self.model.time_step
 
     @property
@@ -142,7 +142,7 @@ class Step(ReprMixin):
         internal: ArrayLike | None,
         wanted: SensitivityDirections | None,
     ) -> Rollout:
-        sizes, check = self.sizes, float_array_of_shape
+        sizes, check = self.sizes, checked_float_array
         z0 = np.zeros(sizes["nz"]) if internal is None else check("internal", internal, (sizes["nz"],))
         start = np.concatenate([check("q0", q0, (sizes["n"],)), check("p0", p0, (sizes["n"],)), z0])
         if prescribed is None and sizes["nc"]:
@@ -152,7 +152,7 @@ class Step(ReprMixin):
         if len(ends) != 2:
             raise ModelError(f"prescribed has {len(ends)} entries", allowed="the pair (s0, s1)")
         path = np.stack([check("prescribed", s, (sizes["nc"],)) for s in ends])
-        start[list(self.system.prescribed_indices)] = path[0]
+        start[list(self.system.prescribed_coordinate_indices)] = path[0]
         torque = check("u", u, (sizes["nu"],))[None, :]
         values = check("theta", theta, (sizes["ntheta"],))
         return self.kernel.rollout(RolloutInputs(values, start, torque, path, None, wanted))
@@ -190,17 +190,17 @@ def compile_step(
         Time step not positive, unknown force split or constraint force.
     """
     model = build_step_model(system, _positive(time_step), force_split, constraint_force, tolerance)
-    source = codegen.kernel_source(model.functions, model.index_tables) if use_compiler else None
-    library = None if source is None else compiler.compile_library(source)
+    source = codegen.kernel_c_source(model.functions, model.index_tables) if use_compiler else None
+    library = None if source is None else compiler.compiled_shared_library(source)
     if library is None:
         return Step(model, InterpretedKernel(model), is_compiled=False)
     return Step(model, CompiledKernel(model, library), is_compiled=True)
 
 
-def with_time_step(step: Step, time_step: float) -> Step:
+def step_with_time_step(step: Step, time_step: float) -> Step:
     """A copy of a step with another, positive, time step [s], from the same equations and compiled code."""
     model = replace(step.model, time_step=_positive(time_step), tolerance=newton_tolerance(time_step))
-    return Step(model, step.kernel.with_model(model), step.is_compiled)
+    return Step(model, step.kernel.with_step_model(model), step.is_compiled)
 
 
 def compile_step_like(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
@@ -215,7 +215,7 @@ def _positive(time_step: float) -> float:
     return time_step
 
 
-def float_array_of_shape(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
+def checked_float_array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     """The values as a contiguous float array; `ModelError` with `name` if its shape is not `shape`."""
     array = np.ascontiguousarray(values, dtype=float)
     if array.size == 0 and 0 in shape:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ModelError, ResourceError
+from yid_ocp.errors import InsufficientMemoryError, ModelError
 from yid_ocp.integrator import codegen
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, DiscreteEquations, ForceSplit, discrete_equations
 from yid_ocp.model.system import System
@@ -20,7 +20,7 @@ from yid_ocp.model.system import System
 NEWTON_ITERATION_LIMIT = 60
 """Newton iterations of one step before it is given up."""
 EQUILIBRIUM_ITERATION_LIMIT = 100
-"""The same of an equilibrium, which is looked for from far away."""
+"""Newton iterations of a static equilibrium before it is given up."""
 
 # Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
 # RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.
@@ -37,7 +37,7 @@ class StepModel:
     system: System
     equations: DiscreteEquations
     functions: codegen.StepFunctions
-    index_tables: codegen.StepIndexTables
+    index_tables: codegen.StepSparsityTables
     sizes: dict[str, int]
     time_step: float
     tolerance: float
@@ -57,7 +57,7 @@ def build_step_model(
     sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}
     sizes |= {"nx": 2 * n + nz, "ntheta": e.theta.numel()}
     tables, limit = (
-        codegen.step_index_tables(functions),
+        codegen.step_sparsity_tables(functions),
         newton_tolerance(time_step) if tolerance is None else tolerance,
     )
     return StepModel(system, e, functions, tables, sizes, float(time_step), limit)
@@ -138,7 +138,7 @@ class StepStatus:
 
 @dataclass(frozen=True)
 class SensitivityDirections:
-    """Directions of the forward sensitivities of a rollout: d columns, the first ones the named parameters.
+    """The d directions in which a rollout is differentiated: named parameters first, then states and inputs.
 
     Attributes
     ----------
@@ -248,7 +248,7 @@ class CostGradient:
 
 
 @dataclass(frozen=True)
-class StepLinearization:
+class StepEquationLinearizations:
     """Residuals and Jacobians of the equations of many steps, at a trajectory that need not satisfy them.
 
     Attributes
@@ -277,7 +277,7 @@ class StepLinearization:
     p1_by_theta: Array
 
 
-def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
+def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
     """A rollout filled with NaN, with `count` directions or none, for a kernel to write into."""
     shapes: dict[str, tuple[int, ...]] = {"state": (steps + 1, sizes["nx"]), "multipliers": (steps, sizes["m"])}
     shapes |= {"effort": (steps, sizes["nc"]), "torque": (steps, sizes["nu"])}
@@ -289,14 +289,16 @@ def allocate_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Ro
     return Rollout(**values, status=StepStatus(NewtonStatus.OK, 0, 0.0, 0, 0))
 
 
-def allocate_linearization(sizes: dict[str, int], count: int, width: int, derivatives: bool) -> StepLinearization:
+def allocate_linearization(
+    sizes: dict[str, int], count: int, width: int, derivatives: bool
+) -> StepEquationLinearizations:
     """A linearization of `count` steps and `width` parameters filled with zeros; no Jacobians without `derivatives`."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
     shapes: dict[str, tuple[int, ...]] = {"residual": (count, nt), "p1": (count, n)}
     for name, columns in {"new": nt, "old": n + nz, "input": nu, "theta": width}.items():
         shapes |= {f"residual_by_{name}": (steps, nt, columns), f"p1_by_{name}": (steps, n, columns)}
-    return StepLinearization(**_arrays(f"the derivatives of {count} steps", shapes, 0.0))
+    return StepEquationLinearizations(**_arrays(f"the derivatives of {count} steps", shapes, 0.0))
 
 
 def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> dict[str, Array]:
@@ -306,10 +308,10 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> d
         raise out_of_memory_error(what, 8 * sum(math.prod(shape) for shape in shapes.values())) from error
 
 
-def out_of_memory_error(what: str, size: int) -> ResourceError:
-    """The `ResourceError` to raise when `size` bytes for `what` cannot be allocated."""
+def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
+    """The `InsufficientMemoryError` to raise when `size` bytes for `what` cannot be allocated."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
-    return ResourceError(
+    return InsufficientMemoryError(
         f"{_STATUS_MESSAGES[NewtonStatus.OUT_OF_MEMORY]} for {what}: it takes {amount}",
         hint="estimate fewer parameters at once, use a shorter part of the recording, or close other programs",
     )

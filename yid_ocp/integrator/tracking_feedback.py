@@ -19,7 +19,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.integrator.step_model import NEWTON_ITERATION_LIMIT, TrackingFeedback
-from yid_ocp.parallel import LockedCache
+from yid_ocp.parallel import CasadiLockedCache
 
 _Wanted = Sequence[tuple[int, int]]  # a column of derivatives, and which of the parameters it is by
 _NEWTON_ITERATIONS = 5  # for a law of an internal coordinate that is nonlinear in its next value
@@ -42,7 +42,7 @@ def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> 
         raise ModelError(f"a tracking gain is negative: {values.min():g} N m/rad", allowed="0 or more")
     steps = len(reference) - 1
     gain = np.broadcast_to(np.diag(values), (steps, nu, nu)).copy()
-    return TrackingFeedback(np.array(step.system.driven_indices, np.int32), gain, reference[:-1])
+    return TrackingFeedback(np.array(step.system.driven_coordinate_indices, np.int32), gain, reference[:-1])
 
 
 def lqr_feedback(
@@ -66,7 +66,7 @@ def lqr_feedback(
     torque : array_like, shape (N, nu)
         Measured torques [N m].
     arms : Step, optional
-        From `arms_only_step`; made when absent.
+        From `driven_joints_only_step`; made when absent.
 
     References
     ----------
@@ -74,7 +74,7 @@ def lqr_feedback(
     """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system
-    arm_step = arms_only_step(step) if arms is None else arms
+    arm_step = driven_joints_only_step(step) if arms is None else arms
     values = dict(zip(system.parameters.names, np.asarray(theta, float), strict=True))
     parameters = arm_step.system.parameters
     arm_theta = parameters.vector({name: values[name] for name in parameters.names})
@@ -98,12 +98,12 @@ def lqr_feedback(
         cost = stage + closed.T @ cost @ closed + gain[k].T @ weight_u @ gain[k]
         cost = 0.5 * (cost + cost.T)
     n = system.n_coordinates
-    index = np.concatenate([np.array(system.driven_indices), n + np.array(system.driven_indices)])
+    index = np.concatenate([np.array(system.driven_coordinate_indices), n + np.array(system.driven_coordinate_indices)])
     return TrackingFeedback(index.astype(np.int32), gain, np.hstack([reference[:-1], momenta[:-1]]))
 
 
-def arms_only_step(step: Step) -> Step:
-    """The step of a system of the driven joints only, without the object and everything else.
+def driven_joints_only_step(step: Step) -> Step:
+    """Step of the driven joints alone, without the object, grasps, prescribed joints and effects.
 
     `ModelError` where the driven joints do not come first in the configuration.
     """
@@ -188,7 +188,7 @@ class DrivenJointMotion:
         return _one_before(self.angles[:-1]), self.angles[:-1]
 
 
-class MomentumShift:
+class EffectMomentumShift:
     """Difference between the momentum of a motion with effects and that of the recorded motion without them.
 
     `lqr_feedback` computes its reference once, from recorded angles and torques without effects. With a torque other
@@ -200,7 +200,7 @@ class MomentumShift:
 
     def __init__(self, step: Step) -> None:
         e, system = step.equations, step.system
-        driven = list(system.driven_indices)
+        driven = list(system.driven_coordinate_indices)
         nu = len(driven)
         before, now = ca.SX.sym("before", nu), ca.SX.sym("now", nu)
         whole = []
@@ -233,7 +233,7 @@ class MomentumShift:
             function = ca.Function("momentum", inputs, [momentum, ca.densify(by_theta), *slopes])
             return MappedFunction(function, shared_inputs=(5, 6), use_compiler=step.is_compiled)
 
-        self._maps: LockedCache[bool, MappedFunction] = LockedCache(compiled)
+        self._maps: CasadiLockedCache[bool, MappedFunction] = CasadiLockedCache(compiled)
         self._impulse = ca.Function("impulse", inputs, [ca.densify(ca.jacobian(momentum, e.u))])
         at_row = {name: row for row, name in enumerate(system.internal_coordinates)}
         symbols = [before, now, last, then, e.theta, e.time_step]
@@ -244,12 +244,12 @@ class MomentumShift:
             if rows:
                 self._memories.append((own, _Memory(step, symbols, law, rows, columns)))
 
-    def momentum_by_torque(self, theta: Array) -> Array:
+    def momentum_derivative_by_torque(self, theta: Array) -> Array:
         """Derivative of the momentum by the torques of the previous step, shape (nu, nu) [s]."""
         arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
         return np.array(self._impulse(*arguments, theta, self._time_step))
 
-    def shift_and_derivatives(
+    def momentum_shift_and_derivatives(
         self, recorded: DrivenJointMotion, true: DrivenJointMotion, theta: Array, names: Sequence[str]
     ) -> tuple[Array, Array]:
         """Momentum with effects minus recorded, at every node but the last, (N, nu), and its derivatives, (N, nu, d).
@@ -280,7 +280,7 @@ class MomentumShift:
             total += by_all[2] @ _one_before(by_z) + by_all[3] @ by_z
         if true.torque_sensitivity is not None:
             pushed = true.torque_sensitivity
-            total[:, :, : pushed.shape[2]] += self.momentum_by_torque(theta) @ _one_before(pushed)
+            total[:, :, : pushed.shape[2]] += self.momentum_derivative_by_torque(theta) @ _one_before(pushed)
         return (value - plain)[:, :, 0], total
 
     def _remembered(
@@ -309,11 +309,11 @@ class MomentumShift:
         return not set(names).isdisjoint(self.parameter_names) or bool(np.any(theta[self._columns] != self._neutral))
 
 
-def torque_error_feedthrough(gain: Array, by_torque: Array) -> Array:
+def applied_torque_error_feedthrough(gain: Array, by_torque: Array) -> Array:
     """Derivative of the applied torque by an error of the recorded torque, feedback included, (nu, nu).
 
     The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
-    `gain` (nu, nb) is that of one step, `by_torque` is `MomentumShift.momentum_by_torque`.
+    `gain` (nu, nb) is that of one step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_torque`.
     """
     nu = len(by_torque)
     return np.eye(nu) + gain[:, nu:] @ by_torque if gain.shape[1] > nu else np.eye(nu)
@@ -335,11 +335,11 @@ class _Memory:
             after = after - ca.solve(by_new, row)
         by_theta = ca.jacobian(after, theta)[:, columns]
         advance = ca.Function("remembered", [old, before, now, theta, symbol], [after])
-        self._many: LockedCache[int, ca.Function] = LockedCache(advance.mapaccum)
+        self._many: CasadiLockedCache[int, ca.Function] = CasadiLockedCache(advance.mapaccum)
         outputs = [ca.densify(x) for x in (*(ca.jacobian(after, x) for x in (old, before, now)), by_theta)]
         function = ca.Function("remembering", [old, before, now, theta, symbol], outputs)
         compiled = step.is_compiled
-        self._maps = LockedCache[None, MappedFunction](lambda _: MappedFunction(function, (3, 4), compiled))
+        self._maps = CasadiLockedCache[None, MappedFunction](lambda _: MappedFunction(function, (3, 4), compiled))
 
     def along(self, motion: DrivenJointMotion, start: Array, theta: Array) -> Array:
         """Values at every node but the last, shape (N, k)."""

@@ -16,9 +16,9 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, LinkChain, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import axis_angle_rotation, snap_to_unit_entries
+from yid_ocp.model.rotations import rotation_from_axis_sin_cos, snap_near_integer_entries
 
-UNIT_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+AXIS_UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -216,7 +216,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
         squares = ca.vertcat(slender + square_y, slender + square_x, square_x + square_y)
         share = mass * shares[i]
         body = Inertia(share, along / 2, ca.diag(squares) * share, gravity_fraction)
-        turn = np.eye(3) if rotation is None else snap_to_unit_entries(np.asarray(rotation, float))
+        turn = np.eye(3) if rotation is None else snap_near_integer_entries(np.asarray(rotation, float))
         parent, placement = (
             carrier.joint_index,
             carrier.placement @ Placement(ca.SX(ca.DM(turn)), ca.SX(ca.DM.zeros(3))),
@@ -229,7 +229,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
         links.append(tuple(f"{segment.name}_{i}_{axis}" for axis in segment.joint_axes))
         for name, axis in zip(links[-1], segment.joint_axes, strict=True):
             bodies = (body,) if name == links[-1][-1] else ()
-            parts.joints.append(Joint(name, "revolute", parent, placement, UNIT_AXES[axis], bodies))
+            parts.joints.append(Joint(name, "revolute", parent, placement, AXIS_UNIT_VECTORS[axis], bodies))
             parent, placement = len(parts.joints) - 1, Placement.identity()
             kind: Literal["bend", "twist"] = "twist" if axis == "z" else "bend"
             damping = own.get("twist_damping", own["damping"]) if kind == "twist" else own["damping"]
@@ -243,8 +243,8 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
     parts.layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, radius, mass, segment.parent)
 
 
-def polyline_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
-    """Rotation from each edge's frame to the next one's by the smallest angle (no twist), one (3, 3) for every edge.
+def parallel_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
+    """Twist-free rotation of each edge's frame against that of the edge before, a list of one (3, 3) per edge.
 
     They are what `Segment.rest_rotation` and `Segment.link_rest_rotations` take.
 
@@ -280,7 +280,7 @@ def _shortest_turn(direction: Array) -> Array:
     sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
     if sine < 1e-12:
         return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    return axis_angle_rotation(axis / sine, sine, cosine)
+    return rotation_from_axis_sin_cos(axis / sine, sine, cosine)
 
 
 def _length_shares(segment: Segment) -> tuple[float, ...]:
@@ -352,5 +352,5 @@ def _check(segment: Segment, known: Mapping[str, SegmentLayout]) -> None:
         refuse(f"{len(turns)} link rotations for {count} links", f"{count - 1}")
     if at is not None and parent is not None and not 0 <= at < (links := len(known[parent].link_joints)):
         refuse(f"parent_link_index = {at}", f"0 to {links - 1}")
-    if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(UNIT_AXES):
+    if not axes or len(set(axes)) < len(axes) or not set(axes) <= set(AXIS_UNIT_VECTORS):
         refuse(f"joint_axes = '{axes}'", "letters of x, y, z, each at most once")

@@ -2,7 +2,7 @@
 
 A spatial velocity is (angular, linear of the body point now at the world origin), a wrench (moment about the world
 origin, force); with both in one fixed frame the derivatives of the Lagrangian take the closed forms given at
-`RigidBodyDerivatives`, which is what makes the compiled step cheap.
+`RigidBodyLagrangianDerivatives`, which is what makes the compiled step cheap.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 
 from yid_ocp.model.mechanism import Frame, Inertia, Mechanism, Placement
-from yid_ocp.model.rotations import symbolic_axis_rotation
+from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class Kinematics:
 
     def _columns(self, frame: str | Frame, column: Callable[[ca.SX], ca.SX]) -> ca.SX:
         columns = [ca.SX(3, 1)] * len(self.joint_screws)
-        for j in self.mechanism.ancestor_joints(self._frame(frame).joint_index):
+        for j in self.mechanism.ancestor_joint_indices(self._frame(frame).joint_index):
             columns[j] = column(self.joint_screws[j])
         return ca.horzcat(ca.SX(3, 0), *columns)
 
 
 @dataclass(frozen=True)
-class RigidBodyDerivatives:
+class RigidBodyLagrangianDerivatives:
     """First derivatives of the rigid-body Lagrangian at (q, v), and the vectors of its second derivatives.
 
     With S_j the screw of joint j, D_j = V_parent(j) x S_j, Ic_j and H_j the inertia and momentum of all that j moves:
@@ -127,7 +127,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
             rotation = rotations[joint.parent_index] @ rotation
         axis = rotation @ ca.SX(ca.DM(joint.axis))
         if joint.kind == "revolute":
-            rotations.append(rotation @ symbolic_axis_rotation(joint.axis, q[j]))
+            rotations.append(rotation @ symbolic_rotation_from_axis_angle(joint.axis, q[j]))
             screws.append(ca.vertcat(axis, cross_product(origin, axis)))
         else:
             origin = origin + axis * q[j]
@@ -137,7 +137,9 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
     return Kinematics(mechanism, tuple(rotations), tuple(origins), tuple(screws))
 
 
-def rigid_body_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> RigidBodyDerivatives:
+def rigid_body_lagrangian_derivatives(
+    kinematics: Kinematics, v: ca.SX, gravity: ca.SX
+) -> RigidBodyLagrangianDerivatives:
     """Energies and first derivatives of the Lagrangian of a mechanism's bodies.
 
     `v` is the velocity, shape (n, 1) [rad/s or m/s], `gravity` that of the world frame, shape (3, 1) [m/s^2].
@@ -169,7 +171,7 @@ def rigid_body_derivatives(kinematics: Kinematics, v: ca.SX, gravity: ca.SX) -> 
 
     gradients = [ca.densify(ca.vertcat(ca.SX(0, 1), *entries)) for entries in (by_q, by_v)]
     vectors = [columns(entries, rows) for entries, rows in ((S, 6), (D, 6), (F, 6), (B, 6), (G, 3))]
-    return RigidBodyDerivatives(*[*gradients, kinetic, potential, *vectors])
+    return RigidBodyLagrangianDerivatives(*[*gradients, kinetic, potential, *vectors])
 
 
 @dataclass
@@ -224,13 +226,15 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
     return moved, kinetic, potential
 
 
-def mass_matrix(rigid: RigidBodyDerivatives, mechanism: Mechanism) -> ca.SX:
-    """M = L_vv of the bodies, shape (n, n), from the closed form of `RigidBodyDerivatives`."""
+def mass_matrix(rigid: RigidBodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
+    """M = L_vv of the bodies, shape (n, n), from the closed form of `RigidBodyLagrangianDerivatives`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 
-def lagrangian_second_derivatives(rigid: RigidBodyDerivatives, mechanism: Mechanism) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """(L_qq, L_qv, L_vv) of the bodies, each (n, n), from `RigidBodyDerivatives`; L_qv[row q, column v]."""
+def lagrangian_second_derivatives(
+    rigid: RigidBodyLagrangianDerivatives, mechanism: Mechanism
+) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """(L_qq, L_qv, L_vv) of the bodies, each (n, n), from `RigidBodyLagrangianDerivatives`; L_qv[row q, column v]."""
     S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G
     by_qq = _from_pairs(mechanism, lambda i, j: (_dot(D, i, B, j) + _dot(S[:3, :], i, G, j),) * 2)
     by_qv = _from_pairs(mechanism, lambda i, j: (_dot(D, i, F, j), _dot(S, i, B, j)))
@@ -246,7 +250,7 @@ def _from_pairs(mechanism: Mechanism, entry: Callable[[int, int], tuple[ca.SX, c
     n = len(mechanism.joints)
     matrix = ca.SX(n, n)
     for j in range(n):
-        for i in mechanism.ancestor_joints(j):
+        for i in mechanism.ancestor_joint_indices(j):
             upper, lower = entry(i, j)
             matrix[j, i], matrix[i, j] = lower, upper  # on the diagonal the upper one stays
     return matrix

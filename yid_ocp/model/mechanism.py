@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.parameters import Parameters
-from yid_ocp.model.rotations import snap_to_unit_entries
+from yid_ocp.model.rotations import snap_near_integer_entries
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Placement:
     @staticmethod
     def from_matrix(matrix: ArrayLike) -> Placement:
         """Placement from a numeric 4x4 homogeneous matrix."""
-        array = snap_to_unit_entries(np.asarray(matrix, dtype=float))
+        array = snap_near_integer_entries(np.asarray(matrix, dtype=float))
         return Placement(ca.SX(ca.DM(array[:3, :3])), ca.SX(ca.DM(array[:3, 3])))
 
     @staticmethod
@@ -62,7 +62,7 @@ class Inertia:
 
     @staticmethod
     def from_values(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
-        """Inertia from numbers."""
+        """Inertia from a numeric mass [kg], centre of mass [m] and inertia about it [kg m^2]."""
         return Inertia(ca.SX(mass), ca.SX(ca.DM(np.asarray(com, float))), ca.SX(ca.DM(np.asarray(about_com, float))))
 
     def scaled_by(self, factor: ca.SX) -> Inertia:
@@ -212,7 +212,7 @@ class Mechanism(ReprMixin):
         end = self.frames[tip]
         return Frame(end.joint_index, Placement(end.placement.rotation, part * end.placement.translation))
 
-    def ancestor_joints(self, index: int) -> tuple[int, ...]:
+    def ancestor_joint_indices(self, index: int) -> tuple[int, ...]:
         """Indices of the joints from the root to joint `index`, itself included; empty for the world."""
         chain = []
         while index >= 0:
@@ -220,7 +220,7 @@ class Mechanism(ReprMixin):
             index = self.joints[index].parent_index
         return tuple(reversed(chain))
 
-    def with_mechanism(
+    def with_attached_mechanism(
         self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None
     ) -> Mechanism:
         """This mechanism with another one, of other joint and frame names, attached to one of its frames.
@@ -249,7 +249,7 @@ class Mechanism(ReprMixin):
         name = f"{self.name}+{other.name}" if self.joints else other.name
         return Mechanism(name, tuple(joints), {**self.frames, **added}, both, chains)
 
-    def with_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
+    def with_added_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
         """The mechanism with one additional frame, at a pose (4, 4) in the one it is fixed to (the world for None)."""
         if name in self.frames:
             raise ModelError(f"there is a frame '{name}' already", where=self.name)

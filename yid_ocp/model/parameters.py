@@ -108,7 +108,7 @@ class Parameters(ReprMixin):
             theta[self.index(name)] = value
         return theta
 
-    def with_values(self, values: Mapping[str, float]) -> Parameters:
+    def with_nominal_values(self, values: Mapping[str, float]) -> Parameters:
         """The same parameters (and symbols) with other nominal values."""
         changed = list(self._entries)
         for name, value in values.items():

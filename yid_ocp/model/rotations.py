@@ -15,7 +15,7 @@ from yid_ocp.arrays import Array
 _SNAP_TOLERANCE = 1e-11
 
 
-def snap_to_unit_entries(matrix: Array) -> Array:
+def snap_near_integer_entries(matrix: Array) -> Array:
     """The matrix with entries within `_SNAP_TOLERANCE` of -1, 0 and 1 replaced by these numbers."""
     result = np.array(matrix, dtype=float)
     for exact in (-1.0, 0.0, 1.0):
@@ -47,13 +47,13 @@ def rpy_from_rotation(rotation: Array) -> tuple[float, float, float]:
     return math.atan2(s * rotation[0, 2] - c * rotation[1, 2], c * rotation[1, 1] - s * rotation[0, 1]), pitch, yaw
 
 
-def axis_angle_rotation(axis: ArrayLike, sine: float, cosine: float) -> Array:
+def rotation_from_axis_sin_cos(axis: ArrayLike, sine: float, cosine: float) -> Array:
     """Rotation matrix about a unit axis, from the sine and cosine of the angle (Rodrigues' formula)."""
     skew = _skew(np.asarray(axis, float))
     return np.eye(3) + sine * skew + (1 - cosine) * skew @ skew
 
 
-def symbolic_axis_rotation(axis: Sequence[float], angle: ca.SX) -> ca.SX:
+def symbolic_rotation_from_axis_angle(axis: Sequence[float], angle: ca.SX) -> ca.SX:
     """Rotation matrix about a numeric unit axis by a symbolic angle [rad], shape (3, 3)."""
     c, s = ca.cos(angle), ca.sin(angle)
     for k in range(3):
@@ -70,8 +70,10 @@ def symbolic_axis_rotation(axis: Sequence[float], angle: ca.SX) -> ca.SX:
 
 def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
     """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of symbolic angles [rad], shape (3, 3); without yaw Ry Rx."""
-    turned = symbolic_axis_rotation((0.0, 1.0, 0.0), pitch) @ symbolic_axis_rotation((1.0, 0.0, 0.0), roll)
-    return ca.densify(turned if yaw is None else symbolic_axis_rotation((0.0, 0.0, 1.0), yaw) @ turned)
+    turned = symbolic_rotation_from_axis_angle((0.0, 1.0, 0.0), pitch) @ symbolic_rotation_from_axis_angle(
+        (1.0, 0.0, 0.0), roll
+    )
+    return ca.densify(turned if yaw is None else symbolic_rotation_from_axis_angle((0.0, 0.0, 1.0), yaw) @ turned)
 
 
 def _skew(u: Array) -> Array:

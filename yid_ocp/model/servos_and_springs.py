@@ -13,9 +13,9 @@ from yid_ocp.model.mechanism import Joint, Mechanism
 from yid_ocp.model.parameters import Parameter
 
 CommandInterpolation = Literal["held", "interpolated"]
-TORQUE_LIMIT_POWER = 16
+TORQUE_SATURATION_EXPONENT = 16
 """Exponent p of a servo's smooth torque limit, demand / (1 + |demand/limit|^p)^(1/p)."""
-UNLIMITED_EFFORT = 2e4
+UNLIMITED_EFFORT_THRESHOLD = 2e4
 """Effort limits from this value on mean that there is none [N m or N]."""
 _DEFAULT_FULL_TORQUE_ERROR = 0.05  # at which a servo of unknown gain reaches its torque limit [rad or m]
 _DEFAULT_GAIN = 50.0  # of a servo without an effort limit [N m/rad or N/m]
@@ -45,7 +45,7 @@ class PositionServo:
 
         demand = gain (u(t - delay) - q) - damping dq/dt       torque = demand / (1 + tightness demand^p)^(1/p)
 
-    with p = `TORQUE_LIMIT_POWER` and tightness = limit^-p, to which further limits add.
+    with p = `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, to which further limits add.
 
     Attributes
     ----------
@@ -62,11 +62,13 @@ class PositionServo:
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
         """The servo's torque for a command, a coordinate and its rate [N m or N]."""
         demand = self.gain * (command - q) - self.damping * v
-        return demand / (1 + self.torque_limit_tightness * demand**TORQUE_LIMIT_POWER) ** (1 / TORQUE_LIMIT_POWER)
+        return demand / (1 + self.torque_limit_tightness * demand**TORQUE_SATURATION_EXPONENT) ** (
+            1 / TORQUE_SATURATION_EXPONENT
+        )
 
     @property
     def coefficients(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """Gain, damping, delay and tightness."""
+        """Gain, damping, command delay and torque limit tightness (limit^-p)."""
         return self.gain, self.damping, self.command_delay, self.torque_limit_tightness
 
     def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> PositionServo:
@@ -107,14 +109,14 @@ def build_joint_servos(
         at = tree.joints[tree.joint_index(joint)]
         own = _servo_parameters(at)
         gain, damping, delay, limit = (entry.symbol for entry in own)
-        servos[joint] = PositionServo(gain, damping, delay, limit**-TORQUE_LIMIT_POWER, commands)
+        servos[joint] = PositionServo(gain, damping, delay, limit**-TORQUE_SATURATION_EXPONENT, commands)
         entries += own
     return servos, entries
 
 
 def _servo_parameters(joint: Joint) -> list[Parameter]:
-    known = 0 < joint.effort_limit < UNLIMITED_EFFORT
-    limit = joint.effort_limit if known else UNLIMITED_EFFORT
+    known = 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD
+    limit = joint.effort_limit if known else UNLIMITED_EFFORT_THRESHOLD
     gain = limit / _DEFAULT_FULL_TORQUE_ERROR if known else _DEFAULT_GAIN
     torque, per = ("N m", "N m/rad") if joint.coordinate_unit == "rad" else ("N", "N/m")
     rate = per.replace("/", " s/")

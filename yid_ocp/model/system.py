@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ModelError
-from yid_ocp.model.flexible import UNIT_AXES, ElasticJoint, FlexibleObject, SegmentLayout, find_segment_layout
+from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout, find_segment_layout
 from yid_ocp.model.kinematics import Kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameters
@@ -70,12 +70,12 @@ class Grasp:
     relaxation_time: ca.SX | None = None
 
     @property
-    def n_equations(self) -> int:
+    def n_constraint_equations(self) -> int:
         """Number of scalar constraint equations."""
         return len(_GRASP_EQUATION_NAMES[self.kind])
 
     @property
-    def equation_names(self) -> tuple[str, ...]:
+    def constraint_equation_names(self) -> tuple[str, ...]:
         """Names of the equations: `left.x`, ..., then tilts or rotations."""
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
@@ -102,7 +102,7 @@ class Grasp:
             rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))))
         return ca.vertcat(*rows)
 
-    def axis_misalignment(self, kinematics: Kinematics) -> ca.SX:
+    def aligned_axis_differences(self, kinematics: Kinematics) -> ca.SX:
         """Differences between the axes that the grasp aligns, shape (0, 3 or 9; 1).
 
         Beside `constraint_residual` redundant, but not zero where axes are opposite: for a search that starts far off.
@@ -182,8 +182,8 @@ class NodeState:
 class ForceWithDerivatives:
     """A dissipative generalized force F(q, v) of wrenches on bodies, shape (n, 1) [N m or N], and its derivatives.
 
-    With S_j and D_j as in `RigidBodyDerivatives` and the columns of A and T, shape (6, n), for i an ancestor of joint j
-    or j itself:
+    With S_j and D_j as in `RigidBodyLagrangianDerivatives` and the columns of A and T, shape (6, n), for i an ancestor
+    of joint j or j itself:
 
         dF_j/dv_i = dF_i/dv_j = S_i . A_j       dF_j/dq_i = D_i . A_j       dF_i/dq_j = S_i . T_j
     """
@@ -263,13 +263,13 @@ class RecordingErrorEffect(Effect, Protocol):
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """The true value for a recorded `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
 
-    def added_delay(self, channel: str, camera: bool) -> ca.SX:
+    def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """How long before its recorded time a sample was true [s]; `channel` as in `distorted_reading`.
 
         A recorded torque that drives the model is `torque.JOINT`: it acts so much later than it was recorded.
         """
 
-    def lag_time_constant(self, channel: str) -> ca.SX:
+    def channel_lag_time_constant(self, channel: str) -> ca.SX:
         """Time constant of a `torque.JOINT` behind its record, or of `joints.effort.JOINT` behind the true one [s]."""
 
 
@@ -380,7 +380,7 @@ class System(ReprMixin):
         tree = without_gravity(tree) if servos is not None and servos.has_gravity_compensation else tree
         segments: list[SegmentLayout] = []
         for item, frame, placement in options.get("objects", ()):
-            tree = tree.with_mechanism(item.mechanism, frame, placement)
+            tree = tree.with_attached_mechanism(item.mechanism, frame, placement)
             elastic += item.elastic_joints
             segments += item.segment_layouts
         seen, grasps = options.get("point_frames"), tuple(options.get("grasps", ()))
@@ -421,28 +421,28 @@ class System(ReprMixin):
 
     @property
     def n_coordinates(self) -> int:
-        """n, the number of configuration variables."""
+        """Number n of configuration variables (generalized coordinates)."""
         return len(self.mechanism.joints)
 
     @property
     def n_constraints(self) -> int:
-        """m, the number of scalar constraints."""
-        return sum(grasp.n_equations for grasp in self.grasps)
+        """Number m of scalar constraint equations of all grasps."""
+        return sum(grasp.n_constraint_equations for grasp in self.grasps)
 
     @cached_property
-    def driven_indices(self) -> tuple[int, ...]:
-        """Configuration index of each input."""
+    def driven_coordinate_indices(self) -> tuple[int, ...]:
+        """Index in the configuration q of each driven joint, in the order of the inputs."""
         return tuple(self.mechanism.joint_index(name) for name in self.driven)
 
     @cached_property
-    def prescribed_indices(self) -> tuple[int, ...]:
-        """Configuration index of each prescribed coordinate."""
+    def prescribed_coordinate_indices(self) -> tuple[int, ...]:
+        """Index in the configuration q of each joint whose motion is prescribed."""
         return tuple(self.mechanism.joint_index(name) for name in self.prescribed)
 
     @cached_property
-    def free_indices(self) -> tuple[int, ...]:
-        """Configuration indices that are not prescribed."""
-        return tuple(i for i in range(self.n_coordinates) if i not in self.prescribed_indices)
+    def unprescribed_coordinate_indices(self) -> tuple[int, ...]:
+        """Indices in the configuration q of the joints whose motion is not prescribed."""
+        return tuple(i for i in range(self.n_coordinates) if i not in self.prescribed_coordinate_indices)
 
     @property
     def internal_coordinates(self) -> dict[str, ca.SX]:
@@ -493,7 +493,7 @@ class System(ReprMixin):
     def input_force(self, u: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
         """Generalized force of motor torques and servos, shape (n, 1) [N m]."""
         force = [ca.SX(0)] * self.n_coordinates
-        for row, (joint, index) in enumerate(zip(self.driven, self.driven_indices, strict=True)):
+        for row, (joint, index) in enumerate(zip(self.driven, self.driven_coordinate_indices, strict=True)):
             servo = self.servos.get(joint)
             force[index] = u[row] if servo is None else servo.torque(u[row], q[index], v[index])
         return ca.vertcat(*force)
@@ -507,11 +507,13 @@ class System(ReprMixin):
         if all(grasp.relaxation_time is None for grasp in self.grasps):
             return None
         times = ((ca.SX(0) if g.relaxation_time is None else g.relaxation_time, g) for g in self.grasps)
-        return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_equations)))
+        return ca.vertcat(*(time for time, grasp in times for _ in range(grasp.n_constraint_equations)))
 
-    def constraint_compliance(self) -> ca.SX:
-        """Diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
-        return ca.vertcat(ca.SX(0, 1), *(grasp.compliance for grasp in self.grasps for _ in range(grasp.n_equations)))
+    def constraint_compliance_diagonal(self) -> ca.SX:
+        """Compliance of every constraint, the diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
+        return ca.vertcat(
+            ca.SX(0, 1), *(grasp.compliance for grasp in self.grasps for _ in range(grasp.n_constraint_equations))
+        )
 
 
 def _check_names(
@@ -541,6 +543,6 @@ def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
     joints = tuple(
         Joint(f"{name}_{prefix}{letter}", kind, 3 * block + a - 1, Placement.identity(), axis)
         for block, (prefix, kind) in enumerate(kinds)
-        for a, (letter, axis) in enumerate(UNIT_AXES.items())
+        for a, (letter, axis) in enumerate(AXIS_UNIT_VECTORS.items())
     )
     return Mechanism(name, joints, {frame or name: Frame(5, Placement.identity())})

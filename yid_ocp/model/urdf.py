@@ -24,10 +24,10 @@ from yid_ocp.files import is_file
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import (
-    axis_angle_rotation,
     homogeneous_transform,
+    rotation_from_axis_sin_cos,
     rpy_from_rotation,
-    snap_to_unit_entries,
+    snap_near_integer_entries,
 )
 
 _UNLIMITED_VALUE = 1e9  # stands for no limit where URDF asks for a number
@@ -42,7 +42,7 @@ _Carrier = str | None
 log = logging.getLogger(__name__)
 
 
-def example_robot_urdf(robot: str) -> Path:
+def _example_robot_urdf(robot: str) -> Path:
     """Path of a robot's URDF file in the installed example-robot-data package; `ModelError` where there is none.
 
     `robot` is `baxter`, `panda`, `ur5`, or `folder/file.urdf` below the package's robots folder.
@@ -70,7 +70,7 @@ def resolve_urdf_path(robot: str | Path) -> Path:
     """
     scheme, _, name = str(robot).partition(":")
     if scheme == "package":
-        return example_robot_urdf(name)
+        return _example_robot_urdf(name)
     if scheme != "default":
         return Path(robot)
     known = _shipped()
@@ -319,7 +319,7 @@ def _origin(element: Any) -> Array:
 def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia, ...]) -> Joint:
     """The file's joint with its limits, infinite where there are none."""
     limit = source.limit
-    axis = snap_to_unit_entries(_unit_axis(source))
+    axis = snap_near_integer_entries(_unit_axis(source))
     continuous = source.type == "continuous" or limit is None
 
     def bound(value: float | None, otherwise: float) -> float:
@@ -346,7 +346,7 @@ def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Array:
     axis = _unit_axis(joint)
     if joint.type == "prismatic":
         return homogeneous_transform(np.eye(3), value * axis)
-    return homogeneous_transform(axis_angle_rotation(axis, math.sin(value), math.cos(value)), np.zeros(3))
+    return homogeneous_transform(rotation_from_axis_sin_cos(axis, math.sin(value), math.cos(value)), np.zeros(3))
 
 
 def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:

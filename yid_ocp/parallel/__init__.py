@@ -2,7 +2,7 @@
 
 from yid_ocp.parallel.batched_evaluation import batched_call as batched_call
 from yid_ocp.parallel.batched_evaluation import map_with_batched_calls as map_with_batched_calls
-from yid_ocp.parallel.resumable_tasks import LOCAL_WORKERS as LOCAL_WORKERS
+from yid_ocp.parallel.resumable_tasks import LOCAL_WORKER_CONFIG as LOCAL_WORKER_CONFIG
 from yid_ocp.parallel.resumable_tasks import Task as Task
 from yid_ocp.parallel.resumable_tasks import TaskProgressCallback as TaskProgressCallback
 from yid_ocp.parallel.resumable_tasks import TaskResult as TaskResult
@@ -10,8 +10,8 @@ from yid_ocp.parallel.resumable_tasks import WorkerConfig as WorkerConfig
 from yid_ocp.parallel.resumable_tasks import require_task_values as require_task_values
 from yid_ocp.parallel.resumable_tasks import run_tasks as run_tasks
 from yid_ocp.parallel.threads_and_processes import CASADI_LOCK as CASADI_LOCK
+from yid_ocp.parallel.threads_and_processes import CasadiLockedCache as CasadiLockedCache
 from yid_ocp.parallel.threads_and_processes import InlineExecutor as InlineExecutor
-from yid_ocp.parallel.threads_and_processes import LockedCache as LockedCache
+from yid_ocp.parallel.threads_and_processes import available_processor_count as available_processor_count
 from yid_ocp.parallel.threads_and_processes import map_in_threads as map_in_threads
 from yid_ocp.parallel.threads_and_processes import process_pool as process_pool
-from yid_ocp.parallel.threads_and_processes import processor_count as processor_count

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.errors import WorkerError
-from yid_ocp.version import fingerprint_differences, software_fingerprint
+from yid_ocp.version import software_fingerprint, software_fingerprint_differences
 
 _CONNECT_TIMEOUT = 15.0  # timeout for the connection to a scheduler [s]
 _MAX_CLIENT_STARTS = 3  # number of attempts to start a client's event loop
@@ -113,7 +113,7 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
             allowed = "workers that import the same modules and see the same folders as this process"
             hint = "install yid-ocp where the workers run, and choose --out on a file system that all of them share"
             raise WorkerError(f"a worker cannot do the tasks: {said}", where=address, allowed=allowed, hint=hint)
-        if unlike := fingerprint_differences(here, said):
+        if unlike := software_fingerprint_differences(here, said):
             raise _unfit(address, unlike)
 
 
@@ -144,5 +144,5 @@ def _unfit(worker: str, unlike: Sequence[str]) -> WorkerError:
 
 
 def version_mismatch_message(worker: str, unlike: Sequence[str]) -> str:
-    """Error message for a worker with other versions; `unlike` comes from `version.fingerprint_differences`."""
+    """Error message for a worker with other versions; `unlike` comes from `software_fingerprint_differences`."""
     return f"the worker {worker} is of another version: {', '.join(unlike)}"

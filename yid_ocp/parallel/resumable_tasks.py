@@ -28,8 +28,8 @@ from typing import Any
 from yid_ocp.errors import ConfigError, OutputError, WorkerError, YidError
 from yid_ocp.files import file_sha256, json_sha256, make_folder, write_json
 from yid_ocp.parallel.dask_cluster import dask_executor, version_mismatch_message
-from yid_ocp.parallel.threads_and_processes import InlineExecutor, process_pool, processor_count
-from yid_ocp.version import fingerprint_differences, package_source_hash, software_fingerprint
+from yid_ocp.parallel.threads_and_processes import InlineExecutor, available_processor_count, process_pool
+from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences
 
 _TASK_FORMAT = "yid-task/1"
 _RESULT_FILE_TIMEOUT = 60.0  # until a result file written by another machine is visible, as on network file systems [s]
@@ -42,7 +42,7 @@ TaskProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Task:
-    """One function call; its name is for people and does not count for what is resumed.
+    """Arguments of one function call; its name is for display only and does not decide what is resumed.
 
     `arguments`, by keyword, are text, numbers, None, lists and mappings of them, and `Path` for what is read.
     """
@@ -99,7 +99,7 @@ class WorkerConfig:
                 pass
 
 
-LOCAL_WORKERS = WorkerConfig()
+LOCAL_WORKER_CONFIG = WorkerConfig()
 """One process per processor of this machine."""
 
 
@@ -107,7 +107,7 @@ def run_tasks(
     function: _TaskFunction,
     tasks: Sequence[Task],
     folder: Path,
-    workers: WorkerConfig | Executor = LOCAL_WORKERS,
+    workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
     progress: TaskProgressCallback | None = None,
     code: str | None = None,
 ) -> list[TaskResult]:
@@ -187,7 +187,7 @@ def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
 
 def _done_by(workers: WorkerConfig | Executor, jobs: Sequence[_Job], finished: _TaskFinishedCallback) -> None:
     if isinstance(workers, WorkerConfig) and not workers.scheduler_address:
-        _in_own_processes(jobs, finished, workers.n_processes or processor_count())
+        _in_own_processes(jobs, finished, workers.n_processes or available_processor_count())
         return
     with contextlib.ExitStack() as held:
         executor, look = workers, None
@@ -254,7 +254,7 @@ _TaskFinishedCallback = Callable[[_Job, TaskResult], None]
 
 def _perform(job: _Job) -> str:
     """Run a task and write its result file; returns the error message, empty on success."""
-    if unlike := fingerprint_differences(job.maker, software_fingerprint()):
+    if unlike := software_fingerprint_differences(job.maker, software_fingerprint()):
         return f"WorkerError: {version_mismatch_message(socket.gethostname(), unlike)}"
     begun = time.perf_counter()
     entry = {"format": _TASK_FORMAT, "name": job.task.name, "input": job.input}

@@ -34,7 +34,7 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item])
         return list(pool.map(function, entries))
 
 
-def processor_count() -> int:
+def available_processor_count() -> int:
     """Number of processors available to this process."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -50,7 +50,7 @@ def max_threads() -> int:
     said = os.environ.get(_THREADS_VARIABLE, "")
     if said and not (said.isdecimal() and int(said)):
         raise ConfigError(f"{_THREADS_VARIABLE} is '{said}'", where="environment", allowed="a whole number from 1")
-    own = int(said) if said else processor_count()
+    own = int(said) if said else available_processor_count()
     return min(own, getattr(_SHARE, "count", own))
 
 
@@ -65,7 +65,7 @@ CASADI_LOCK = threading.RLock()
 """Lock to be held while shared CasADi expressions are built or differentiated."""
 
 
-class LockedCache(Generic[_Key, _Value]):
+class CasadiLockedCache(Generic[_Key, _Value]):
     """Cached values by key, each computed once under the CasADi lock.
 
     For what is made of CasADi's expressions, which threads must not work on side by side. `compute_value` may depend on
@@ -107,7 +107,7 @@ def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
     They are started anew instead of forked: a fork copies the locks of threads that it does not copy. Together they use
     as many threads as this process might.
     """
-    count = workers or processor_count()
+    count = workers or available_processor_count()
     context = multiprocessing.get_context("spawn")
     each = max(1, max_threads() // count)
     return ProcessPoolExecutor(count, mp_context=context, initializer=_begin_worker, initargs=(each,))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from yid_ocp.analysis.experiment_design import with_observable_frames
+from yid_ocp.analysis.experiment_design import add_observable_frames_to_step
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.effects import EffectBase, make_effect
@@ -18,13 +18,13 @@ from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_UNINFORMED_
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.options import check_option_bounds
 from yid_ocp.planning.informative_motion_search import (
-    DOptimality,
-    EffectDiscrimination,
+    DOptimalityCriterion,
+    EffectDiscriminationCriterion,
     InformativeMotionSearch,
     MotionSearchResult,
     OptimalityCriterion,
 )
-from yid_ocp.planning.joint_paths import FramePositions, PlannedMotion, PlanOptions
+from yid_ocp.planning.joint_paths import FramePositionFunction, PlannedMotion, PlanOptions
 from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem
@@ -105,10 +105,12 @@ def plan_informative_motion(
         extra, step = [name for e in rivals for name in e.parameters.names], compile_step_like(problem.step, system)
         composed = EstimationProblem(step, recordings, problem.free, problem.options, known, (), extra)
     names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_names))
-    shapes = {entry.name: entry.value for e in rivals for entry in e.parameters if entry.name in e.shape_names}
+    shapes = {
+        entry.name: entry.value for e in rivals for entry in e.parameters if entry.name in e.shape_parameter_names
+    }
     experiment = PlannedExperiment.from_options(composed, known | shapes, options, names)
     system, still = experiment.simulator.step.system, experiment.zero_coefficients
-    points = FramePositions(system, system.point_frames)
+    points = FramePositionFunction(system, system.point_frames)
     limits = PlanResidualsAndLimits(experiment.simulator, options, points, np.zeros(3), still)
     criterion = _criterion(experiment, chosen, rivals)
     search = InformativeMotionSearch(experiment, limits, criterion)
@@ -179,13 +181,13 @@ def _criterion(
     columns = [name.split("[")[0] for name in experiment.column_names]
     parameters = tuple(i for i, name in enumerate(columns) if name in experiment.free_parameters)
     if not rivals:
-        return DOptimality(tuple(i for i, name in enumerate(columns) if name in chosen), parameters)
+        return DOptimalityCriterion(tuple(i for i, name in enumerate(columns) if name in chosen), parameters)
     places, sizes = [], []
     for effect in rivals:
         own = tuple(columns.index(name) for name in effect.amplitude_names)
         places.append(own)
         sizes.append(_size(effect) / experiment.unknown_scales[list(own)][:, None])
-    return EffectDiscrimination(tuple(places), tuple(sizes), parameters)
+    return EffectDiscriminationCriterion(tuple(places), tuple(sizes), parameters)
 
 
 def _size(effect: EffectBase) -> Array:
@@ -206,7 +208,7 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualsAndLimits)
             what = f"{name} begins {max(low, -high):.3g} beyond the limit of the joint"
             hint = "give a plan.start_joint_positions within the limits"
             raise ConfigError(what, where="plan.start_joint_positions", hint=hint)
-    broken = limits.violated_limits(limits.limit_values(mover.simulate_path(still), still).value)
+    broken = limits.worst_violation_per_limit(limits.limited_quantity_values(mover.simulate_path(still), still).value)
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
         said = "; ".join(f"{name}: {x:.4g} where {bound:.4g} is allowed, {what}" for what, name, x, bound in parts)
@@ -221,7 +223,10 @@ def _random(experiment: PlannedExperiment, seed: int) -> Array:
 def _smooth(experiment: PlannedExperiment, w: Array) -> Array:
     """The motion, made smaller until what it tells changes smoothly with it."""
     for _ in range(10):
-        rows, there = experiment.search_sensitivities(w), experiment.search_sensitivities((1.0 + 1e-4) * w)
+        rows, there = (
+            experiment.search_problem_sensitivities(w),
+            experiment.search_problem_sensitivities((1.0 + 1e-4) * w),
+        )
         if (
             rows is not None
             and there is not None
@@ -236,7 +241,7 @@ def _unseen(experiment: PlannedExperiment, motions: Sequence[Array]) -> dict[str
     """Parameters of which no reading tells in any of the motions: how far one moves at most [standard deviations]."""
     largest = np.zeros(len(experiment.column_names))
     for w in motions:
-        rows = experiment.search_sensitivities(w)
+        rows = experiment.search_problem_sensitivities(w)
         if rows is not None:
             largest = np.maximum(largest, np.linalg.norm(rows, axis=0))
     named = zip(experiment.column_names, largest, strict=True)
@@ -269,12 +274,12 @@ def _check_seen(
 def _would_see(experiment: PlannedExperiment, name: str, w: Array) -> str:
     """What would see a parameter, in words."""
     mover, n = experiment.simulator, experiment.simulator.step.system.n_coordinates
-    wide, seen = with_observable_frames(mover.step)
+    wide, seen = add_observable_frames_to_step(mover.step)
     w = _PROBE_AMPLITUDE * w / max(float(np.abs(w).max()), _PROBE_AMPLITUDE)
     rolled = mover.simulate_path(w, names=[name])
     if rolled.state_sensitivity is None or not rolled.status.is_converged:
         return f"{name} needs another sensor"
-    frames = FramePositions(wide.system, [sight.name for sight in seen])
+    frames = FramePositionFunction(wide.system, [sight.name for sight in seen])
     by_q = frames.positions_and_jacobian(rolled.state[:, :n], mover.theta)[1]
     size = abs(mover.theta[wide.system.parameters.index(name)]) or 1.0
     moved = size * np.einsum("tiq,tq->ti", by_q, rolled.state_sensitivity[:, :n, 0]).reshape(len(by_q), -1, 3)
@@ -331,7 +336,9 @@ def _plan(
 
 def _judged(experiment: PlannedExperiment, criterion: OptimalityCriterion, found: MotionSearchResult) -> float:
     try:
-        return criterion.value_and_gradient(experiment.configured_sensitivities(found.w), False)[0]
+        return criterion.value_and_gradient_by_sensitivities(
+            experiment.configured_problem_sensitivities(found.w), False
+        )[0]
     except SolverError:
         return -math.inf
 
@@ -340,7 +347,7 @@ def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, _Par
     """Parameters of the nominal problem before, after and with both, and what the planned recording leaves open."""
     problem = experiment.configured_problem
     before = identifiability(problem.with_parameter_values(experiment.parameter_values))
-    after = identifiability(experiment.estimation_problem(w).with_free_subset(problem.free))
+    after = identifiability(experiment.planned_estimation_problem(w).with_free_subset(problem.free))
     shared = [name for name in problem.free if name not in problem.options.local_parameters]
     at = [[entry.parameter_names.index(name) for name in shared] for entry in (before, after)]
     both = sum(entry.fisher_information[np.ix_(i, i)] for entry, i in zip((before, after), at, strict=True))
@@ -358,9 +365,9 @@ def _distances(
     experiment: PlannedExperiment, criterion: OptimalityCriterion, rivals: Sequence[EffectBase], w: Array
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Distances of effects in the recordings that there are, and in the planned one."""
-    assert isinstance(criterion, EffectDiscrimination)
-    recorded, planned = experiment.recorded_sensitivities, experiment.configured_sensitivities(w)
-    before, after = criterion.effect_distances(recorded), criterion.effect_distances(planned)
+    assert isinstance(criterion, EffectDiscriminationCriterion)
+    recorded, planned = experiment.existing_recording_sensitivities, experiment.configured_problem_sensitivities(w)
+    before, after = criterion.pairwise_effect_distances(recorded), criterion.pairwise_effect_distances(planned)
     labels = [effect.label for effect in rivals]
     pairs = itertools.permutations(range(len(labels)), 2)
     return {(labels[i], labels[j]): (float(before[i, j]), float(after[i, j])) for i, j in pairs}
@@ -373,7 +380,9 @@ def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: 
     def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
 
-    for rows, own in limits.limits_with_values(limits.limit_values(mover.simulate_path(w), w).value):
+    for rows, own in limits.limits_with_quantity_values(
+        limits.limited_quantity_values(mover.simulate_path(w), w).value
+    ):
         near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
         found[rows.description] = reached(rows.row_names, near)
     flat = w.ravel()

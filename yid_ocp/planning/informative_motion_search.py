@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 
 from yid_ocp.arrays import Array
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
-from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, scaled_bounds
+from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, limit_units_and_scaled_bounds
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
@@ -35,7 +35,7 @@ def _prior(columns: int, bounded: Sequence[int]) -> Array:
 
 
 @dataclass(frozen=True)
-class DOptimality:
+class DOptimalityCriterion:
     """Minus half the log determinant of the covariance of chosen parameters, all others and nuisances eliminated.
 
     With all parameters chosen that is D-optimality, with some of them D_s-optimality, with one its standard deviation.
@@ -48,7 +48,7 @@ class DOptimality:
     chosen_columns: tuple[int, ...]
     parameter_columns: tuple[int, ...]
 
-    def value_and_gradient(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
+    def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
         """Criterion [nat] at sensitivities (nr, columns) to relative changes, and its gradient by them if asked for."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
@@ -63,8 +63,8 @@ class DOptimality:
 
 
 @dataclass(frozen=True)
-class EffectDiscrimination:
-    """Distance of each effect's change of the readings from what another effect and all free unknowns can imitate.
+class EffectDiscriminationCriterion:
+    """Criterion of how far each effect's change of the readings is from what another and the unknowns can imitate.
 
     d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
     -1/2 log sum_ij 1 / (1 + d_ij^2).
@@ -75,15 +75,15 @@ class EffectDiscrimination:
     amplitude_cases: tuple[Array, ...]
     parameter_columns: tuple[int, ...]  # with a prior: of the nominal parameters and of the effects
 
-    def effect_distances(self, rows: Array) -> Array:
-        """d_ij in standard deviations of the data, from i (row) to j; the diagonal is infinite."""
+    def pairwise_effect_distances(self, rows: Array) -> Array:
+        """Distances of effect i's (row) changes from what effect j can imitate [data stds]; diagonal infinite."""
         found = np.full((len(self.amplitude_columns),) * 2, np.inf)
         for i, j in itertools.permutations(range(len(found)), 2):
             found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
         return found
 
-    def value_and_gradient(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """As `DOptimality.value_and_gradient`."""
+    def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
+        """As `DOptimalityCriterion.value_and_gradient_by_sensitivities`."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)
@@ -107,7 +107,7 @@ class EffectDiscrimination:
         return square, rest, others, used
 
 
-OptimalityCriterion = DOptimality | EffectDiscrimination
+OptimalityCriterion = DOptimalityCriterion | EffectDiscriminationCriterion
 
 _INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 0.05, 0.4  # of the trust region, for every unknown of the motion [rad or m]
 _MIN_TRUST_RADIUS = 1e-3
@@ -120,7 +120,7 @@ _MAX_LIMIT_CORRECTIONS = 2  # of the linear limits where a step passes the true 
 
 @dataclass(frozen=True)
 class MotionSearchResult:
-    """Coefficients w (K, nc) that a search ended with, and the criterion at the start and in the end [nat]."""
+    """Result of a motion search: final spline coefficients w (K, nc), initial and final criterion [nat]."""
 
     w: Array
     initial_criterion: float
@@ -138,11 +138,11 @@ class InformativeMotionSearch:
     ) -> None:
         self.experiment, self.limits, self.criterion = experiment, limits, criterion
         self.lower, self.upper = (bound.ravel() for bound in experiment.simulator.coefficient_bounds())
-        self._unit, self._low, self._high = scaled_bounds(limits.limit_rows)
+        self._unit, self._low, self._high = limit_units_and_scaled_bounds(limits.limit_rows)
 
-    def max_limit_violation(self, w: Array) -> float:
+    def _max_limit_violation(self, w: Array) -> float:
         """Largest limit violation of a motion, relative to the limits; infinite where it cannot be simulated."""
-        value = self.limits.limit_values(self.experiment.simulator.simulate_path(w), w).value / self._unit
+        value = self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(w), w).value / self._unit
         if not np.all(np.isfinite(value)):
             return np.inf
         flat = w.ravel()
@@ -150,28 +150,32 @@ class InformativeMotionSearch:
         return max(float(np.max(value - self._high)), float(np.max(self._low - value)), joints)
 
     def shrink_to_limits(self, w: Array) -> Array:
-        """The motion, scaled down until it keeps the limits."""
+        """Spline coefficients (K, nc) of the motion, scaled down until it keeps the limits."""
         for _ in range(60):
-            if self.max_limit_violation(w) <= 0.0:
+            if self._max_limit_violation(w) <= 0.0:
                 return w
             w = 0.8 * w
         return np.zeros_like(w)
 
     def _value_and_rows(self, w: Array) -> tuple[float, Array | None]:
         """Criterion and sensitivities of a motion; minus infinity where it cannot be simulated."""
-        rows = self.experiment.search_sensitivities(w)
-        return (-np.inf, None) if rows is None else (self.criterion.value_and_gradient(rows, False)[0], rows)
+        rows = self.experiment.search_problem_sensitivities(w)
+        return (
+            (-np.inf, None)
+            if rows is None
+            else (self.criterion.value_and_gradient_by_sensitivities(rows, False)[0], rows)
+        )
 
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
-        """Improve a motion that keeps the limits until convergence."""
+        """Maximise the criterion from spline coefficients (K, nc) that keep the limits, until convergence."""
         w, radius = start, _INITIAL_TRUST_RADIUS
         value, rows = self._value_and_rows(w)
         first, finished, done = value, False, 0
         while rows is not None and done < rounds and not finished:
             done += 1
-            slopes = self.experiment.sensitivity_derivatives(w, rows)
+            slopes = self.experiment.sensitivity_derivatives_by_coefficients(w, rows)
             rolled = self.experiment.simulator.simulate_path(w, True)
-            limits = self.limits.limit_values(rolled, w)
+            limits = self.limits.limited_quantity_values(rolled, w)
             if slopes is None or limits.jacobian is None:
                 break
             bounded = limits.value / self._unit, limits.jacobian / self._unit[:, None]
@@ -207,15 +211,18 @@ class InformativeMotionSearch:
             room = np.maximum(np.concatenate([high[near_high], low[near_low]]), 0.0)
             step = self._inner(rows, slopes, w, normal, room, radius)
             there = w + step.reshape(w.shape)
-            if self.max_limit_violation(there) <= 0.0:
+            if self._max_limit_violation(there) <= 0.0:
                 return there - w
-            true = self.limits.limit_values(self.experiment.simulator.simulate_path(there), there).value / self._unit
+            true = (
+                self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(there), there).value
+                / self._unit
+            )
             if not np.all(np.isfinite(true)):
                 break
             shift = true - value - slope @ step
         for share in (0.9, 0.7, 0.4, 0.2, 0.1):
             part = share * step.reshape(w.shape)
-            if self.max_limit_violation(w + part) <= 0.0:
+            if self._max_limit_violation(w + part) <= 0.0:
                 return part
         return np.zeros_like(w)
 
@@ -225,7 +232,7 @@ class InformativeMotionSearch:
         flat, normal = radius * slopes.reshape(len(slopes), -1), radius * normal
 
         def cost(x: Array) -> tuple[float, Array]:
-            found, by_rows = self.criterion.value_and_gradient(rows + (x @ flat).reshape(rows.shape))
+            found, by_rows = self.criterion.value_and_gradient_by_sensitivities(rows + (x @ flat).reshape(rows.shape))
             return -found, -(flat @ by_rows.ravel())
 
         low = np.maximum(-1.0, np.minimum(self.lower - w.ravel(), 0.0) / radius)

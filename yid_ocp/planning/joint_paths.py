@@ -115,7 +115,7 @@ class PlanOptions:
     ] = 100
 
 
-class FramePositions:
+class FramePositionFunction:
     """Function for world positions of named frames and their Jacobian by the configuration.
 
     Raises `ConfigError` for a frame that does not exist.
@@ -165,8 +165,8 @@ class SplinePath:
     def _controls(self) -> int:
         return 2 * _N_REST_CONTROL_POINTS + self.n_coefficients - 1
 
-    def control_point_matrix(self, order: int = 0) -> Array:
-        """Matrix from the coefficients to the control points of a derivative, shape (..., K)."""
+    def coefficients_to_control_points_matrix(self, order: int = 0) -> Array:
+        """Matrix that maps coefficients to control points of the spline or of a derivative, shape (..., K)."""
         spread = np.zeros((self._controls, self.n_coefficients))
         ends, free = _N_REST_CONTROL_POINTS, self.n_coefficients - 1
         spread[ends : ends + free, :-1] = np.eye(free)
@@ -183,7 +183,7 @@ class SplinePath:
         knots = self.knots
         own = knots[order : len(knots) - order]
         inside = np.minimum(np.asarray(t, float), self.duration)
-        values = BSpline(own, self.control_point_matrix(order), _SPLINE_DEGREE - order)(inside)
+        values = BSpline(own, self.coefficients_to_control_points_matrix(order), _SPLINE_DEGREE - order)(inside)
         return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
 
     def straight_line_coefficients(self, change: Array) -> Array:
@@ -206,19 +206,21 @@ class PathSimulator:
     hold_duration: float  # time for which the joints stand still at the end [s]
 
     @property
-    def joint_indices(self) -> list[int]:
+    def moved_joint_indices(self) -> list[int]:
         """Configuration indices of the moved joints."""
-        return list(self.step.system.prescribed_indices)
+        return list(self.step.system.prescribed_coordinate_indices)
 
     @property
-    def start_positions(self) -> Array:
+    def moved_joint_start_positions(self) -> Array:
         """Start positions of the moved joints, shape (nc,) [rad or m]."""
-        return np.asarray(self.start_equilibrium.state[self.joint_indices])
+        return np.asarray(self.start_equilibrium.state[self.moved_joint_indices])
 
     def coefficient_bounds(self) -> tuple[Array, Array]:
         """Lowest and highest coefficients that keep the joints' position limits, shape (K, nc) each."""
         shape = (self.path.n_coefficients, 1)
-        lower, upper = (np.tile(side - self.start_positions, shape) for side in _position_limits(self.step.system))
+        lower, upper = (
+            np.tile(side - self.moved_joint_start_positions, shape) for side in _position_limits(self.step.system)
+        )
         return lower, upper
 
     @cached_property
@@ -229,7 +231,7 @@ class PathSimulator:
         return np.asarray(self.step.time_step * np.arange(moving + standing + 1))
 
     @cached_property
-    def standstill_nodes(self) -> IntArray:
+    def standstill_node_indices(self) -> IntArray:
         """Indices of the nodes at which the joints stand still at the end."""
         return np.flatnonzero(self.node_times >= self.path.duration - 1e-9)
 
@@ -239,27 +241,27 @@ class PathSimulator:
 
     def joint_positions(self, w: Array) -> Array:
         """Positions of the moved joints at the nodes, shape (N + 1, nc), for coefficients (K, nc)."""
-        return self.start_positions + self._basis @ w
+        return self.moved_joint_start_positions + self._basis @ w
 
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
         """Simulate the path of coefficients (K, nc), with derivatives by named parameters, then by the coefficients."""
         directions = None
         if slopes or names:
             size = w.size if slopes else 0
-            nodes, nc = len(self.node_times), len(self.joint_indices)
+            nodes, nc = len(self.node_times), len(self.moved_joint_indices)
             by_path = np.zeros((nodes, nc, len(names) + size))
             start = np.zeros((len(self.start_equilibrium.state), len(names) + size))
             if slopes:
                 by_path[:, :, len(names) :] = np.einsum("tk,ji->tjki", self._basis, np.eye(nc)).reshape(nodes, nc, size)
             if names:
-                known, guess = self.start_positions, self.start_configuration
+                known, guess = self.moved_joint_start_positions, self.start_configuration
                 rest = EquilibriumSolver(self.step).solve(known, self.theta, guess=guess, names=names)
                 start[:, : len(names)] = rest.state_by_theta
             directions = SensitivityDirections(tuple(names), start, None, by_path)
         begin, steps, path = self.start_equilibrium.state, len(self.node_times) - 1, self.joint_positions(w)
         return simulate(self.step, self.theta, begin, steps, path=path, directions=directions)
 
-    def trajectories(self, frames: FramePositions, state: Array) -> Array:
+    def trajectories(self, frames: FramePositionFunction, state: Array) -> Array:
         """Positions of frames along states (N, nx), shape (N, frames, 3) [m]."""
         q = state[:, : self.step.system.n_coordinates]
         return frames.positions_and_jacobian(q, self.theta)[0].reshape(len(state), -1, 3)
@@ -272,7 +274,7 @@ class PathSimulator:
 
 _TRAVEL_WEIGHT = 1e-2  # of a joint's travel [rad] beside the distance to the place in units of what counts as reached
 _MIN_POINT_MOBILITY = 1e-9  # motion of the point by a joint's, in metres per radian or metre, that counts as none
-REACHED_TOLERANCE_FACTOR = 1.5  # of that unit: beyond it a place is out of reach
+TARGET_REACHED_TOLERANCE_FACTOR = 1.5  # of that unit: beyond it a place is out of reach
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,7 +321,9 @@ class PlannedMotion:
     def point_trajectories(self) -> dict[str, Array]:
         """Trajectories of the system's points and of the one with a target by name, each of shape (N + 1, 3) [m]."""
         names = self._point_names
-        places = self.simulator.trajectories(FramePositions(self.simulator.step.system, names), self.rollout.state)
+        places = self.simulator.trajectories(
+            FramePositionFunction(self.simulator.step.system, names), self.rollout.state
+        )
         return {name: places[:, i] for i, name in enumerate(names)}
 
     @property
@@ -339,11 +343,11 @@ class _EndEquilibrium:
 
 def _position_limits(system: System) -> tuple[Array, Array]:
     """Lower and upper limits of the moved joints, shape (nc,) each."""
-    joints = [system.mechanism.joints[i] for i in system.prescribed_indices]
+    joints = [system.mechanism.joints[i] for i in system.prescribed_coordinate_indices]
     return np.array([joint.lower_limit for joint in joints]), np.array([joint.upper_limit for joint in joints])
 
 
-def ordered_start_positions(system: System, posture: Mapping[str, float]) -> Array:
+def ordered_start_joint_positions(system: System, posture: Mapping[str, float]) -> Array:
     """Start positions of the moved joints, given by name, as an array of shape (nc,).
 
     Raises `ConfigError` where a joint is missing, does not exist, or stands outside its range.
@@ -387,7 +391,7 @@ def solve_start_equilibrium(step: Step, theta: Array, posture: Array, guess: Arr
 def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits: PlanLimits, when: str) -> None:
     """Raise `ConfigError` where efforts or spring angles exceed their limits although the arms stand still."""
     system, joints = step.system, step.system.mechanism.joints
-    efforts = zip(system.prescribed_indices, simulate(step, theta, rest.state, 1).effort[0], strict=True)
+    efforts = zip(system.prescribed_coordinate_indices, simulate(step, theta, rest.state, 1).effort[0], strict=True)
     springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
     largest = np.inf if limits.max_spring_angle is None else limits.max_spring_angle
     able = limits.effort_fraction
@@ -405,14 +409,14 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
 
 
 def solve_end_equilibrium(
-    step: Step, theta: Array, start: Equilibrium, point: FramePositions, place: Array, tolerance: float
+    step: Step, theta: Array, start: Equilibrium, point: FramePositionFunction, place: Array, tolerance: float
 ) -> _EndEquilibrium:
     """Solve for joint positions within their limits, near the start, at which the point rests nearest to its target.
 
     Raises `ConfigError` where no joint moves the point.
     """
     statics, system = EquilibriumSolver(step), step.system
-    n, first = system.n_coordinates, start.state[list(system.prescribed_indices)]
+    n, first = system.n_coordinates, start.state[list(system.prescribed_coordinate_indices)]
 
     def point_and_slope(rest: Equilibrium) -> tuple[Array, Array]:
         where, by_q = point.positions_and_jacobian(rest.state[None, :n], theta)
@@ -459,7 +463,7 @@ def _last_kept(function: Callable[[Array], tuple[Array, Array]]) -> Callable[[Ar
 
 def check_target_reachable(end: _EndEquilibrium, name: str, place: Array, tolerance: float) -> None:
     """Raise `ConfigError` where the point cannot rest at its target."""
-    if end.target_distance <= REACHED_TOLERANCE_FACTOR * tolerance:
+    if end.target_distance <= TARGET_REACHED_TOLERANCE_FACTOR * tolerance:
         return
     known = np.isfinite(end.target_distance)
     off = f"{1e3 * end.target_distance:.3g} mm off" if known else "nowhere, as no posture near it is at rest"

@@ -15,19 +15,19 @@ from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
 from yid_ocp.options import check_option_bounds
 from yid_ocp.planning.joint_paths import (
-    REACHED_TOLERANCE_FACTOR,
-    FramePositions,
+    TARGET_REACHED_TOLERANCE_FACTOR,
+    FramePositionFunction,
     PathSimulator,
     PlannedMotion,
     PlanOptions,
     SplinePath,
     check_standstill_limits,
     check_target_reachable,
-    ordered_start_positions,
+    ordered_start_joint_positions,
     solve_end_equilibrium,
     solve_start_equilibrium,
 )
-from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShooting, PlanShootingResult
+from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShootingProblem, PlanShootingResult
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
@@ -44,7 +44,7 @@ class ParameterCovariance:
 
 
 @dataclass(frozen=True, eq=False)
-class MotionPlan(PlannedMotion):
+class TargetMotionPlan(PlannedMotion):
     """A planned motion that brings a point to a target, with its predicted errors.
 
     Its simulator's step may be a shorter one than that the plan began with.
@@ -63,13 +63,13 @@ class MotionPlan(PlannedMotion):
         return tuple(dict.fromkeys((*self.simulator.step.system.point_frames, self.target_point)))
 
 
-def plan_motion(
+def plan_motion_to_target(
     step: Step,
     options: PlanOptions,
     theta: Array | None = None,
     known: ParameterCovariance | None = None,
     progress: Progress = NULL_PROGRESS,
-) -> MotionPlan:
+) -> TargetMotionPlan:
     """Plan a motion of a step's prescribed joints that brings a point to a target.
 
     Parameters are the system's values when `theta` is absent; the covariance of some of them may be `known`. There is a
@@ -100,9 +100,9 @@ def plan_motion(
     check_target_reachable(end, point.names[0], place, options.position_tolerance)
     check_standstill_limits(step, values, end.equilibrium, options.limits, "where it ends")
 
-    def attempt(duration: float) -> MotionPlan:
+    def attempt(duration: float) -> TargetMotionPlan:
         own = replace(mover, path=replace(path, duration=duration))
-        straight = own.path.straight_line_coefficients(end.joint_positions - own.start_positions)
+        straight = own.path.straight_line_coefficients(end.joint_positions - own.moved_joint_start_positions)
         rows = PlanResidualsAndLimits(own, replace(options, duration=duration), point, place, straight, inside)
         return _attempt(rows, known)
 
@@ -115,24 +115,24 @@ def plan_motion(
 
 def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
     if options.start_joint_positions is not None:
-        return ordered_start_positions(system, options.start_joint_positions)
+        return ordered_start_joint_positions(system, options.start_joint_positions)
     if not system.grasps:
         what, where = "nothing says where the motion begins", "plan.start_joint_positions"
         hint = "only where a gripper holds the object do the angles follow from that"
         raise ConfigError(what, where=where, allowed="every joint that moves", hint=hint)
     by_name = dict(zip(system.parameters.names, map(float, theta), strict=True))
     angles = grasping_joint_angles(system, by_name)
-    return ordered_start_positions(system, {name: angles[name] for name in angles if name in system.prescribed})
+    return ordered_start_joint_positions(system, {name: angles[name] for name in angles if name in system.prescribed})
 
 
-def _points(system: System, options: PlanOptions) -> tuple[FramePositions, FramePositions | None]:
+def _points(system: System, options: PlanOptions) -> tuple[FramePositionFunction, FramePositionFunction | None]:
     if options.point is None:
         hint = nearest_name_hint("", system.point_frames)
         raise ConfigError("no point is named", where="plan.point", allowed="a frame of the model", hint=hint)
     calm = [name for name in system.point_frames if name != options.point]
     boxed = options.frames_in_box or system.point_frames
-    inside = FramePositions(system, boxed) if options.goal == "box" else None
-    return FramePositions(system, [options.point, *calm]), inside
+    inside = FramePositionFunction(system, boxed) if options.goal == "box" else None
+    return FramePositionFunction(system, [options.point, *calm]), inside
 
 
 def _place(options: PlanOptions, begin: Array) -> Array:
@@ -150,7 +150,7 @@ def _place(options: PlanOptions, begin: Array) -> Array:
     return begin + np.array(options.target_offset, float)
 
 
-def _check_box(options: PlanOptions, inside: FramePositions, at: Array, place: Array) -> None:
+def _check_box(options: PlanOptions, inside: FramePositionFunction, at: Array, place: Array) -> None:
     """Refuse a box that frames begin outside of at places (frames, 3) [m], or that the point leaves."""
     if options.box is None:
         raise ConfigError("there is no box", where="plan.box", allowed="two corners [m]", hint="goal: place needs none")
@@ -174,7 +174,7 @@ def _check_box(options: PlanOptions, inside: FramePositions, at: Array, place: A
             )
 
 
-def _attempt(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> MotionPlan:
+def _attempt(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> TargetMotionPlan:
     """The best motion of one duration: found with the step's time step, sharpened with shorter ones.
 
     What swings in the end is a small difference of large motions: a step that is fine enough for them leaves out part
@@ -184,7 +184,7 @@ def _attempt(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> Motion
     lower, upper = mover.coefficient_bounds()
     for halved in range(_MAX_STEP_HALVINGS + 1):
         cases = [rows, *_scenarios(rows, known)] if options.minimize_parameter_sensitivity else [rows]
-        shot = PlanShooting(cases, guess.shape).solve(guess, lower, upper, options.max_iterations)
+        shot = PlanShootingProblem(cases, guess.shape).solve(guess, lower, upper, options.max_iterations)
         evaluations += shot.n_evaluations
         if not shot.is_converged or halved == _MAX_STEP_HALVINGS:
             break
@@ -200,7 +200,7 @@ def _attempt(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> Motion
 
 def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
     """The same motion from rest with another step or other parameters."""
-    rest = solve_start_equilibrium(step, theta, mover.start_positions, mover.start_configuration)
+    rest = solve_start_equilibrium(step, theta, mover.moved_joint_start_positions, mover.start_configuration)
     return replace(mover, step=step, theta=theta, start_equilibrium=rest)
 
 
@@ -210,7 +210,7 @@ def _steady(rows: PlanResidualsAndLimits, finer: PathSimulator, w: Array) -> boo
         mover.trajectories(rows.point, mover.simulate_path(w).state[::every])
         for mover, every in ((rows.simulator, 1), (finer, 2))
     )
-    change = (other - own)[rows.simulator.standstill_nodes]
+    change = (other - own)[rows.simulator.standstill_node_indices]
     place = np.linalg.norm(change[:, 0], axis=1).max()
     speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / rows.simulator.step.time_step
     reached, rest = rows.options.position_tolerance, rows.options.rest_speed_tolerance
@@ -242,26 +242,26 @@ def _scenarios(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> list
 
 def _point_slopes(rows: PlanResidualsAndLimits, w: Array, known: ParameterCovariance) -> Array:
     """Derivative of the point's place at every node of the end by the uncertain parameters, shape (nodes, 3, count)."""
-    mover, n, end = rows.simulator, rows.simulator.step.system.n_coordinates, rows.simulator.standstill_nodes
+    mover, n, end = rows.simulator, rows.simulator.step.system.n_coordinates, rows.simulator.standstill_node_indices
     rollout = mover.simulate_path(w, names=known.parameter_names)
     assert rollout.state_sensitivity is not None
     _, by_q = rows.point.positions_and_jacobian(rollout.state[end, :n], mover.theta)
     return np.einsum("tiq,tqd->tid", by_q[:, :3], rollout.state_sensitivity[end, :n, : len(known.parameter_names)])
 
 
-def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: ParameterCovariance) -> MotionPlan:
+def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: ParameterCovariance) -> TargetMotionPlan:
     mover = rows.simulator
     rollout, std = mover.simulate_path(shot.w), None
     if len(known.parameter_names):
         slope = _point_slopes(rows, shot.w, known)[-1]
         std = np.sqrt(np.maximum(np.diag(slope @ known.covariance @ slope.T), 0.0))
     own = mover.trajectories(rows.point, rollout.state)
-    end = mover.standstill_nodes
+    end = mover.standstill_node_indices
     error = float(np.max(np.linalg.norm(own[end, 0] - rows.target, axis=1)))
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
-    course = rows.reference_path
+    course = rows.reference_point_positions
     off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
-    broken = rows.violated_limits(rows.limit_values(rollout, shot.w).value)
+    broken = rows.worst_violation_per_limit(rows.limited_quantity_values(rollout, shot.w).value)
     message = shot.message
     for what, (name, value, bound) in broken.items():
         message += f"; {name} passes its limit of {what}: {value:.4g} where {bound:.4g} is allowed"
@@ -271,21 +271,25 @@ def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: Para
         message += "; take a longer plan.duration, a nearer place, or a higher plan.limits where the machine allows it"
     # what errs least over all likely parameters need not arrive with the likeliest ones
     doubt = float(np.linalg.norm(std)) if std is not None and rows.options.minimize_parameter_sensitivity else 0.0
-    far = not error <= REACHED_TOLERANCE_FACTOR * max(rows.options.position_tolerance, doubt)
+    far = not error <= TARGET_REACHED_TOLERANCE_FACTOR * max(rows.options.position_tolerance, doubt)
     if shot.is_converged and far:
         message = f"the best motion within the limits leaves the point {1e3 * error:.3g} mm from its place"
         message += "; take a longer plan.duration or a nearer place"
     reached = shot.is_converged and not broken and not far
     errors = error, swing, off_path, std, shot.n_evaluations
-    return MotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)
+    return TargetMotionPlan(mover, shot.w, rollout, reached, message, rows.point.names[0], rows.target, *errors)
 
 
 def _shortest(
-    found: MotionPlan, options: PlanOptions, h: float, attempt: Callable[[float], MotionPlan], progress: Progress
-) -> MotionPlan:
+    found: TargetMotionPlan,
+    options: PlanOptions,
+    h: float,
+    attempt: Callable[[float], TargetMotionPlan],
+    progress: Progress,
+) -> TargetMotionPlan:
     """Halve the gap between a duration with which the goal is reached and one with which it is not, in steps of h."""
 
-    def good(one: MotionPlan) -> bool:
+    def good(one: TargetMotionPlan) -> bool:
         return one.is_successful and one.max_residual_speed <= options.rest_speed_tolerance
 
     if not good(found):

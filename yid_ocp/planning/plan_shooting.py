@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 from yid_ocp.arrays import Array
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.planning.joint_paths import FramePositions, PathSimulator, PlanOptions
+from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanOptions
 
 _LIMIT_NODE_STRIDE = 2  # nodes between those at which limits on what moves freely are asked for
 _QUASI_STATIC_DISTANCE = 1.0  # RMS distance of the joints from the quasi-static motion that counts as one [rad or m]
@@ -24,7 +24,7 @@ _ACCELERATION_WEIGHT = 1e-3  # of their mean square, in parts of their limit: of
 
 
 @dataclass(frozen=True)
-class ValueWithJacobian:
+class _ValueWithJacobian:
     """A vector (nr,) and its Jacobian (nr, nw) by the spline coefficients."""
 
     value: Array
@@ -42,41 +42,41 @@ class _LimitRows:
     row_names: tuple[str, ...]  # joint, spring or frame of each row
 
 
-def scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array, Array, Array]:
+def limit_units_and_scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array, Array, Array]:
     """Units of all limit rows, and their lower and upper bounds in these units, shape (rows,) each."""
     unit, lower, upper = (np.concatenate([getattr(rows, k) for rows in limits]) for k in ("unit", "lower", "upper"))
     return unit, lower / unit, upper / unit
 
 
-def _stacked(parts: list[ValueWithJacobian]) -> ValueWithJacobian:
+def _stacked(parts: list[_ValueWithJacobian]) -> _ValueWithJacobian:
     """Vectors and Jacobians stacked one below the other."""
     slopes = [part.jacobian for part in parts]
     known = [slope for slope in slopes if slope is not None]
     value = np.concatenate([part.value for part in parts]) if parts else np.zeros(0)
-    return ValueWithJacobian(value, np.vstack(known) if len(known) == len(slopes) and known else None)
+    return _ValueWithJacobian(value, np.vstack(known) if len(known) == len(slopes) and known else None)
 
 
 @dataclass(eq=False)
 class PlanResidualsAndLimits:
-    """Residuals and limit rows of a planned motion, for one set of parameters."""
+    """Goal residuals and limited quantities of a planned motion, for one set of model parameters."""
 
     simulator: PathSimulator
     options: PlanOptions
-    point: FramePositions  # of the frame that is to arrive, and of all frames that are to rest
+    point: FramePositionFunction  # of the frame that is to arrive, and of all frames that are to rest
     target: Array  # (3,), where it is to arrive [m]
     quasi_static_coefficients: Array  # (K, nc); of motions that do equally well, the one nearest to them is wanted
-    inside: FramePositions | None = None  # frames that stay in the box
+    inside: FramePositionFunction | None = None  # frames that stay in the box
 
     def __post_init__(self) -> None:
         system = self.simulator.step.system
-        self._joints = [system.mechanism.joints[i] for i in self.simulator.joint_indices]
+        self._joints = [system.mechanism.joints[i] for i in self.simulator.moved_joint_indices]
         able = self.options.limits.effort_fraction
         self._effort_limit = able * np.array([joint.effort_limit for joint in self._joints])
         self._springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
         self.limit_rows = self._bounded()
 
     @property
-    def reference_path(self) -> Array | None:
+    def reference_point_positions(self) -> Array | None:
         """Reference position of the point at every node, shape (N + 1, 3) [m]; None where only the end counts."""
         if self.options.goal != "path":
             return None
@@ -87,7 +87,7 @@ class PlanResidualsAndLimits:
         # the clock starts and stops gently as well, so that the way is one that can be followed
         return np.array(CubicSpline(at, places, bc_type="clamped")(np.minimum(self.simulator.node_times, at[-1])))
 
-    def goal_residual(self, rollout: Rollout, w: Array) -> ValueWithJacobian:
+    def _goal_residual(self, rollout: Rollout, w: Array) -> _ValueWithJacobian:
         """Goal residual: distances and speeds over their tolerances, and weak regularisation of the motion."""
         mover, options, h = self.simulator, self.options, self.simulator.step.time_step
         n, size = mover.step.system.n_coordinates, w.size
@@ -95,14 +95,14 @@ class PlanResidualsAndLimits:
         by_w = None
         if rollout.state_sensitivity is not None:
             by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n, -size:])
-        end, course = mover.standstill_nodes, self.reference_path
+        end, course = mover.standstill_node_indices, self.reference_point_positions
         after, before, reached = end[1:], end[1:] - 1, options.position_tolerance
         by_speed = None if by_w is None else (by_w[after] - by_w[before]) / h
         parts = [_rows(at[end, :3] - self.target, None if by_w is None else by_w[end, :3], reached)]
         parts.append(_rows((at[after] - at[before]) / h, by_speed, options.rest_speed_tolerance))
         if course is not None:
             parts.append(_rows(at[:, :3] - course, None if by_w is None else by_w[:, :3], reached))
-        bend = mover.path.control_point_matrix(2) / options.limits.max_acceleration
+        bend = mover.path.coefficients_to_control_points_matrix(2) / options.limits.max_acceleration
         parts.append(_rows(bend @ w, _by_coefficients(bend, w), _ACCELERATION_WEIGHT**-0.5))
         parts.append(_rows(w - self.quasi_static_coefficients, np.eye(size), _QUASI_STATIC_DISTANCE))
         if options.effort_weight:
@@ -114,22 +114,22 @@ class PlanResidualsAndLimits:
             parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
         return _stacked(parts)
 
-    def limit_values(self, rollout: Rollout, w: Array) -> ValueWithJacobian:
-        """Values of the limit rows of `limit_rows` along a motion, in their own units."""
+    def limited_quantity_values(self, rollout: Rollout, w: Array) -> _ValueWithJacobian:
+        """Values of the limited quantities along a motion, in the order of `limit_rows` and in their own units."""
         mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
-        controls = [mover.path.control_point_matrix(order) for order in (1, 2)]
-        parts = [ValueWithJacobian((matrix @ w).ravel(), _by_coefficients(matrix, w)) for matrix in controls]
+        controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
+        parts = [_ValueWithJacobian((matrix @ w).ravel(), _by_coefficients(matrix, w)) for matrix in controls]
         finite = np.isfinite(self._effort_limit)
         by_effort = None if pushed is None else pushed[every, finite, -size:].reshape(-1, size)
-        parts.append(ValueWithJacobian(rollout.effort[every, finite].ravel(), by_effort))
+        parts.append(_ValueWithJacobian(rollout.effort[every, finite].ravel(), by_effort))
         if self.options.limits.max_spring_angle is not None:
             slope = None if moved is None else moved[every, self._springs, -size:].reshape(-1, size)
-            parts.append(ValueWithJacobian(rollout.state[every, self._springs].ravel(), slope))
+            parts.append(_ValueWithJacobian(rollout.state[every, self._springs].ravel(), slope))
         if self.inside is not None:
             at, by_q = self.inside.positions_and_jacobian(rollout.state[every, :n], mover.theta)
             slope = None if moved is None else np.einsum("tiq,tqd->tid", by_q, moved[every, :n, -size:])
-            parts.append(ValueWithJacobian(at.ravel(), None if slope is None else slope.reshape(-1, size)))
+            parts.append(_ValueWithJacobian(at.ravel(), None if slope is None else slope.reshape(-1, size)))
         return _stacked(parts)
 
     def _bounded(self) -> list[_LimitRows]:
@@ -137,7 +137,7 @@ class PlanResidualsAndLimits:
         names = tuple(joint.name for joint in self._joints)
         speed = limits.velocity_fraction * np.array([joint.velocity_limit for joint in self._joints])
         sharp = np.full(len(names), limits.max_acceleration)
-        count = len(mover.path.control_point_matrix())
+        count = len(mover.path.coefficients_to_control_points_matrix())
         found = [_even("velocity [rad/s or m/s]", names, speed, count - 1)]
         found.append(_even("acceleration [rad/s^2 or m/s^2]", names, sharp, count - 2))
         finite = np.isfinite(self._effort_limit)
@@ -154,15 +154,15 @@ class PlanResidualsAndLimits:
             found.append(_LimitRows("place [m]", low, high, np.full(len(low), 0.1), axes * nodes))
         return found
 
-    def limits_with_values(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
-        """Every kind of limit with its rows of `limit_values`."""
+    def limits_with_quantity_values(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
+        """Every kind of limit with its rows of `limited_quantity_values`."""
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
-    def violated_limits(self, value: Array) -> dict[str, tuple[str, float, float]]:
+    def worst_violation_per_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
         """The worst violated row of each kind of limit: its name, value and bound."""
         found = {}
-        for rows, own in self.limits_with_values(value):
+        for rows, own in self.limits_with_quantity_values(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
             worst = int(np.argmax(over)) if len(own) else 0
             if len(own) and over[worst] > 1e-4:
@@ -176,10 +176,10 @@ def _by_coefficients(matrix: Array, w: Array) -> Array:
     return np.einsum("tk,ji->tjki", matrix, np.eye(w.shape[1])).reshape(-1, w.size)
 
 
-def _rows(value: Array, slope: Array | None, unit: float) -> ValueWithJacobian:
+def _rows(value: Array, slope: Array | None, unit: float) -> _ValueWithJacobian:
     """Rows of nodes (N, m), so that the sum of their squares is the mean over the nodes in squares of the unit."""
     scale = 1.0 / (unit * np.sqrt(len(value)))
-    return ValueWithJacobian(scale * value.ravel(), None if slope is None else scale * slope.reshape(value.size, -1))
+    return _ValueWithJacobian(scale * value.ravel(), None if slope is None else scale * slope.reshape(value.size, -1))
 
 
 def _even(what: str, names: tuple[str, ...], limit: Array, count: int) -> _LimitRows:
@@ -195,7 +195,7 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 @dataclass(frozen=True)
 class PlanShootingResult:
-    """Result of the search for a planned motion, of coefficients w (K, nc); converged is one within the limits."""
+    """Result of a search for a planned motion: coefficients w (K, nc), converged only if within the limits."""
 
     w: Array
     cost: float
@@ -204,28 +204,28 @@ class PlanShootingResult:
     n_evaluations: int
 
 
-class PlanShooting:
+class PlanShootingProblem:
     """Shooting problem with the residuals of several parameter cases and the limits of the first case."""
 
     def __init__(self, cases: Sequence[PlanResidualsAndLimits], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
-        self._last: tuple[Array, tuple[ValueWithJacobian, ValueWithJacobian]] | None = None
-        self._unit, self._lower, self._upper = scaled_bounds(self._cases[0].limit_rows)
+        self._last: tuple[Array, tuple[_ValueWithJacobian, _ValueWithJacobian]] | None = None
+        self._unit, self._lower, self._upper = limit_units_and_scaled_bounds(self._cases[0].limit_rows)
         self.evaluations = 0
 
-    def residual_and_limits(self, x: Array) -> tuple[ValueWithJacobian, ValueWithJacobian]:
+    def _residual_and_limit_values(self, x: Array) -> tuple[_ValueWithJacobian, _ValueWithJacobian]:
         """Residual and scaled limit values with their Jacobians; not finite where a rollout fails."""
         if self._last is None or not np.array_equal(self._last[0], x):
             self.evaluations += 1
             w = x.reshape(self._shape)
             rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
-            parts = [case.goal_residual(rollout, w) for case, rollout in zip(self._cases, rollouts, strict=True)]
+            parts = [case._goal_residual(rollout, w) for case, rollout in zip(self._cases, rollouts, strict=True)]
             whole, scale = _stacked(parts), 1.0 / np.sqrt(len(self._cases))
-            limits = self._cases[0].limit_values(rollouts[0], w)
+            limits = self._cases[0].limited_quantity_values(rollouts[0], w)
             assert whole.jacobian is not None
             assert limits.jacobian is not None
-            residual = ValueWithJacobian(scale * whole.value, scale * whole.jacobian)
-            scaled = ValueWithJacobian(limits.value / self._unit, limits.jacobian / self._unit[:, None])
+            residual = _ValueWithJacobian(scale * whole.value, scale * whole.jacobian)
+            scaled = _ValueWithJacobian(limits.value / self._unit, limits.jacobian / self._unit[:, None])
             self._last = np.array(x), (residual, scaled)
         return self._last[1]
 
@@ -246,7 +246,7 @@ class PlanShooting:
             stop = {"max_nfev": iterations, "ftol": 1e-6, "xtol": 1e-7, "gtol": 1e-8}
             found = least_squares(value, x, jac=slope, bounds=(low, high), x_scale=1.0, **stop)
             x, ended = found.x, found.status > 0
-            reached = self.residual_and_limits(x)[1].value
+            reached = self._residual_and_limit_values(x)[1].value
             over = np.vstack([reached - self._upper, self._lower - reached])
             passed = float(np.max(over, initial=0.0))
             if passed <= _LIMIT_TOLERANCE or not np.isfinite(passed):
@@ -255,7 +255,7 @@ class PlanShooting:
             if passed > 0.25 * before:
                 penalty = min(_PENALTY_GROWTH * penalty, _MAX_PENALTY)
             before = passed
-        residual = self.residual_and_limits(x)[0].value
+        residual = self._residual_and_limit_values(x)[0].value
         finished = bool(ended and passed <= _LIMIT_TOLERANCE)
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
@@ -265,7 +265,7 @@ class PlanShooting:
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
-        residual, limits = self.residual_and_limits(x)
+        residual, limits = self._residual_and_limit_values(x)
         assert residual.jacobian is not None
         assert limits.jacobian is not None
         root = np.sqrt(penalty)

@@ -20,23 +20,23 @@ from yid_ocp.analysis.experiment_design import DEFAULT_TORQUE_STD
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError, SolverError
-from yid_ocp.inference.linearized_residual import residual_without_weak_priors
-from yid_ocp.inference.whitening import whitened_at
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.step import Step, compile_step_like
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.planning.joint_paths import (
-    FramePositions,
+    FramePositionFunction,
     PathSimulator,
     PlanOptions,
     SplinePath,
-    ordered_start_positions,
+    ordered_start_joint_positions,
     solve_start_equilibrium,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.signal_filters import effort_filter
-from yid_ocp.sensors.joints import POSITION_GROUP
+from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME
 
 _PLANNED_RECORDING_NAME = "planned"
 _MIN_POINT_RATE = 20.0  # at least so often a slow sensor's information is spread over the motion [Hz]
@@ -82,13 +82,13 @@ class PlannedExperiment:
         theta = step.system.parameters.vector(known)
         first = np.array(episode.initial_known_coordinates)
         if options.start_joint_positions is not None:
-            first = ordered_start_positions(step.system, options.start_joint_positions)
+            first = ordered_start_joint_positions(step.system, options.start_joint_positions)
         path = SplinePath(options.duration, options.n_spline_coefficients)
         mover = PathSimulator(step, theta, solve_start_equilibrium(step, theta, first), path, options.hold_duration)
         _check_long_enough(problem, float(mover.node_times[-1]))
         return PlannedExperiment(problem, known, mover, tuple(names) or problem.free)
 
-    def noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
+    def _noise_free_recording(self, w: Array, fastest: float = np.inf) -> Recording:
         """Noise-free predicted recording of a motion (K, nc); it states the standard deviations of its sensors.
 
         `fastest` is the highest sample rate of points [Hz]; those of a faster sensor are thinned, their information per
@@ -102,7 +102,7 @@ class PlannedExperiment:
         assert joints is not None
         period = float(np.median(np.diff(joints.t)))
         t = np.asarray(period * np.arange(int(np.floor(duration / period + 1e-9)) + 1), float)
-        impulse = np.cumsum(np.vstack([np.zeros((1, len(mover.joint_indices))), rollout.effort]), axis=0)
+        impulse = np.cumsum(np.vstack([np.zeros((1, len(mover.moved_joint_indices))), rollout.effort]), axis=0)
         impulse = impulse * mover.step.time_step
         begin, end = (
             np.stack([np.interp(at, mover.node_times, x) for x in impulse.T], axis=1) for at in (t, t + period)
@@ -118,7 +118,7 @@ class PlannedExperiment:
             per_sample = errors.torque_std / min(1.0, np.sqrt(period / mover.step.time_step))
             stds = [errors.angle_std, per_sample, errors.torque_bias_std]
         group = JointGroup(
-            system.prescribed, t, mover.start_positions + mover.path.basis_values(t) @ w,
+            system.prescribed, t, mover.moved_joint_start_positions + mover.path.basis_values(t) @ w,
             effort=None if joints.effort is None else effort, effort_kind="mean",
             position_std=stds[0], effort_std=stds[1], effort_bias_std=stds[2],
         )  # fmt: skip
@@ -126,12 +126,12 @@ class PlannedExperiment:
         groups = [self._seen(samples, frames, q, fastest) for samples, frames in self._points]
         return Recording(group, tuple(groups), "a planned motion", "yid_ocp plan", _PLANNED_RECORDING_NAME)
 
-    def _seen(self, samples: Measurements, frames: FramePositions, q: Array, fastest: float) -> PointGroup:
+    def _seen(self, samples: Measurements, frames: FramePositionFunction, q: Array, fastest: float) -> PointGroup:
         """Points of one sensor along the motion, their information per second as in the recording."""
         mover, base = self.simulator, self.configured_problem.episodes[0]
         sensor, spent = samples.sensor, base.grid.steps * base.grid.time_step
-        inverse = np.sum(np.where(samples.is_used, samples.weight**2, 0.0), axis=0)
-        rate = float(np.max(np.count_nonzero(samples.is_used, axis=0))) / spent
+        inverse = np.sum(np.where(samples.used_output_mask, samples.weight**2, 0.0), axis=0)
+        rate = float(np.max(np.count_nonzero(samples.used_output_mask, axis=0))) / spent
         stride = max(1, round(1.0 / (mover.step.time_step * min(max(rate, _MIN_POINT_RATE), fastest))))
         at = np.arange(0, len(mover.node_times), stride)
         dense = 1.0 / (stride * mover.step.time_step)
@@ -145,11 +145,11 @@ class PlannedExperiment:
         return PointGroup(*points, times, places, std.copy(), group.sensor, pose=group.pose)
 
     @cached_property
-    def _points(self) -> list[tuple[Measurements, FramePositions]]:
+    def _points(self) -> list[tuple[Measurements, FramePositionFunction]]:
         """Measurements of points, each with their frames."""
         system, measured = self.simulator.step.system, self.configured_problem.episodes[0].measurements
         seen = [samples for samples in measured if samples.sensor.point_names]
-        return [(samples, FramePositions(system, samples.sensor.frame_names)) for samples in seen]
+        return [(samples, FramePositionFunction(system, samples.sensor.frame_names)) for samples in seen]
 
     def _options(self, **changes: object) -> ProblemOptions:
         """The problem's options for the planned recording alone, which states its points' noise itself."""
@@ -165,12 +165,12 @@ class PlannedExperiment:
 
     @property
     def zero_coefficients(self) -> Array:
-        """Spline coefficients of no motion, shape (K, nc)."""
-        return np.zeros((self.simulator.path.n_coefficients, len(self.simulator.joint_indices)))
+        """Zero spline coefficients, with which the arms stay where they start, shape (K, nc)."""
+        return np.zeros((self.simulator.path.n_coefficients, len(self.simulator.moved_joint_indices)))
 
-    def estimation_problem(self, w: Array) -> EstimationProblem:
+    def planned_estimation_problem(self, w: Array) -> EstimationProblem:
         """The configured estimation problem with the planned recording in place of its own, at `parameter_values`."""
-        return self._problem(self.configured_problem.step, self.noise_free_recording(w), self._options())
+        return self._problem(self.configured_problem.step, self._noise_free_recording(w), self._options())
 
     def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
         free = [name for name in self.free_parameters if name in self.configured_problem.free]
@@ -178,21 +178,21 @@ class PlannedExperiment:
         problem = EstimationProblem(step, [recording], free, options, self.parameter_values, (), extra)
         return problem.with_free_subset(self.free_parameters)
 
-    def configured_sensitivities(self, w: Array) -> Array:
-        """Sensitivities of the planned recording in the configured problem, without columns of torque offsets.
+    def configured_problem_sensitivities(self, w: Array) -> Array:
+        """Whitened sensitivities of the planned recording to relative changes of the configured problem's unknowns.
 
         `SolverError` where the motion cannot be followed by its torques.
         """
-        return self._weighted(self.estimation_problem(w))
+        return self._weighted(self.planned_estimation_problem(w))
 
     @property
-    def recorded_sensitivities(self) -> Array:
-        """Sensitivities of the existing recordings in the configured problem."""
+    def existing_recording_sensitivities(self) -> Array:
+        """Whitened sensitivities of existing recordings to relative changes of the configured problem's unknowns."""
         problem = self.configured_problem.with_parameter_values(self.parameter_values)
         return self._weighted(problem.with_free_subset(self.free_parameters))
 
     def _weighted(self, problem: EstimationProblem) -> Array:
-        problem = whitened_at(problem, problem.initial_unknowns)
+        problem = problem_whitened_at(problem, problem.initial_unknowns)
         evaluation = problem.evaluate(problem.initial_unknowns)
         if not evaluation.ok:
             raise SolverError(f"the motion cannot be followed by its torques: {evaluation.message}")
@@ -203,7 +203,7 @@ class PlannedExperiment:
 
         That is not something that a sensor sees.
         """
-        jacobian = residual_without_weak_priors(problem, evaluation)[1] * _sizes(problem)
+        jacobian = linearization_without_weak_priors(problem, evaluation)[1] * _sizes(problem)
         own = np.array([name.split("[")[0] in self.free_parameters for name in problem.unknown_names])
         jacobian[problem.residual_rows.stated_priors] *= ~own
         return jacobian
@@ -211,7 +211,7 @@ class PlannedExperiment:
     @cached_property
     def _known(self) -> EstimationProblem:
         """The problem in which the motion is known and torques are measured."""
-        recording = self.noise_free_recording(self.zero_coefficients, _MAX_SEARCH_POINT_RATE)
+        recording = self._noise_free_recording(self.zero_coefficients, _MAX_SEARCH_POINT_RATE)
         joints = recording.joints
         assert joints is not None
         sensors = dict(self._options().sensors)
@@ -221,18 +221,18 @@ class PlannedExperiment:
         if self.configured_problem.system.driven:
             # how wrong the motion may be is said by `_blur`
             joints = replace(joints, position_std=None)
-            sensors.pop(POSITION_GROUP, None)
+            sensors.pop(JOINT_POSITION_GROUP_NAME, None)
         options = self._options(huber_threshold=np.inf, weak_prior_factor=0.0, weighting="whitened", sensors=sensors)
         return self._problem(self.simulator.step, replace(recording, joints=joints), options)
 
     @cached_property
     def unknown_scales(self) -> Array:
-        """Size to which relative changes of each of the problem's unknowns refer, in the order of `column_names`."""
+        """Size of every unknown of the search problem to which its relative change refers, in column order."""
         return _sizes(self._known)
 
     @cached_property
     def column_names(self) -> tuple[str, ...]:
-        """Names of the columns of `search_sensitivities`: parameters, other unknowns, constant errors of torques."""
+        """Columns of `search_problem_sensitivities`: parameters, other unknowns, constant errors of torques."""
         return (*self._known.unknown_names, *(f"offset of {name}" for name in self._offset_std))
 
     @cached_property
@@ -247,17 +247,19 @@ class PlannedExperiment:
     def _offsets(self) -> Array:
         """Columns of the constant errors, in units of their standard deviations, priors below, (nr + no, no)."""
         problem, std = self._known, self._offset_std
-        found = np.zeros((problem.residual_rows.without_weak_priors.stop, len(std)))
+        found = np.zeros((problem.residual_rows.slice_without_weak_priors.stop, len(std)))
         for samples, rows in zip(problem.episodes[0].measurements, problem.residual_rows.measurements[0], strict=True):
             if not samples.sensor.effort_joints:
                 continue
-            joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[samples.is_used]
+            joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[samples.used_output_mask]
             for i, (name, size) in enumerate(std.items()):
                 own = joint == samples.sensor.effort_joints.index(name)
-                found[rows, i] = samples.decorrelate(np.where(own, size * samples.weight[samples.is_used], 0.0))
+                found[rows, i] = samples.decorrelate(
+                    np.where(own, size * samples.weight[samples.used_output_mask], 0.0)
+                )
         return np.vstack([found, np.eye(len(std))])
 
-    def search_sensitivities(self, w: Array) -> Array | None:
+    def search_problem_sensitivities(self, w: Array) -> Array | None:
         """Whitened sensitivities of all measurements to relative changes of the unknowns, (nr, columns).
 
         With rows for the priors of nuisances; None where the motion cannot be simulated.
@@ -288,7 +290,7 @@ class PlannedExperiment:
         data = problem.residual_rows.data.stop
         if not self.configured_problem.system.driven:
             return np.zeros((data, 0)), np.zeros(0)
-        nc = len(mover.joint_indices)
+        nc = len(mover.moved_joint_indices)
         waves = _splines(mover.node_times, _PATH_ERROR_BANDWIDTH)
         path = np.asarray(mover.joint_positions(self.zero_coefficients))
 
@@ -312,13 +314,13 @@ class PlannedExperiment:
         u, s, _ = np.linalg.svd(blur @ (vectors[:, kept] / np.sqrt(values[kept])), full_matrices=False)
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
-    def sensitivity_derivatives(self, w: Array, rows: Array) -> Array | None:
-        """Forward differences of `search_sensitivities` by the spline coefficients, (w.size, nr, columns)."""
+    def sensitivity_derivatives_by_coefficients(self, w: Array, rows: Array) -> Array | None:
+        """Forward differences of `search_problem_sensitivities` by the spline coefficients, (w.size, nr, columns)."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()
             moved[i] += _SPLINE_DIFFERENCE_STEP
-            there = self.search_sensitivities(moved.reshape(w.shape))
+            there = self.search_problem_sensitivities(moved.reshape(w.shape))
             return None if there is None else (there - rows) / _SPLINE_DIFFERENCE_STEP
 
         found = map_with_batched_calls(one, range(w.size))

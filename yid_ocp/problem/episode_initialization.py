@@ -13,9 +13,9 @@ from yid_ocp.errors import DataError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, InitialState, truncate_episode
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.model_functions import NodeValues
+from yid_ocp.problem.model_functions import NodeStateValues
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads
-from yid_ocp.problem.unknown_vector import initial_state_limits
+from yid_ocp.problem.unknown_vector import initial_state_offset_limits
 
 _MAX_FIRST_SAMPLE_TIME = 1.0
 """Latest time at which a point's first sample still shows the initial equilibrium [s]."""
@@ -25,7 +25,7 @@ _MAX_REMAINING_ERROR_FRACTION = 0.5
 """Largest fraction of that error that may remain at another equilibrium."""
 
 
-def with_observed_equilibrium(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+def with_observed_equilibrium_and_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
     """Episode with the initial equilibrium that its points show and with gear loads free of effort noise.
 
     Parameters
@@ -44,7 +44,7 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
     seen = [found for samples in episode.measurements if (found := _first(samples, episode.grid.time_step)) is not None]
     if not seen:
         return episode
-    own, n = predictor.episode_theta(episode, theta), predictor.system.n_coordinates
+    own, n = predictor.theta_with_episode_values(episode, theta), predictor.system.n_coordinates
     offset = np.zeros(len(predictor.unknowns.initial_state_names))
     least = predictor.initial_state(episode, own, offset, ())
     error = _error(predictor, seen, least, own)
@@ -64,7 +64,7 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
 
 def _first(samples: Measurements, time_step: float) -> Measurements | None:
     """The first sample of points, as if it were taken at node 0; None where it comes too late."""
-    rows = np.flatnonzero(samples.is_used.any(axis=1))[:1]
+    rows = np.flatnonzero(samples.used_output_mask.any(axis=1))[:1]
     if (
         not samples.sensor.point_names
         or not len(rows)
@@ -82,9 +82,9 @@ def _error(predictor: EpisodePredictor, seen: Sequence[Measurements], start: Ini
     state = start.state[None]
     squares: list[Array] = []
     for samples in seen:
-        read = predictor.model_functions.compiled_sensor(samples.sensor, predictor.unknowns.free_parameters)
-        predicted = read(NodeValues.along_trajectory(predictor.step, state), theta).output
-        squares.append(samples.whitened_residual(predicted)[samples.is_used] ** 2)
+        read = predictor.model_functions.compiled_sensor_function(samples.sensor, predictor.unknowns.free_parameters)
+        predicted = read(NodeStateValues.from_trajectory(predictor.step, state), theta).output
+        squares.append(samples.whitened_residual(predicted)[samples.used_output_mask] ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
@@ -113,7 +113,7 @@ _HELD_OUT_ITERATIONS = 3
 
 
 def estimate_initial_state_offset(predictor: EpisodePredictor, episode: Episode, theta: Array, std: Array) -> Array:
-    """Offset of the initial state from equilibrium, estimated from `_HELD_OUT_START_WINDOW` seconds and its prior.
+    """Offset of the initial state from equilibrium, estimated from the first measurements and its prior.
 
     Zero where the rollout fails; `std` is the prior's, (number of estimated rows,).
     """
@@ -123,7 +123,7 @@ def estimate_initial_state_offset(predictor: EpisodePredictor, episode: Episode,
     short = truncate_episode(episode, max(round(_HELD_OUT_START_WINDOW / predictor.step.time_step), 2))
     weight = 1.0 / std
     guess: Array | None = None
-    limit = initial_state_limits(predictor.system, predictor.unknowns.initial_state_names)
+    limit = initial_state_offset_limits(predictor.system, predictor.unknowns.initial_state_names)
     for _ in range(_HELD_OUT_ITERATIONS):
         result = predictor.predict_episode(short, theta, offset, True, guess)
         if isinstance(result, str) or result.output_sensitivities is None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.rollout import adjoint_gradient, rollout_inputs, simulate_batch
+from yid_ocp.integrator.rollout import adjoint_gradient, checked_rollout_inputs, simulate_batch
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
@@ -22,12 +22,12 @@ from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.model_functions import (
     CorrectedInputs,
     ModelFunctions,
-    NodeValues,
+    NodeStateValues,
     node_velocity,
     node_velocity_adjoint,
 )
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.recorded_inputs import mean_step_inputs, mean_step_inputs_by_delay
+from yid_ocp.problem.recorded_inputs import mean_step_input_delay_derivative, mean_step_inputs
 from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeSmoother
 from yid_ocp.problem.unknown_vector import UnknownVectorLayout
 
@@ -68,7 +68,7 @@ class EpisodePredictor:
     # -- the start ----------------------------------------------------------------------------------------------------
 
     @property
-    def estimated_state_indices(self) -> tuple[int, ...]:
+    def estimated_initial_state_indices(self) -> tuple[int, ...]:
         """Indices of the estimated components of the initial state, in the order of `initial_state_names`."""
         joints, n = self.system.mechanism.joint_index, self.system.n_coordinates
         hidden = list(self.system.internal_coordinates)
@@ -85,15 +85,15 @@ class EpisodePredictor:
         samples = episode.measurements
         if self.options.start_point_noise_std is not None:
             weight = 1.0 / self.options.start_point_noise_std
-            samples = tuple(replace(s, weight=np.where(s.is_used, weight, 0.0)) for s in samples)
+            samples = tuple(replace(s, weight=np.where(s.used_output_mask, weight, 0.0)) for s in samples)
         own, window = self._with(theta, episode.known_parameters), self.options.start_fit_window
         start = self.model_functions.initial_state_fitter.fit_to_points(
             episode.initial_known_coordinates, samples, own, window, episode.prescribed_path
         )
         return replace(episode, fixed_initial_state=start)
 
-    def episode_theta(self, episode: Episode, theta: Array) -> Array:
-        """theta with the episode's own values: known ones, and those fitted along with its initial state."""
+    def theta_with_episode_values(self, episode: Episode, theta: Array) -> Array:
+        """Parameter vector theta with the episode's own values: known ones and those fitted with its initial state."""
         fitted: Mapping[str, float] = (
             {} if episode.fixed_initial_state is None else episode.fixed_initial_state.fitted_parameters
         )
@@ -113,7 +113,7 @@ class EpisodePredictor:
         Parameters
         ----------
         theta : ndarray, shape (ntheta,)
-            From `episode_theta`.
+            From `theta_with_episode_values`.
         offset : ndarray, shape (number of estimated rows,)
             Of an estimated initial state from equilibrium.
         wanted : tuple of str
@@ -121,7 +121,7 @@ class EpisodePredictor:
         guess : ndarray, optional, shape (n,)
             Configuration near the equilibrium; when absent `Episode.equilibrium_guess`, else that of least energy.
         """
-        nx, rows = self.step.sizes["nx"], list(self.estimated_state_indices)
+        nx, rows = self.step.sizes["nx"], list(self.estimated_initial_state_indices)
         by_offset = np.zeros((nx, len(rows)))
         by_offset[rows, np.arange(len(rows))] = 1.0
         rest: Equilibrium | None = None
@@ -145,7 +145,7 @@ class EpisodePredictor:
         state[rows] += offset
         return InitialState(state, np.hstack([by_theta, by_offset]), rest, "")
 
-    def has_uncorrected_inputs(self, episode: Episode, theta: Array) -> bool:
+    def uses_inputs_as_recorded(self, episode: Episode, theta: Array) -> bool:
         """Whether no effect corrects the episode's inputs, times or tracked reference: none is free or non-neutral."""
         wanted = self.unknowns.free_parameters
         inputs = self.corrected_inputs(episode, theta, wanted)
@@ -161,7 +161,7 @@ class EpisodePredictor:
         ]
         if self._follows_momenta and self.model_functions.momentum_shift.is_active(theta, wanted):
             return False
-        slopes += self.model_functions.input_corrections.effort_time_constants(theta, wanted) or ()
+        slopes += self.model_functions.input_corrections.effort_lag_time_constants(theta, wanted) or ()
         for samples in episode.measurements:
             slopes += self._delay_in_steps(samples, theta, wanted) or ()
         return not any(np.any(x) for x in slopes) and all(np.array_equal(a, b) for a, b in pairs)
@@ -173,7 +173,7 @@ class EpisodePredictor:
 
     # -- what drives the rollout --------------------------------------------------------------------------------------
 
-    def tracking_inputs(
+    def corrected_inputs_with_momentum_shift(
         self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> CorrectedInputs:
         """Corrected inputs of an episode, with the momentum shift of its tracking filter's reference.
@@ -197,7 +197,7 @@ class EpisodePredictor:
         )
 
     def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
-        """True torques, angles and paths of an episode by the model's input effects, with derivatives by `wanted`."""
+        """Torques, angles and paths corrected by the effects on inputs, with derivatives by the parameters `wanted`."""
         corrections = self.model_functions.input_corrections
         torque, arm, path = episode.torque, episode.measured_driven_angles, episode.prescribed_path
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
@@ -209,7 +209,7 @@ class EpisodePredictor:
             where = (joints, self.system.driven, episode.grid, episode.name)
             delay, by_delay = corrections.torque_delay(theta, wanted)
             torque = mean_step_inputs(*where, delay, self.system.servos)
-            by_recorded = mean_step_inputs_by_delay(*where, delay, self.system.servos)[:, :, None] * by_delay
+            by_recorded = mean_step_input_delay_derivative(*where, delay, self.system.servos)[:, :, None] * by_delay
         if errors is not None:
             # what multiplies or follows a reading would else take its noise for torque, and shrink to be rid of it
             torque, first = torque - errors.recorded_torque_noise, first - errors.recorded_torque_noise[0]
@@ -222,11 +222,14 @@ class EpisodePredictor:
             if by_recorded is not None and wanted:
                 by_theta[:-1] += by_reading[:-1, :nu, None] * by_recorded
             torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
-        lag = corrections.torque_time_constants(theta, wanted)
+        lag = corrections.torque_lag_time_constants(theta, wanted)
         if lag is not None:
-            torque, by_torque = FirstOrderLag(*lag, self.step.time_step).filter_step_means(torque, by_torque)
+            torque, by_torque = FirstOrderLag(*lag, self.step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
-            torque, first = torque - errors.remaining_torque_error, first - errors.remaining_torque_error[0]
+            torque, first = (
+                torque - errors.torque_error_left_after_effects,
+                first - errors.torque_error_left_after_effects[0],
+            )
         if corrections.corrects_angles:
             true, _, by_angle, _, _ = corrections.true_angles_and_efforts(
                 np.hstack([arm, path]), episode.joint_loads, theta, wanted
@@ -253,7 +256,7 @@ class EpisodePredictor:
             pairs = [(p, None if isinstance(p, str) else next(rollouts)) for p in prepared]
             return map_in_threads(lambda pair: self._told(*pair), pairs)
 
-        width = len(self.unknowns.free_parameters) + len(self.estimated_state_indices) if derivatives else 0
+        width = len(self.unknowns.free_parameters) + len(self.estimated_initial_state_indices) if derivatives else 0
         each = [8 * (episode.grid.steps + 1) * self.step.sizes["nx"] * (width + 1) for episode, *_ in asked]
         found: list[EpisodePrediction | str] = []
         while len(found) < len(asked):
@@ -267,21 +270,21 @@ class EpisodePredictor:
     ) -> _Prepared | str:
         """What an episode's rollout starts from and is driven by."""
         wanted = self.unknowns.free_parameters if derivatives else ()
-        theta = self.episode_theta(episode, theta)
+        theta = self.theta_with_episode_values(episode, theta)
         start = self.initial_state(episode, theta, offset, wanted, guess)
         if start.failure_message:
             return start.failure_message
         by_start = start.state_sensitivity
-        inputs = self.tracking_inputs(episode, theta, wanted, start.state, by_start)
-        feedback, driven = episode.feedback_about_smoothed_motion, self.system.driven_indices
+        inputs = self.corrected_inputs_with_momentum_shift(episode, theta, wanted, start.state, by_start)
+        feedback, driven = episode.feedback_about_smoothed_motion, self.system.driven_coordinate_indices
         directions = None
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity
-            by_torque = inputs.nominal_torque_tangents(feedback, driven, width)
+            by_torque = inputs.nominal_torque_sensitivity(feedback, driven, width)
             by_path = None if by_path is None else np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
             directions = SensitivityDirections(wanted, by_start, by_torque, by_path)
         feedback = inputs.corrected_feedback(feedback, driven, episode.measured_driven_angles)
-        member = rollout_inputs(
+        member = checked_rollout_inputs(
             self.step,
             theta,
             start.state,
@@ -299,7 +302,7 @@ class EpisodePredictor:
             return str(prepared)
         episode, start, inputs, wanted = prepared.episode, prepared.start, prepared.inputs, prepared.wanted
         theta, feedback, directions = prepared.member.theta, prepared.member.feedback, prepared.member.directions
-        driven = self.system.driven_indices
+        driven = self.system.driven_coordinate_indices
         if not rollout.status.is_converged:
             return f"{episode.name}: {rollout.status.message}"
         by_applied = None
@@ -350,18 +353,18 @@ class EpisodePredictor:
         predicted : ndarray, shape (M, k)
         sensitivities : ndarray, shape (M, k, d)
         """
-        read = _Trajectory(NodeValues.along_trajectory(self.step, state), by_state, None, None, None)
+        read = _Trajectory(NodeStateValues.from_trajectory(self.step, state), by_state, None, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.free_parameters)
-        return samples.interpolate(y), samples.interpolate(total)
+        return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
-    def node_values(self, rollout: Rollout) -> NodeValues:
-        """Values along a rollout; the load is the effort of prescribed joints and the torque of driven ones."""
+    def node_values(self, rollout: Rollout) -> NodeStateValues:
+        """State values at all nodes of a rollout; the load is prescribed joints' effort and driven joints' torque."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
-        load[:-1, list(self.system.prescribed_indices)] = rollout.effort
-        load[:-1, list(self.system.driven_indices)] = rollout.torque
+        load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
+        load[:-1, list(self.system.driven_coordinate_indices)] = rollout.torque
         load[-1] = load[-2]
         lam = rollout.multipliers[np.minimum(np.arange(len(load)), len(load) - 2)] / self.step.time_step
-        return NodeValues.along_trajectory(self.step, rollout.state, load, lam)
+        return NodeStateValues.from_trajectory(self.step, rollout.state, load, lam)
 
     def _delay_in_steps(
         self, samples: Measurements, theta: Array, wanted: tuple[str, ...]
@@ -370,27 +373,27 @@ class EpisodePredictor:
         found = self.model_functions.input_corrections.sensor_delay(samples.sensor, theta, wanted)
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
 
-    def measurements_at_true_times(self, samples: Measurements, theta: Array) -> Measurements:
-        """Measurements shifted to the times at which their readings were true."""
+    def delay_corrected_measurements(self, samples: Measurements, theta: Array) -> Measurements:
+        """Measurements moved earlier by the sensor's delay, to the times at which their readings were true."""
         late = self._delay_in_steps(samples, theta, ())
-        return samples if late is None else samples.delayed_by(late[0])
+        return samples if late is None else samples.shifted_earlier_by(late[0])
 
     def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
         """The rollout with efforts of prescribed joints as they are compared: as sensors follow them, and smoothed."""
         effort, slope = rollout.effort, rollout.effort_sensitivity
-        if (lag := self.model_functions.input_corrections.effort_time_constants(theta, wanted)) is not None:
-            effort, slope = FirstOrderLag(*lag, self.step.time_step).filter_node_values(effort, slope)
-        if (smooth := self.effort_smoother(episode, theta)) is not None:
+        if (lag := self.model_functions.input_corrections.effort_lag_time_constants(theta, wanted)) is not None:
+            effort, slope = FirstOrderLag(*lag, self.step.time_step).lagged_node_values(effort, slope)
+        if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             effort, slope = smooth.smooth(effort), None if slope is None else smooth.smooth(slope)
         return replace(rollout, effort=effort, effort_sensitivity=slope)
 
-    def effort_smoother(self, episode: Episode, theta: Array) -> NodeSmoother | None:
+    def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeSmoother | None:
         """Smoother of predicted efforts of prescribed joints, the filter of the measured ones; None if not compared."""
         compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
         nodes = np.unique(
-            np.concatenate([self.measurements_at_true_times(samples, theta).evaluation_nodes for samples in compared])
+            np.concatenate([self.delay_corrected_measurements(samples, theta).evaluation_nodes for samples in compared])
         )
         return LowPassFilter(self.options.path_cutoff).node_smoother(nodes, episode.grid.steps, self.step.time_step)
 
@@ -399,7 +402,7 @@ class EpisodePredictor:
     ) -> tuple[Array, Array]:
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
-            samples = samples.delayed_by(late[0])
+            samples = samples.shifted_earlier_by(late[0])
         along = _Trajectory(
             self.node_values(rollout),
             rollout.state_sensitivity,
@@ -408,9 +411,9 @@ class EpisodePredictor:
             rollout.multipliers_sensitivity,
         )
         y, total = self._read(samples, along, theta, wanted)
-        predicted, slopes = samples.interpolate(y), samples.interpolate(total)
+        predicted, slopes = samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
         if late is not None and rollout.state_sensitivity is not None:
-            slopes[:, :, : len(wanted)] -= samples.prediction_rate(y, unmoved, late[0])[:, :, None] * late[1]
+            slopes[:, :, : len(wanted)] -= samples.prediction_rate_per_step(y, unmoved, late[0])[:, :, None] * late[1]
         return predicted, slopes
 
     def _read(
@@ -418,7 +421,7 @@ class EpisodePredictor:
     ) -> tuple[Array, Array]:
         """Readings at the samples' nodes, (nodes, k), and their derivatives by d directions, (nodes, k, d)."""
         n, nodes = self.system.n_coordinates, samples.evaluation_nodes
-        read = self.model_functions.compiled_sensor(samples.sensor, wanted)(along.values.at(nodes), theta)
+        read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(along.values.at(nodes), theta)
         if along.by_state is None:
             return read.output, np.zeros((*read.output.shape, 0))
         total = read.by_q @ along.by_state[nodes, :n]
@@ -426,7 +429,10 @@ class EpisodePredictor:
             total += read.by_z @ along.by_state[nodes, 2 * n :]
         if read.by_v.shape[2]:
             total += read.by_v @ node_velocity(along.by_state[:, :n], nodes, self.step.time_step)
-        loads = ((self.system.prescribed_indices, along.by_effort), (self.system.driven_indices, along.by_torque))
+        loads = (
+            (self.system.prescribed_coordinate_indices, along.by_effort),
+            (self.system.driven_coordinate_indices, along.by_torque),
+        )
         for index, by_load_there in loads:
             by_load = read.by_load[:, :, list(index)]
             if by_load_there is not None and np.any(by_load):
@@ -444,7 +450,7 @@ class EpisodePredictor:
 
     # -- the adjoint --------------------------------------------------------------------------------------------------
 
-    def gradient_by_adjoint(
+    def cost_gradient_by_adjoint(
         self, episode: Episode, result: EpisodePrediction, theta: Array, offset: Array, pulls: list[Array]
     ) -> Array:
         """Gradient of a cost of an episode's predictions by its (shared, local, start) unknowns, by the adjoint.
@@ -460,17 +466,19 @@ class EpisodePredictor:
             Derivative of the cost by every prediction.
         """
         wanted, rollout = self.unknowns.free_parameters, result.rollout
-        theta = self.episode_theta(episode, theta)
+        theta = self.theta_with_episode_values(episode, theta)
         by_state = np.zeros((episode.grid.steps + 1, self.step.sizes["nx"]))
         by_effort, by_applied = np.zeros_like(rollout.effort), np.zeros_like(rollout.torque)
         by_multipliers = np.zeros_like(rollout.multipliers)
         total, read = np.zeros(len(wanted)), self.node_values(self._recorded(episode, rollout, theta, ()))
         for samples, pull in zip(episode.measurements, pulls, strict=True):
             total += self._pull(samples, pull, read, theta, _Pulls(by_state, by_effort, by_applied, by_multipliers))
-        if (smooth := self.effort_smoother(episode, theta)) is not None:
+        if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             by_effort = smooth.smoothing_adjoint(by_effort)
-        if (lag := self.model_functions.input_corrections.effort_time_constants(theta, wanted)) is not None:
-            by_effort, by_lag = FirstOrderLag(*lag, self.step.time_step).node_values_adjoint(rollout.effort, by_effort)
+        if (lag := self.model_functions.input_corrections.effort_lag_time_constants(theta, wanted)) is not None:
+            by_effort, by_lag = FirstOrderLag(*lag, self.step.time_step).lagged_node_values_adjoint(
+                rollout.effort, by_effort
+            )
             total += by_lag
         feedback = episode.tracking_feedback
         if feedback is not None:
@@ -478,9 +486,9 @@ class EpisodePredictor:
         by_lam = by_multipliers if np.any(by_multipliers) else None
         by_inputs = adjoint_gradient(self.step, theta, rollout, wanted, by_state, by_lam, by_effort, feedback)
         start = self.initial_state(episode, theta, offset, wanted, result.equilibrium_guess)
-        inputs = self.tracking_inputs(episode, theta, wanted, start.state, start.state_sensitivity)
+        inputs = self.corrected_inputs_with_momentum_shift(episode, theta, wanted, start.state, start.state_sensitivity)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
-        by_torque = inputs.nominal_torque_tangents(feedback, self.system.driven_indices, len(own))
+        by_torque = inputs.nominal_torque_sensitivity(feedback, self.system.driven_coordinate_indices, len(own))
         if by_torque is not None:
             own += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.prescribed_path_sensitivity is not None:
@@ -490,17 +498,17 @@ class EpisodePredictor:
             )
         return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)
 
-    def _pull(self, samples: Measurements, pull: Array, values: NodeValues, theta: Array, pulls: _Pulls) -> Array:
+    def _pull(self, samples: Measurements, pull: Array, values: NodeStateValues, theta: Array, pulls: _Pulls) -> Array:
         """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
         n, wanted = self.system.n_coordinates, self.unknowns.free_parameters
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
-            samples = samples.delayed_by(late[0])
+            samples = samples.shifted_earlier_by(late[0])
         at_nodes, nodes = samples.interpolation_adjoint(pull), samples.evaluation_nodes
-        read = self.model_functions.compiled_sensor(samples.sensor, wanted)(values.at(nodes), theta)
+        read = self.model_functions.compiled_sensor_function(samples.sensor, wanted)(values.at(nodes), theta)
         direct = np.einsum("mk,mkq->q", at_nodes, read.by_theta)
         if late is not None:
-            direct -= np.sum(pull * samples.prediction_rate(read.output, unmoved, late[0]), axis=0) @ late[1]
+            direct -= np.sum(pull * samples.prediction_rate_per_step(read.output, unmoved, late[0]), axis=0) @ late[1]
         pulls.by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, read.by_q)
         pulls.by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, read.by_z)
         last, h = np.minimum(nodes, len(pulls.by_effort) - 1), self.step.time_step
@@ -509,7 +517,10 @@ class EpisodePredictor:
             pulls.by_state[:, :n] += node_velocity_adjoint(by_velocity, nodes, len(pulls.by_state), h)
         if read.by_lam.shape[2]:
             np.add.at(pulls.by_multipliers, last, np.einsum("mk,mkq->mq", at_nodes, read.by_lam) / h)
-        loads = ((self.system.prescribed_indices, pulls.by_effort), (self.system.driven_indices, pulls.by_torque))
+        loads = (
+            (self.system.prescribed_coordinate_indices, pulls.by_effort),
+            (self.system.driven_coordinate_indices, pulls.by_torque),
+        )
         for index, by_load_there in loads:
             if index:
                 np.add.at(by_load_there, last, np.einsum("mk,mkq->mq", at_nodes, read.by_load[:, :, list(index)]))
@@ -520,7 +531,7 @@ class EpisodePredictor:
 class _Trajectory:
     """Values at all nodes and derivatives of states, efforts, applied torques and multipliers."""
 
-    values: NodeValues
+    values: NodeStateValues
     by_state: Array | None
     by_effort: Array | None
     by_torque: Array | None

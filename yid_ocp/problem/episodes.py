@@ -15,12 +15,18 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.rollout import generalized_momentum
 from yid_ocp.integrator.statics import Equilibrium
-from yid_ocp.integrator.step import Step, float_array_of_shape
+from yid_ocp.integrator.step import Step, checked_float_array
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import lqr_feedback, proportional_feedback
 from yid_ocp.model.system import System
 from yid_ocp.problem.initial_state_fit import FixedInitialState
-from yid_ocp.problem.measurements import Measurements, TimeGrid, make_time_grid, place_on_grid, with_paper_weights
+from yid_ocp.problem.measurements import (
+    Measurements,
+    TimeGrid,
+    locate_measurements_on_grid,
+    make_time_grid,
+    with_paper_weights,
+)
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.problem.recorded_inputs import (
@@ -30,10 +36,10 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_efforts,
 )
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
-from yid_ocp.sensors import CHANNELS, SENSOR_READERS, SensorContext
+from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorReadingContext
 from yid_ocp.sensors.joints import (
-    EFFORT_GROUP,
-    POSITION_GROUP,
+    JOINT_EFFORT_GROUP_NAME,
+    JOINT_POSITION_GROUP_NAME,
     PositionSensor,
     is_noise_std_stated,
     joint_angle_noise_std,
@@ -70,7 +76,7 @@ class EpisodePrediction:
     torque_correction_sensitivity: Array | None = None
 
     @property
-    def torque_correction_columns(self) -> Array | None:
+    def torque_correction_and_sensitivity(self) -> Array | None:
         """`torque_correction` followed by the columns of its derivative where it is known, shape (N, nu, 1 + d)."""
         if self.torque_correction is None:
             return None
@@ -112,7 +118,7 @@ seconds without correction."""
 
 
 @dataclass(frozen=True)
-class InputErrors:
+class InputErrorModel:
     """Noise levels and current estimates of the torque and angle errors that drive one recording's rollout.
 
     Attributes
@@ -151,24 +157,24 @@ class InputErrors:
 
     @property
     def total_torque_error(self) -> Array:
-        """Total error subtracted from the torque of every step, b + w, shape (N, nu) [N m]."""
+        """Estimated torque error in every step, constant offset plus noise, shape (N, nu) [N m]."""
         return self.torque_bias + self.torque_noise
 
     @property
-    def remaining_torque_error(self) -> Array:
-        """Error still to be subtracted after effects on torques, shape (N, nu) [N m]."""
+    def torque_error_left_after_effects(self) -> Array:
+        """Part of the torque error still to be subtracted after effects on torques apply, shape (N, nu) [N m]."""
         return self.total_torque_error - self.transmitted_torque_noise
 
     @property
-    def with_bias_only(self) -> InputErrors:
-        """The same errors with the constant offset alone; torques and angles otherwise as recorded."""
+    def with_torque_bias_only(self) -> InputErrorModel:
+        """The same errors with the torques' constant offset alone: noise and smoothed reference are dropped."""
         none = np.zeros_like(self.torque_noise)
         return replace(
             self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
         )
 
-    def first_steps(self, steps: int) -> InputErrors:
-        """The errors of the first `steps` steps."""
+    def truncated_to_steps(self, steps: int) -> InputErrorModel:
+        """The same error model restricted to the first `steps` steps of the rollout."""
         first = {
             name: getattr(self, name)[:steps]
             for name in ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
@@ -186,29 +192,31 @@ def _recorded_input_errors(
     grid: TimeGrid,
     sensors: Mapping[str, SensorOptions],
     samples: Sequence[Measurements],
-) -> InputErrors | None:
+) -> InputErrorModel | None:
     """Error levels of the torques and angles that drive a recording's rollout; None where there are none."""
     joints, driven = recording.joints, system.driven
     if joints is None or joints.effort is None or not driven or system.servos:
         return None
-    effort, position = (sensors.get(group, SensorOptions()) for group in (EFFORT_GROUP, POSITION_GROUP))
+    effort, position = (
+        sensors.get(group, SensorOptions()) for group in (JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME)
+    )
     std = joint_torque_noise_std(joints, driven, effort, recording.name)
     bias = joint_torque_bias_std(joints, driven, effort)
     encoders = any(isinstance(entry.sensor, PositionSensor) for entry in samples)
     if not encoders and not np.any(std > 0) and not np.any(bias > 0):
         return None
     angle = joint_angle_noise_std(joints, driven, position, recording.name)
-    for group, choice, level in ((EFFORT_GROUP, effort, std), (POSITION_GROUP, position, angle)):
+    for group, choice, level in ((JOINT_EFFORT_GROUP_NAME, effort, std), (JOINT_POSITION_GROUP_NAME, position, angle)):
         if not is_noise_std_stated(joints, group, choice):
             words = "%s: the noise of %s is neither recorded nor configured; %.2g to %.2g %s estimated from its fastest"
-            log.warning(words + " changes", recording.name, group, level.min(), level.max(), CHANNELS[group].unit)
+            log.warning(words + " changes", recording.name, group, level.min(), level.max(), CHANNEL_KINDS[group].unit)
     if encoders:
         columns = [joints.names.index(name) for name in driven]
         std = np.maximum(std, _MIN_TORQUE_ERROR_FRACTION * np.maximum(np.std(joints.effort[:, columns], axis=0), 1e-3))
     period = float(np.median(np.diff(joints.t)))
     middle = grid.node_times[:-1] + grid.time_step / 2
     sample = np.clip(np.searchsorted(joints.t, middle, "right") - 1, 0, len(joints.t) - 1)
-    return InputErrors(
+    return InputErrorModel(
         # a step that spans several samples averages them
         std * min(1.0, np.sqrt(period / grid.time_step)),
         bias,
@@ -242,7 +250,7 @@ class Episode:
         Tracking filter of the driven joints with gains computed at the nominal parameters.
     known_parameters : mapping of str to float
         Known values of parameters that differ from recording to recording.
-    input_errors : InputErrors or None
+    input_errors : InputErrorModel or None
         Of the torques and angles that drive the rollout; None where there are none.
     fixed_initial_state : FixedInitialState or None
         Initial state that is given or was fitted to points; None where it is an equilibrium.
@@ -263,7 +271,7 @@ class Episode:
     smoothed_driven_angles: Array
     tracking_feedback: TrackingFeedback | None = None
     known_parameters: Mapping[str, float] = field(default_factory=dict)
-    input_errors: InputErrors | None = None
+    input_errors: InputErrorModel | None = None
     fixed_initial_state: FixedInitialState | None = None
     initial_state_shared_with: int | None = None
     equilibrium_guess: Array | None = None
@@ -276,7 +284,7 @@ class Episode:
         return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)
 
     @property
-    def has_constant_sensor_errors(self) -> bool:
+    def has_uncertain_sensor_biases(self) -> bool:
         """Whether a sensor may have a constant error over the recording, which counts as noise."""
         return any(np.any(samples.bias_std > 0) for samples in self.measurements)
 
@@ -300,7 +308,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
         The recording does not fit the model, is too short, or states no noise level.
     """
     step, system = functions.step, functions.step.system
-    recording = recording.with_effort_kind(options.sensors.get(EFFORT_GROUP, SensorOptions()).effort_kind)
+    recording = recording.with_effort_kind(options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_kind)
     grid = make_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
         raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)
@@ -335,7 +343,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
         else _recorded_input_errors(recording, system, grid, options.sensors, samples),
         fixed_initial_state=None
         if start is None
-        else FixedInitialState(float_array_of_shape("known_start", start, (step.sizes["nx"],))),
+        else FixedInitialState(checked_float_array("known_start", start, (step.sizes["nx"],))),
     )
     return _tracked(episode, functions, options, theta)
 
@@ -351,7 +359,9 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
             tracking_feedback=proportional_feedback(step, episode.measured_driven_angles, options.proportional_gains),
         )
     plain = functions.momentum_shift.theta_without_effects(theta)
-    loop = lqr_feedback(step, episode.smoothed_driven_angles, episode.torque, plain, arms=functions.arms_only_step)
+    loop = lqr_feedback(
+        step, episode.smoothed_driven_angles, episode.torque, plain, arms=functions.arms_only_integrator_step
+    )
     return replace(episode, tracking_feedback=loop)
 
 
@@ -379,11 +389,11 @@ def truncate_episode(episode: Episode, steps: int) -> Episode:
         tracking_feedback=None
         if whole is None
         else TrackingFeedback(whole.state_indices, whole.gain[:steps], whole.reference[:steps]),
-        input_errors=None if errors is None else errors.first_steps(steps),
+        input_errors=None if errors is None else errors.truncated_to_steps(steps),
     )
 
 
-def mass_matrix_diagonal(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
+def mass_matrix_diagonal_at_zero(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
     """Mass matrix diagonal of the named joints at the zero configuration, shape (k,) [kg m^2 or kg]."""
     sizes = step.sizes
     n, zero = sizes["n"], np.zeros
@@ -410,7 +420,7 @@ def _joint_mass_matrices(step: Step, theta: Array, names: tuple[str, ...], angle
 def _samples(
     step: Step, recording: Recording, options: ProblemOptions, theta: Array, grid: TimeGrid
 ) -> tuple[Measurements, ...]:
-    around = SensorContext(
+    around = SensorReadingContext(
         step.system,
         recording,
         lambda group: options.sensors.get(group, SensorOptions()),
@@ -424,7 +434,7 @@ def _samples(
         found = [data for data in found if data.sensor.has_paper_weight]
     # places before efforts, which follow from the motion
     found.sort(key=lambda data: bool(data.sensor.effort_joints))
-    samples = tuple(place_on_grid(data, grid, recording.name) for data in found)
+    samples = tuple(locate_measurements_on_grid(data, grid, recording.name) for data in found)
     if not any(s.n_residuals for s in samples):
         raise DataError(
             "the recording holds no measurement that the model could be compared with",

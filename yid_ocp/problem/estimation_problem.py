@@ -16,17 +16,23 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
-from yid_ocp.problem.episode_initialization import estimate_initial_state_offset, with_observed_equilibrium
+from yid_ocp.problem.episode_initialization import estimate_initial_state_offset, with_observed_equilibrium_and_loads
 from yid_ocp.problem.episode_prediction import EpisodePredictor
-from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialState, mass_matrix_diagonal, prepare_episode
+from yid_ocp.problem.episodes import (
+    Episode,
+    EpisodePrediction,
+    InitialState,
+    mass_matrix_diagonal_at_zero,
+    prepare_episode,
+)
 from yid_ocp.problem.evaluation import (
     EquilibriumGuesses,
     Evaluation,
-    ResidualRows,
+    ResidualVectorLayout,
     ResidualWhitener,
     whitened_episode_residual,
 )
-from yid_ocp.problem.measurements import ResidualBlock, huber_loss
+from yid_ocp.problem.measurements import ResidualBlock, huber_loss_and_residual_factors
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.synthetic_recording import synthesize_recording
@@ -35,8 +41,8 @@ from yid_ocp.problem.unknown_vector import (
     check_free_parameters,
     check_parameter_bounds,
     estimated_initial_state_names,
-    initial_state_limits,
-    soft_logarithm,
+    initial_state_offset_limits,
+    soft_logarithm_and_slope,
     stated_prior_jacobian,
     stated_prior_std,
     with_named_entries,
@@ -70,7 +76,7 @@ class EstimationProblem(ReprMixin):
         Initial values of free parameters and values of fixed ones.
     unknowns : UnknownVectorLayout
         Layout of the unknown vector.
-    residual_rows : ResidualRows
+    residual_rows : ResidualVectorLayout
         Layout of the residual.
     whitening_filters, held_out_whitening_filters : tuple of ResidualWhitener or None
         Filter that whitens each recording's residual; None where sensor noise is the only noise.
@@ -91,7 +97,7 @@ class EstimationProblem(ReprMixin):
     held_out: tuple[Episode, ...]
     unknowns: UnknownVectorLayout
     predictor: EpisodePredictor
-    residual_rows: ResidualRows
+    residual_rows: ResidualVectorLayout
     whitening_filters: tuple[ResidualWhitener | None, ...]
     held_out_whitening_filters: tuple[ResidualWhitener | None, ...]
 
@@ -120,7 +126,8 @@ class EstimationProblem(ReprMixin):
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.with_fitted_initial_state(episode, theta) for episode in episodes)
         ready, other = (
-            tuple(with_observed_equilibrium(self.predictor, e, theta) for e in group) for group in (fitted, others)
+            tuple(with_observed_equilibrium_and_loads(self.predictor, e, theta) for e in group)
+            for group in (fitted, others)
         )
         self._set(functions, options, tuple(free), theta, ready, other)
 
@@ -147,13 +154,17 @@ class EstimationProblem(ReprMixin):
             tuple(episode.name for episode in episodes),
         )
         self.predictor = EpisodePredictor(model_functions, options, self.unknowns)
-        inertia = partial(mass_matrix_diagonal, model_functions.step, theta)
+        inertia = partial(mass_matrix_diagonal_at_zero, model_functions.step, theta)
         self._prior_std = stated_prior_std(self.unknowns, options, model_functions.step.system, inertia)
         bare = options.weighting == "paper" or options.weak_prior_factor <= 1
-        weak = np.zeros(len(self.unknown_names), bool) if bare else self.is_positive & ~np.isfinite(self._prior_std)
+        weak = (
+            np.zeros(len(self.unknown_names), bool)
+            if bare
+            else self.positive_unknowns_mask & ~np.isfinite(self._prior_std)
+        )
         self._weak: IntArray = np.flatnonzero(weak)
         self._stated = stated_prior_jacobian(self.unknowns, options, self._prior_std)
-        self.residual_rows = ResidualRows.from_episodes(episodes, len(self._stated), len(self._weak))
+        self.residual_rows = ResidualVectorLayout.from_episodes(episodes, len(self._stated), len(self._weak))
 
     def _changed(self, **changes: Any) -> EstimationProblem:
         """Changed problem that shares the compiled functions; episodes are not prepared again."""
@@ -165,7 +176,7 @@ class EstimationProblem(ReprMixin):
 
     def _summary(self) -> ReprSummary:
         free = f"{len(self.free)} of {count_with_noun(len(self.system.parameters), 'parameter')} free"
-        seen = sum(int(samples.is_used.sum()) for episode in self.episodes for samples in episode.measurements)
+        seen = sum(int(samples.used_output_mask.sum()) for episode in self.episodes for samples in episode.measurements)
         used, held = (count_with_noun(len(entries), "recording") for entries in (self.episodes, self.held_out))
         rows: list[tuple[str, ...]] = [("unknown", "start", "lower", "upper")]
         rows += [
@@ -208,7 +219,9 @@ class EstimationProblem(ReprMixin):
         shared, local = (
             [self.theta[index(name)] for name in part] for part in (self.shared_parameters, self.local_parameters)
         )
-        return self.unknowns.pack(shared, local, np.zeros(len(self.unknowns.initial_state_names)))
+        return self.unknowns.pack_same_for_all_recordings(
+            shared, local, np.zeros(len(self.unknowns.initial_state_names))
+        )
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -216,9 +229,10 @@ class EstimationProblem(ReprMixin):
         shared, local = (
             self.system.parameters.bounds(part) for part in (self.shared_parameters, self.local_parameters)
         )
-        wide = initial_state_limits(self.system, self.unknowns.initial_state_names)
+        wide = initial_state_offset_limits(self.system, self.unknowns.initial_state_names)
         lower, upper = (
-            self.unknowns.pack(shared[side], local[side], wide * (-1 if side == 0 else 1)) for side in (0, 1)
+            self.unknowns.pack_same_for_all_recordings(shared[side], local[side], wide * (-1 if side == 0 else 1))
+            for side in (0, 1)
         )
         return lower, upper
 
@@ -232,13 +246,13 @@ class EstimationProblem(ReprMixin):
         return np.where(size > 0, size, fallback)
 
     @property
-    def is_positive(self) -> BoolArray:
+    def positive_unknowns_mask(self) -> BoolArray:
         """Mask of unknowns that must be positive and have a positive initial value, shape (nx,)."""
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 
     @property
-    def data_noise_unit(self) -> float:
-        """Noise unit of the data residuals: 1 where they are whitened, else the points' root mean square noise [m]."""
+    def data_residual_noise_std(self) -> float:
+        """Noise std of the data residuals: 1 where they are whitened, else the points' RMS noise [m]."""
         if self.options.weighting != "paper":
             return 1.0
         found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.measurements]
@@ -251,9 +265,9 @@ class EstimationProblem(ReprMixin):
         return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
 
     @property
-    def has_uncorrected_inputs(self) -> bool:
+    def uses_inputs_as_recorded(self) -> bool:
         """Whether no effect corrects recorded inputs, times or the tracked reference: none is free or non-neutral."""
-        return all(self.predictor.has_uncorrected_inputs(episode, self.theta) for episode in self.episodes)
+        return all(self.predictor.uses_inputs_as_recorded(episode, self.theta) for episode in self.episodes)
 
     # -- the unknown vector -------------------------------------------------------------------------------------------
 
@@ -295,11 +309,11 @@ class EstimationProblem(ReprMixin):
             cost += part.cost
             residuals.append(part.residual)
             if part.jacobian is not None:
-                jacobians.append(self.unknowns.scatter_columns(part.jacobian, i))
+                jacobians.append(self.unknowns.scatter_to_unknown_columns(part.jacobian, i))
         done = tuple(replace(result, output_sensitivities=None, torque_correction_sensitivity=None) for result in done)
-        prior_residual, prior_jacobian = self.prior_residual(x)
-        residual = np.concatenate([*residuals, prior_residual])
-        cost += 0.5 * float(prior_residual @ prior_residual)
+        prior_residual_and_jacobian, prior_jacobian = self.prior_residual_and_jacobian(x)
+        residual = np.concatenate([*residuals, prior_residual_and_jacobian])
+        cost += 0.5 * float(prior_residual_and_jacobian @ prior_residual_and_jacobian)
         jacobian = np.vstack([*jacobians, prior_jacobian]) if derivatives else None
         if not np.isfinite(cost):
             return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
@@ -326,7 +340,7 @@ class EstimationProblem(ReprMixin):
         """
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.whitening_filters)
-        weighted |= any(episode.has_constant_sensor_errors for episode in self.episodes)
+        weighted |= any(episode.has_uncertain_sensor_biases for episode in self.episodes)
         if evaluation is None or (weighted and evaluation.jacobian is None):
             evaluation = self.evaluate(x, weighted, equilibrium_guesses)
         gradient = np.zeros(len(x))
@@ -338,19 +352,19 @@ class EstimationProblem(ReprMixin):
             pulls = []
             for k, samples in enumerate(self.episodes[i].measurements):
                 raw = samples.whitened_residual(result.predicted_outputs[k])
-                _, factor = huber_loss(raw, self.options.huber_threshold)
-                pulls.append(samples.whitening_adjoint(factor**2 * raw))
-            own = self.predictor.gradient_by_adjoint(self.episodes[i], result, *self.split(x, i), pulls)
-            gradient += self.unknowns.scatter_columns(own[None, :], i)[0]
-        prior_residual, prior_jacobian = self.prior_residual(x)
-        return evaluation.cost, gradient + prior_jacobian.T @ prior_residual, evaluation
+                _, factor = huber_loss_and_residual_factors(raw, self.options.huber_threshold)
+                pulls.append(samples.whitened_residual_adjoint(factor**2 * raw))
+            own = self.predictor.cost_gradient_by_adjoint(self.episodes[i], result, *self.split(x, i), pulls)
+            gradient += self.unknowns.scatter_to_unknown_columns(own[None, :], i)[0]
+        prior_residual_and_jacobian, prior_jacobian = self.prior_residual_and_jacobian(x)
+        return evaluation.cost, gradient + prior_jacobian.T @ prior_residual_and_jacobian, evaluation
 
-    def prior_residual(self, x: Array) -> tuple[Array, Array]:
+    def prior_residual_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Return the residual of the stated and weak priors, and its Jacobian by the unknowns."""
         stated, weak, start = self._stated, self._weak, self.initial_unknowns
         rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
         spread = np.log(max(self.options.weak_prior_factor, 1.0 + 1e-9))
-        value, slope = soft_logarithm(x[weak] / start[weak])
+        value, slope = soft_logarithm_and_slope(x[weak] / start[weak])
         rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
         return np.concatenate([stated @ (x - start), value / spread]), rows
 
@@ -367,7 +381,7 @@ class EstimationProblem(ReprMixin):
         guess : ndarray, optional, shape (n,)
             Configuration near the equilibrium.
         """
-        own = self.predictor.episode_theta(episode, theta)
+        own = self.predictor.theta_with_episode_values(episode, theta)
         none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
         return self.predictor.initial_state(episode, own, none, self.unknowns.free_parameters, guess)
 
@@ -384,11 +398,11 @@ class EstimationProblem(ReprMixin):
         """
         return [
             (episode, self.predictor.predict_episode(episode, theta, offset, derivatives))
-            for episode, theta, offset in self.held_out_evaluation_points(x)
+            for episode, theta, offset in self.held_out_prediction_inputs(x)
         ]
 
-    def held_out_evaluation_points(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
-        """Each held-out episode with its fitted initial state, theta, and the offset of an estimated initial state."""
+    def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
+        """For each held-out recording: episode with fitted initial state, theta, and estimated initial state offset."""
         x = np.asarray(x, float)
         theta, found = self.held_out_theta(x), []
         for held in self.held_out:
@@ -467,11 +481,11 @@ class EstimationProblem(ReprMixin):
         """Whether errors of recorded torques or angles act as process noise in any recording."""
         return any(episode.input_errors is not None for episode in self.episodes)
 
-    def held_out_residual(self, i: int, episode: Episode, result: EpisodePrediction) -> ResidualBlock:
+    def whitened_held_out_residual(self, i: int, episode: Episode, result: EpisodePrediction) -> ResidualBlock:
         """Whitened residual of held-out recording `i` from `predict_held_out`, without a robust loss."""
         return whitened_episode_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
-    def truncated_to(self, duration: float) -> EstimationProblem:
+    def truncated_to_duration(self, duration: float) -> EstimationProblem:
         """The same problem on the first `duration` seconds of each recording, rebuilt without held-out recordings."""
         return self._prepared(options=replace(self.options, duration=duration), held_out=())
 

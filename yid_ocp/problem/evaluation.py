@@ -11,13 +11,13 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
-from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrors
+from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.measurements import (
-    ConstantErrorModel,
+    ConstantSensorErrorModel,
     Measurements,
     ResidualBlock,
-    constant_error_sensitivities,
-    huber_loss,
+    huber_loss_and_residual_factors,
+    sensitivities_to_constant_errors,
 )
 
 EquilibriumGuesses = tuple[Array | None, ...]
@@ -25,11 +25,11 @@ EquilibriumGuesses = tuple[Array | None, ...]
 
 
 class ResidualWhitener(Protocol):
-    """What whitens the residual of one recording by process noise, frozen; `inference.whitening` makes it."""
+    """Frozen Kalman filter that whitens one recording's residual, process noise included (`inference.whitening`)."""
 
     @property
-    def input_errors(self) -> InputErrors:
-        """With the values of torque errors about which it is linearized."""
+    def input_errors(self) -> InputErrorModel:
+        """Errors of torques and angles, with the torque errors about which the filter is linearized."""
         ...
 
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
@@ -51,13 +51,13 @@ class EvaluateFunction(Protocol):
     def __call__(
         self, x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
-        """At `x`, shape (nx,)."""
+        """Evaluate the problem at the unknown vector `x`, shape (nx,)."""
         ...
 
 
 @dataclass(frozen=True)
-class ResidualRows:
-    """Slices of the residual vector: measurements of all episodes, then stated priors, then weak priors.
+class ResidualVectorLayout:
+    """Layout of the residual vector as slices: measurements of all episodes, then stated priors, then weak priors.
 
     Attributes
     ----------
@@ -71,12 +71,12 @@ class ResidualRows:
     weak_priors: slice
 
     @property
-    def without_weak_priors(self) -> slice:
+    def slice_without_weak_priors(self) -> slice:
         """Slice of the data and the stated priors, without the weak priors."""
         return slice(0, self.stated_priors.stop)
 
     @staticmethod
-    def from_episodes(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualRows:
+    def from_episodes(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualVectorLayout:
         """Layout from the episodes' measurements and the numbers of stated and weak priors."""
         at, groups = 0, []
         for episode in episodes:
@@ -85,7 +85,9 @@ class ResidualRows:
                 own.append(slice(at, at + samples.n_residuals))
                 at += samples.n_residuals
             groups.append(tuple(own))
-        return ResidualRows(tuple(groups), slice(0, at), slice(at, at + stated), slice(at + stated, at + stated + weak))
+        return ResidualVectorLayout(
+            tuple(groups), slice(0, at), slice(at, at + stated), slice(at + stated, at + stated + weak)
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -141,9 +143,9 @@ def whitened_episode_residual(
 ) -> ResidualBlock:
     """Whitened residual of one episode: by sensor noise, or by the frozen Kalman filter where one is given.
 
-    Constant sensor errors count as noise, see `ConstantErrorModel`.
+    Constant sensor errors count as noise, see `ConstantSensorErrorModel`.
     """
-    by_constants = constant_error_sensitivities(episode.measurements)
+    by_constants = sensitivities_to_constant_errors(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
     plain = _sensor_whitened_residual(episode.measurements, result)
@@ -151,10 +153,10 @@ def whitened_episode_residual(
     if plain.jacobian is not None:
         columns = np.hstack([columns, plain.jacobian])
     if whitening is not None:
-        columns, by_constants = _innovations(whitening, columns, by_constants, result.torque_correction_columns)
+        columns, by_constants = _innovations(whitening, columns, by_constants, result.torque_correction_and_sensitivity)
     if by_constants.shape[1]:
-        columns = ConstantErrorModel.from_sensitivities(by_constants).whiten(columns)
-    cost, factor = huber_loss(columns[:, 0], threshold)
+        columns = ConstantSensorErrorModel.from_sensitivities(by_constants).whiten(columns)
+    cost, factor = huber_loss_and_residual_factors(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualBlock(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
 

@@ -16,10 +16,10 @@ from yid_ocp.integrator.statics import relaxed_internal_coordinates
 from yid_ocp.integrator.step import Step
 from yid_ocp.least_squares import levenberg_marquardt
 from yid_ocp.model import forward_kinematics
-from yid_ocp.model.objects.cable import START_SHAPE_SUFFIXES, START_SPEED_PARAMETER
-from yid_ocp.parallel import LockedCache
+from yid_ocp.model.objects.cable import START_ANGLE_AND_LOAD_SUFFIXES, START_SPEED_PARAMETER_NAME
+from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.sensors import Sensor, sensor_function
+from yid_ocp.sensors import Sensor, sensor_reading_function
 
 # Width of the elastic prior: a bend of this size at a joint of mean stiffness costs as much as one standard
 # deviation of a measured point [rad]; other joints in proportion to their stiffness.
@@ -87,12 +87,12 @@ class InitialStateFitter:
         self.step = step
         self.fitted_parameters = tuple(fitted_parameters)
         system, e = step.system, step.equations
-        self._known = [*system.driven_indices, *system.prescribed_indices]
+        self._known = [*system.driven_coordinate_indices, *system.prescribed_coordinate_indices]
         # what follows its load at once has no start of its own
         idle = {system.mechanism.joint_index(joint) for joint in system.joint_compliances}
         self._free = [i for i in range(system.n_coordinates) if i not in set(self._known) | idle]
-        self._sensor: LockedCache[Sensor, ca.Function] = LockedCache(
-            lambda sensor: sensor_function(step.system, sensor, self.fitted_parameters)
+        self._sensor: CasadiLockedCache[Sensor, ca.Function] = CasadiLockedCache(
+            lambda sensor: sensor_reading_function(step.system, sensor, self.fitted_parameters)
         )
         chosen = (
             ca.vertcat(*(system.parameters[name].symbol for name in self.fitted_parameters))
@@ -100,9 +100,9 @@ class InitialStateFitter:
             else ca.SX(0, 1)
         )
         kinematics = forward_kinematics(system.mechanism, e.q1)
-        aligned = ca.vertcat(ca.SX(0, 1), *(grasp.axis_misalignment(kinematics) for grasp in system.grasps))
+        aligned = ca.vertcat(ca.SX(0, 1), *(grasp.aligned_axis_differences(kinematics) for grasp in system.grasps))
         held = ca.vertcat(
-            e.constraint_violation,
+            e.end_of_step_constraint_violation,
             ca.substitute(aligned, ca.vertcat(ca.SX(0, 1), *system.internal_coordinates.values()), e.z1),
         )
         outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
@@ -116,7 +116,7 @@ class InitialStateFitter:
         self._presets = tuple(
             (index, spring.joint_name)
             for index, spring in zip(at, system.elastic_joints, strict=True)
-            if f"{spring.joint_name}.{START_SHAPE_SUFFIXES[0]}" in system.parameters
+            if f"{spring.joint_name}.{START_ANGLE_AND_LOAD_SUFFIXES[0]}" in system.parameters
         )
         self._load = ca.Function(
             "load", e.arguments, [e.rigid_body_terms.lagrangian_by_q, e.constraint_impulses.before_jacobian]
@@ -168,7 +168,7 @@ class InitialStateFitter:
         )
         guess = rest.copy()
         guess[self._known] = posture
-        guess[list(system.prescribed_indices)] = path[first]
+        guess[list(system.prescribed_coordinate_indices)] = path[first]
         found = [(guess, trial, np.inf) for trial in self._trials(theta[index])]
         for stage, softness in enumerate(_NOISE_FACTORS):
             if stage == _SELECTION_STAGE:
@@ -181,18 +181,18 @@ class InitialStateFitter:
         velocity = np.zeros(system.n_coordinates)
         if then > first:
             guess = q.copy()
-            guess[list(system.prescribed_indices)] = path[then]
+            guess[list(system.prescribed_coordinate_indices)] = path[then]
             span = (then - first) * step.time_step
             slow = np.full(system.n_coordinates, 1 / (_RATE_STD * span))
             task = _Task(frames[then], theta, guess, slow, 0, 1.0)
             velocity = (self._fit(guess, values, task)[0] - q) / span
         q0 = q - velocity * first * step.time_step
-        q0[list(system.prescribed_indices)] = path[0]
+        q0[list(system.prescribed_coordinate_indices)] = path[0]
         momentum = generalized_momentum(step, q0, velocity, theta)
         state = np.concatenate([q0, momentum, relaxed_internal_coordinates(step, q0, theta)])
         own = dict(zip(self.fitted_parameters, values.tolist(), strict=True)) | self._preset(q, theta, stiffness)
-        if START_SPEED_PARAMETER in system.parameters:
-            own[START_SPEED_PARAMETER] = _speed(frames[first], frames[then], (then - first) * step.time_step)
+        if START_SPEED_PARAMETER_NAME in system.parameters:
+            own[START_SPEED_PARAMETER_NAME] = _speed(frames[first], frames[then], (then - first) * step.time_step)
         return FixedInitialState(state, own)
 
     def _preset(self, q: Array, theta: Array, stiffness: Array) -> dict[str, float]:
@@ -213,9 +213,9 @@ class InitialStateFitter:
         columns = np.array(ca.densify(pull))[:, at].T
         reaction = np.linalg.lstsq(weight[:, None] * columns, weight * (stiffness[at] * q[at] - free), rcond=None)[0]
         load = free + columns @ reaction
-        angles = {f"{joint}.{START_SHAPE_SUFFIXES[0]}": float(q[index]) for index, joint in self._presets}
+        angles = {f"{joint}.{START_ANGLE_AND_LOAD_SUFFIXES[0]}": float(q[index]) for index, joint in self._presets}
         return angles | {
-            f"{j}.{START_SHAPE_SUFFIXES[1]}": float(v) for (_, j), v in zip(self._presets, load, strict=True)
+            f"{j}.{START_ANGLE_AND_LOAD_SUFFIXES[1]}": float(v) for (_, j), v in zip(self._presets, load, strict=True)
         }
 
     def _trials(self, values: Array) -> list[Array]:

@@ -131,8 +131,8 @@ class Measurements:
     noise_correlation: Array | None = None
 
     @property
-    def channel_of_column(self) -> tuple[str, ...]:
-        """Channel name of each of the k outputs."""
+    def output_channel_names(self) -> tuple[str, ...]:
+        """ChannelKind name of each of the k outputs."""
         return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
     @property
@@ -147,7 +147,7 @@ class Measurements:
         return np.unique(np.concatenate([self.node, after]))
 
     @property
-    def is_used(self) -> BoolArray:
+    def used_output_mask(self) -> BoolArray:
         """Mask of measured outputs with positive weight, shape (M, k)."""
         return self.weight > 0
 
@@ -165,7 +165,7 @@ class Measurements:
         """
         if self.noise_correlation is None:
             return None
-        seen = self.is_used
+        seen = self.used_output_mask
         together = seen[:, :, None] & seen[:, None, :]
         size, turn = np.linalg.eigh(np.where(together, self.noise_correlation, np.eye(seen.shape[1])))
         blocks = (turn / np.sqrt(np.maximum(size, 1e-12))[:, None, :]) @ turn.transpose(0, 2, 1)
@@ -181,14 +181,14 @@ class Measurements:
         """Whitened residual, prediction minus measurement, zero where nothing was measured, shape (M, k)."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
         if self.decorrelation_matrix is not None:
-            plain[self.is_used] = self.decorrelation_matrix @ plain[self.is_used]
+            plain[self.used_output_mask] = self.decorrelation_matrix @ plain[self.used_output_mask]
         return plain
 
-    def whitening_adjoint(self, pull: Array) -> Array:
+    def whitened_residual_adjoint(self, pull: Array) -> Array:
         """Adjoint of `whitened_residual`: cost derivative by the prediction from that by the residual, shape (M, k)."""
         if self.decorrelation_matrix is not None:
             pull = pull.copy()
-            pull[self.is_used] = self.decorrelation_matrix.T @ pull[self.is_used]
+            pull[self.used_output_mask] = self.decorrelation_matrix.T @ pull[self.used_output_mask]
         return np.asarray(pull * self.weight)
 
     def residual_block(
@@ -196,15 +196,15 @@ class Measurements:
     ) -> ResidualBlock:
         """Residual block with weights of Huber's loss and, with slopes of the prediction (M, k, d), its Jacobian."""
         raw = self.whitened_residual(predicted)
-        cost, factor = huber_loss(raw, threshold)
-        seen, jacobian = self.is_used, None
+        cost, factor = huber_loss_and_residual_factors(raw, threshold)
+        seen, jacobian = self.used_output_mask, None
         robust = factor[seen]
         if slopes is not None:
             jacobian = robust[:, None] * self.decorrelate(self.weight[seen][:, None] * slopes[seen])
         return ResidualBlock(cost, robust * raw[seen], jacobian, robust)
 
-    def delayed_by(self, steps: Array) -> Measurements:
-        """The same samples shifted back by a delay of each output, shape (k,) [steps], within the span."""
+    def shifted_earlier_by(self, steps: Array) -> Measurements:
+        """The same samples moved earlier by each output's delay, shape (k,) [steps], within the predictable nodes."""
         position = np.clip((self.node + self.fraction)[:, None] - steps, *self.predictable_nodes)
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-9, near, position)
@@ -212,7 +212,7 @@ class Measurements:
         node = np.minimum(np.floor(position), max(last - 1, first)).astype(np.int64)
         return replace(self, node=node, fraction=position - node)
 
-    def prediction_rate(self, at_nodes: Array, unmoved: Measurements, steps: Array) -> Array:
+    def prediction_rate_per_step(self, at_nodes: Array, unmoved: Measurements, steps: Array) -> Array:
         """Rate of change of a prediction per step for delayed samples, shape (M, k); at a node the mean of both sides.
 
         `at_nodes` (len(nodes), k) is the prediction, `unmoved` the measurements before the delay of `steps` (k,).
@@ -233,7 +233,7 @@ class Measurements:
             (position < self.predictable_nodes[0] - 1e-9) | (position > self.predictable_nodes[1] + 1e-9), 0.0, rate
         )
 
-    def interpolate(self, at_nodes: Array) -> Array:
+    def interpolate_to_samples(self, at_nodes: Array) -> Array:
         """Interpolate values at `evaluation_nodes`, shape (len(nodes), ...), to the samples, shape (M, ...)."""
         nodes = self.evaluation_nodes
         column = () if self.node.ndim == 1 else (np.arange(at_nodes.shape[1]),)
@@ -243,7 +243,7 @@ class Measurements:
         return np.where(fraction > 0, (1 - fraction) * before + fraction * after, before)
 
     def interpolation_adjoint(self, at_samples: Array) -> Array:
-        """Transpose of `interpolate`, shape (M, ...) to (len(nodes), ...)."""
+        """Transpose of `interpolate_to_samples`, shape (M, ...) to (len(nodes), ...)."""
         nodes = self.evaluation_nodes
         result = np.zeros((len(nodes), *at_samples.shape[1:]))
         fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_samples.ndim - self.fraction.ndim)))
@@ -259,7 +259,7 @@ class Measurements:
         return result
 
 
-def place_on_grid(data: SensorData, grid: TimeGrid, where: str) -> Measurements:
+def locate_measurements_on_grid(data: SensorData, grid: TimeGrid, where: str) -> Measurements:
     """Locate a sensor's data on the nodes of a rollout; raises `DataError` where a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
@@ -290,8 +290,8 @@ def with_paper_weights(samples: Measurements, grid: TimeGrid) -> Measurements:
     return replace(samples, node=nearest_node, fraction=exact, weight=weight, bias_std=none, noise_correlation=None)
 
 
-def huber_loss(residual: Array, scale: float) -> tuple[float, Array]:
-    """Return Huber's loss of whitened residuals and the factors that turn residuals into a weighted least squares.
+def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[float, Array]:
+    """Return the Huber loss of whitened residuals and the factors that scale them for weighted least squares.
 
     Parameters
     ----------
@@ -315,7 +315,7 @@ def huber_loss(residual: Array, scale: float) -> tuple[float, Array]:
 
 
 @dataclass(frozen=True)
-class ConstantErrorModel:
+class ConstantSensorErrorModel:
     """Noise model of constant sensor errors: SVD of the residual's sensitivities to errors of unit variance.
 
     Attributes
@@ -333,9 +333,9 @@ class ConstantErrorModel:
     right_vectors: Array
 
     @staticmethod
-    def from_sensitivities(slopes: Array) -> ConstantErrorModel:
+    def from_sensitivities(slopes: Array) -> ConstantSensorErrorModel:
         """Model from the sensitivities of residuals of unit variance, shape (r, m)."""
-        return ConstantErrorModel(*np.linalg.svd(slopes, full_matrices=False))
+        return ConstantSensorErrorModel(*np.linalg.svd(slopes, full_matrices=False))
 
     def whiten(self, columns: Array) -> Array:
         """Whiten columns (a residual, its derivatives) by sensor noise and constant errors, shape (r, c)."""
@@ -344,7 +344,7 @@ class ConstantErrorModel:
             columns - self.left_vectors @ ((1 - 1 / np.sqrt(1 + self.singular_values**2))[:, None] * along)
         )
 
-    def estimate_errors(self, residual: Array) -> Array:
+    def estimate_constant_errors(self, residual: Array) -> Array:
         """Estimate the errors, measured minus true, from a residual, prediction minus measurement, shape (m,)."""
         return np.asarray(
             -self.right_vectors.T
@@ -352,7 +352,7 @@ class ConstantErrorModel:
         )
 
 
-def constant_error_sensitivities(samples: Sequence[Measurements]) -> Array:
+def sensitivities_to_constant_errors(samples: Sequence[Measurements]) -> Array:
     """Sensitivities of whitened measurements to constant sensor errors [standard deviations], shape (r, m).
 
     Those of the residual, prediction minus measurement, have the opposite sign.
@@ -362,7 +362,7 @@ def constant_error_sensitivities(samples: Sequence[Measurements]) -> Array:
     found = np.zeros((sum(s.n_residuals for s in samples), count))
     rows = 0
     for s, part in zip(samples, parts, strict=True):
-        own = s.decorrelate(part[s.is_used])
+        own = s.decorrelate(part[s.used_output_mask])
         found[rows : rows + s.n_residuals, before : before + own.shape[1]] = own
         rows, before = rows + s.n_residuals, before + own.shape[1]
     return found
@@ -373,11 +373,13 @@ def subtract_estimated_biases(samples: Sequence[Measurements], predicted: Sequen
 
     `predicted` has the shape (M, k) for each.
     """
-    slopes = constant_error_sensitivities(samples)
+    slopes = sensitivities_to_constant_errors(samples)
     if not slopes.shape[1]:
         return tuple(samples)
-    residual = np.concatenate([s.whitened_residual(y)[s.is_used] for s, y in zip(samples, predicted, strict=True)])
-    left = ConstantErrorModel.from_sensitivities(slopes).estimate_errors(residual)
+    residual = np.concatenate(
+        [s.whitened_residual(y)[s.used_output_mask] for s, y in zip(samples, predicted, strict=True)]
+    )
+    left = ConstantSensorErrorModel.from_sensitivities(slopes).estimate_constant_errors(residual)
     made = []
     for s in samples:
         error, own = s.bias_std.copy(), s.bias_std > 0

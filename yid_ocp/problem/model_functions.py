@@ -14,11 +14,11 @@ from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import TrackingFeedback
-from yid_ocp.integrator.tracking_feedback import DrivenJointMotion, MomentumShift, arms_only_step
+from yid_ocp.integrator.tracking_feedback import DrivenJointMotion, EffectMomentumShift, driven_joints_only_step
 from yid_ocp.model.system import RecordingErrorEffect, System
-from yid_ocp.parallel import LockedCache
+from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.initial_state_fit import InitialStateFitter
-from yid_ocp.sensors import Sensor, sensor_function
+from yid_ocp.sensors import Sensor, sensor_reading_function
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class CorrectedInputs:
 
     def with_momentum_shift(
         self,
-        shift: MomentumShift,
+        shift: EffectMomentumShift,
         recorded: DrivenJointMotion,
         measured: Array,
         theta: Array,
@@ -115,13 +115,13 @@ class CorrectedInputs:
             self.torque_sensitivity,
             by_internal,
         )
-        momentum, slope = shift.shift_and_derivatives(recorded, true, theta, wanted)
+        momentum, slope = shift.momentum_shift_and_derivatives(recorded, true, theta, wanted)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 
-    def nominal_torque_tangents(
+    def nominal_torque_sensitivity(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], width: int
     ) -> Array | None:
-        """Tangents of the nominal torque, including those of the filter's reference, shape (N, nu, width)."""
+        """Derivatives of the nominal torque, including those through the filter's reference, shape (N, nu, width)."""
         reached = [] if self.torque_sensitivity is None else [self.torque_sensitivity]
         for slope, momenta in ((self.driven_angles_sensitivity, False), (self.momentum_shift_sensitivity, True)):
             if feedback is not None and slope is not None:
@@ -179,8 +179,8 @@ class InputCorrections:
             function = ca.Function("true", [angle, effort, theta], [*outputs, *slopes])
             return MappedFunction(function, shared_inputs=(2,), use_compiler=use_compiler)
 
-        self._maps: LockedCache[bool, MappedFunction] = LockedCache(compiled)
-        self._sensor_delays: LockedCache[Sensor, ca.Function | None] = LockedCache(self._sensor_delay)
+        self._maps: CasadiLockedCache[bool, MappedFunction] = CasadiLockedCache(compiled)
+        self._sensor_delays: CasadiLockedCache[Sensor, ca.Function | None] = CasadiLockedCache(self._sensor_delay)
 
     def _corrected(self, angle: ca.SX, effort: ca.SX) -> tuple[ca.SX, ca.SX]:
         angles, efforts = [], []
@@ -198,7 +198,7 @@ class InputCorrections:
         return ca.vertcat(ca.SX(0, 1), *angles), ca.vertcat(ca.SX(0, 1), *efforts)
 
     def _delay(self, channel: str, camera: bool) -> ca.SX:
-        total = sum((effect.added_delay(channel, camera) for effect in self._effects), ca.SX(0))
+        total = sum((effect.added_channel_delay(channel, camera) for effect in self._effects), ca.SX(0))
         kind, _, joint = channel.partition(".")
         if kind == "torque" and joint in self.system.servos:
             total += self.system.servos[joint].command_delay
@@ -208,7 +208,7 @@ class InputCorrections:
     def true_angles_and_efforts(
         self, angle: Array, effort: Array, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """True angles and efforts of `joint_names` behind readings.
+        """True angles and efforts of `joint_names` computed from recorded ones, with derivatives by `wanted`.
 
         Parameters
         ----------
@@ -229,29 +229,29 @@ class InputCorrections:
         return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
 
     def torque_delay(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
-        """Delay from recorded to acting torque of each driven joint, shape (nu,) [s], and its derivative."""
+        """Delay from recorded to acting torque, shape (nu,) [s], and its derivatives by `wanted` parameters."""
         return self._evaluate(self._late, theta, wanted)
 
-    def torque_time_constants(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """Time constant of each driven joint's torque lag, (nu,) [s], and its derivative; None without lags."""
+    def torque_lag_time_constants(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """Time constants of driven joints' torque lags, (nu,) [s], and derivatives by `wanted`; None without lags."""
         function = self._lags["torque"]
         return None if function is None else self._evaluate(function, theta, wanted)
 
-    def effort_time_constants(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """Time constant of each prescribed joint's effort lag, (nc,) [s], and its derivative; None without lags."""
+    def effort_lag_time_constants(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
+        """Time constants of prescribed joints' effort lags, (nc,) [s], derivatives by `wanted`; None without lags."""
         function = self._lags["joints.effort"]
         return None if function is None else self._evaluate(function, theta, wanted)
 
     def _lag_function(self, kind: str, joints: tuple[str, ...]) -> ca.Function | None:
         lags = [
-            sum((effect.lag_time_constant(f"{kind}.{joint}") for effect in self._effects), ca.SX(0))
+            sum((effect.channel_lag_time_constant(f"{kind}.{joint}") for effect in self._effects), ca.SX(0))
             / self.system.recorded_time_scale
             for joint in joints
         ]
         return self._with_jacobian(lags)
 
     def sensor_delay(self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """Delay from true to recorded time of each output, shape (k,) [s], and its derivative; None without delays."""
+        """Recorded minus true time of each output, (k,) [s], with derivatives by `wanted`; None without delays."""
         found = self._sensor_delays(sensor)
         return None if found is None else self._evaluate(found, theta, wanted)
 
@@ -277,7 +277,7 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 
 @dataclass(frozen=True)
-class NodeValues:
+class NodeStateValues:
     """Values of `model.NodeState` at K nodes: q, v, load (K, n), z (K, nz), lam (K, m), rates by the recorded clock."""
 
     q: Array
@@ -287,21 +287,23 @@ class NodeValues:
     lam: Array
 
     @staticmethod
-    def along_trajectory(step: Step, state: Array, load: Array | None = None, lam: Array | None = None) -> NodeValues:
+    def from_trajectory(
+        step: Step, state: Array, load: Array | None = None, lam: Array | None = None
+    ) -> NodeStateValues:
         """Values at all nodes of a trajectory (K, nx); loads and constraint forces are zero when absent."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
         v = node_velocity(q, nodes, step.time_step)
         lam = np.zeros((len(state), step.sizes["m"])) if lam is None else lam
-        return NodeValues(q, v, z, np.zeros_like(q) if load is None else load, lam)
+        return NodeStateValues(q, v, z, np.zeros_like(q) if load is None else load, lam)
 
-    def at(self, nodes: IntArray) -> NodeValues:
-        """The values at some of the nodes."""
-        return NodeValues(self.q[nodes], self.v[nodes], self.z[nodes], self.load[nodes], self.lam[nodes])
+    def at(self, nodes: IntArray) -> NodeStateValues:
+        """The same values at the nodes with the given indices."""
+        return NodeStateValues(self.q[nodes], self.v[nodes], self.z[nodes], self.load[nodes], self.lam[nodes])
 
 
 def node_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Mean midpoint velocity of the steps beside some nodes of a trajectory (K, ...), shape (len(nodes), ...)."""
+    """Velocity at some nodes of a trajectory (K, ...), the mean over the adjacent steps, shape (len(nodes), ...)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, len(q) - 1)
     span = np.maximum(after - before, 1) * time_step
     return np.asarray((q[after] - q[before]) / span.reshape(-1, *[1] * (q.ndim - 1)))
@@ -317,7 +319,7 @@ def node_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: f
 
 
 class _SensorReadings(NamedTuple):
-    """Readings of a sensor at K nodes, (K, k), and their derivatives, (K, k, ...), as of `sensors.sensor_function`."""
+    """Readings of a sensor at K nodes, (K, k), and their derivatives, (K, k, ...); see `sensor_reading_function`."""
 
     output: Array
     by_q: Array
@@ -340,7 +342,7 @@ class _CompiledSensor:
     all_derivatives: MappedFunction
     columns: tuple[int, ...] | None = None
 
-    def __call__(self, at: NodeValues, theta: Array) -> _SensorReadings:
+    def __call__(self, at: NodeStateValues, theta: Array) -> _SensorReadings:
         """Readings at nodes."""
         output, *slopes = self.all_derivatives(at.q, at.v, at.z, at.load, at.lam, theta)
         if self.columns is not None:
@@ -364,13 +366,15 @@ class ModelFunctions:
         self.parameter_names = names
         self.input_corrections = InputCorrections(step.system, names, step.is_compiled)
         self._start_parameters = start_parameters
-        self._statics: LockedCache[None, EquilibriumSolver] = LockedCache(lambda _: EquilibriumSolver(step))
-        self._start_fit: LockedCache[None, InitialStateFitter] = LockedCache(
+        self._statics: CasadiLockedCache[None, EquilibriumSolver] = CasadiLockedCache(lambda _: EquilibriumSolver(step))
+        self._start_fit: CasadiLockedCache[None, InitialStateFitter] = CasadiLockedCache(
             lambda _: InitialStateFitter(step, start_parameters)
         )
-        self._arms: LockedCache[None, Step] = LockedCache(lambda _: arms_only_step(step))
-        self._momentum: LockedCache[None, MomentumShift] = LockedCache(lambda _: MomentumShift(step))
-        self._sensors: LockedCache[tuple[Sensor, bool], MappedFunction] = LockedCache(self._compiled)
+        self._arms: CasadiLockedCache[None, Step] = CasadiLockedCache(lambda _: driven_joints_only_step(step))
+        self._momentum: CasadiLockedCache[None, EffectMomentumShift] = CasadiLockedCache(
+            lambda _: EffectMomentumShift(step)
+        )
+        self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     @property
     def equilibrium_solver(self) -> EquilibriumSolver:
@@ -383,16 +387,16 @@ class ModelFunctions:
         return self._start_fit(None)
 
     @property
-    def arms_only_step(self) -> Step:
+    def arms_only_integrator_step(self) -> Step:
         """Compiled step of the arms alone, for which the tracking filter's gains are computed."""
         return self._arms(None)
 
     @property
-    def momentum_shift(self) -> MomentumShift:
+    def momentum_shift(self) -> EffectMomentumShift:
         """Momenta that effects add to those that the tracking filter follows."""
         return self._momentum(None)
 
-    def compiled_sensor(self, sensor: Sensor, wanted: tuple[str, ...] = ()) -> _CompiledSensor:
+    def compiled_sensor_function(self, sensor: Sensor, wanted: tuple[str, ...] = ()) -> _CompiledSensor:
         """Compiled function of a sensor's readings, with derivatives by the parameters `wanted`."""
         if not wanted or wanted == self.parameter_names:
             return _CompiledSensor(self._sensors((sensor, bool(wanted))))
@@ -410,5 +414,5 @@ class ModelFunctions:
 
     def _compiled(self, key: tuple[Sensor, bool]) -> MappedFunction:
         sensor, differentiated = key
-        function = sensor_function(self.step.system, sensor, self.parameter_names if differentiated else ())
+        function = sensor_reading_function(self.step.system, sensor, self.parameter_names if differentiated else ())
         return MappedFunction(function, shared_inputs=(5,), use_compiler=self.step.is_compiled)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.issues import Issue
-from yid_ocp.model.objects.base import ClampPath
+from yid_ocp.model.objects.base import ClampPoseDefinition
 from yid_ocp.options import OptionInfo
 from yid_ocp.problem.measurements import ResidualWeighting
 from yid_ocp.sensors import SensorOptions as SensorOptions
@@ -88,7 +88,7 @@ class ProblemOptions:
         float, Gt(0), OptionInfo("low-pass cutoff of prescribed paths and of the efforts compared with them", "Hz")
     ] = 10.0
     sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
-    clamp_paths: tuple[ClampPath, ...] = ()
+    clamp_paths: tuple[ClampPoseDefinition, ...] = ()
     local_parameters: tuple[str, ...] = ()
     prior_stds: Mapping[str, float] = field(default_factory=dict)
     multivariate_prior: MultivariateGaussianPrior = field(default_factory=MultivariateGaussianPrior)
@@ -126,6 +126,6 @@ class ProblemOptions:
     data_issues: tuple[Issue, ...] = ()
 
     @property
-    def has_trusted_data(self) -> bool:
+    def has_no_serious_data_issues(self) -> bool:
         """Whether the recordings have no data quality issue graver than a warning."""
         return all(doubt.weight == "warning" for doubt in self.data_issues)

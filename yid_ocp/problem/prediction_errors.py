@@ -104,14 +104,14 @@ def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
     return float(np.sqrt(np.mean(square[seen]))) if np.any(seen) else float("nan")
 
 
-def measured_positions(recording: Recording, points: Sequence[str]) -> Array:
+def measured_point_positions(recording: Recording, points: Sequence[str]) -> Array:
     """Measured positions of some points of one group, shape (M, len(points), 3) [m]."""
     group = _group_with_points(recording, points)
     return group.position[:, [group.names.index(point) for point in points]]
 
 
 def _given_frame(recording: Recording, points: Sequence[str], given: int) -> Array:
-    at = measured_positions(recording, points)
+    at = measured_point_positions(recording, points)
     if not 1 <= given < len(at):
         raise DataError(f"given = {given} frames", where=recording.name, allowed=f"1 to {len(at) - 1}")
     if not np.all(np.isfinite(at[given - 1])):
@@ -123,10 +123,10 @@ def _given_frame(recording: Recording, points: Sequence[str], given: int) -> Arr
 def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], given: int, share: Array) -> Array:
     """Given frames as measured, then the last one plus each point's share of the known points' displacement."""
     here = _given_frame(recording, points, given)
-    result = np.array(measured_positions(recording, points))
+    result = np.array(measured_point_positions(recording, points))
     moved = np.zeros((len(result), len(points), 3))
     if known:
-        paths = measured_positions(recording, known)
+        paths = measured_point_positions(recording, known)
         moved = np.einsum("pk,mkx->mpx", share, paths - _given_frame(recording, known, given))
     result[given:] = here + moved[given:]
     return result

@@ -12,12 +12,12 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import sensor_kinds
 from yid_ocp.errors import DataError, nearest_name_hint
-from yid_ocp.model.objects.base import ClampPath
+from yid_ocp.model.objects.base import ClampPoseDefinition
 from yid_ocp.model.servos_and_springs import PositionServo
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
-from yid_ocp.sensors import CHANNELS, recorded_camera_pose, recorded_joint_columns
+from yid_ocp.sensors import CHANNEL_KINDS, recorded_camera_pose, recorded_joint_columns
 
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
 """Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
@@ -59,7 +59,7 @@ def mean_step_inputs(
     return np.asarray(np.diff(np.stack(total, axis=1), axis=0) / grid.time_step)
 
 
-def mean_step_inputs_by_delay(
+def mean_step_input_delay_derivative(
     joints: JointGroup,
     driven: tuple[str, ...],
     grid: TimeGrid,
@@ -171,14 +171,14 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
     return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
 
 
-def recorded_sensors(recordings: Sequence[Recording]) -> frozenset[str]:
+def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
     """Sensors that the recordings contain, among those that effects require (`effects.sensor_kinds`)."""
     found = set()
     for recording in recordings:
         own = {} if recording.joints is None else {"joints": recording.joints.channels}
         own |= {group.name: dict(group.values) for group in recording.channel_groups}
-        for kind in CHANNELS:
-            channel = CHANNELS[kind]
+        for kind in CHANNEL_KINDS:
+            channel = CHANNEL_KINDS[kind]
             if any(channel.is_in_group(group) and channel.quantity in values for group, values in own.items()):
                 found.add(kind)
         if any(recorded_camera_pose(group) is not None for group in recording.points):
@@ -189,7 +189,11 @@ def recorded_sensors(recordings: Sequence[Recording]) -> frozenset[str]:
 
 
 def prescribed_path(
-    recording: Recording, system: System, grid: TimeGrid, low_pass: LowPassFilter, clamps: tuple[ClampPath, ...] = ()
+    recording: Recording,
+    system: System,
+    grid: TimeGrid,
+    low_pass: LowPassFilter,
+    clamps: tuple[ClampPoseDefinition, ...] = (),
 ) -> Array:
     """Prescribed coordinates at every node, shape (steps + 1, nc).
 
@@ -218,7 +222,7 @@ def prescribed_path(
 
 
 def _clamp_course(
-    recording: Recording, clamp: ClampPath, grid: TimeGrid, low_pass: LowPassFilter
+    recording: Recording, clamp: ClampPoseDefinition, grid: TimeGrid, low_pass: LowPassFilter
 ) -> Mapping[str, Array]:
     origin = _smoothed_point_path(recording, clamp.origin_point, grid, low_pass)
     direction = _smoothed_point_path(recording, clamp.z_axis_point, grid, low_pass) - origin

@@ -172,7 +172,7 @@ class FirstOrderLag:
     time_constant_sensitivity: Array
     time_step: float
 
-    def filter_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
+    def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
         """Mean over each step of the lagged output for inputs held over steps; output and input start equal.
 
         Parameters
@@ -196,7 +196,7 @@ class FirstOrderLag:
         through = by_value + share[:, None] * (followed - by_value)
         return value + share * gap, through + mean_by_time
 
-    def filter_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
+    def lagged_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
         """Lagged output at nodes for an input that is linear between nodes, starting at node 1.
 
         Parameters
@@ -223,8 +223,8 @@ class FirstOrderLag:
         total[:, :, :width] += self._by_time(value, followed)[:, :, None] * self.time_constant_sensitivity
         return followed, total
 
-    def node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """Adjoint of `filter_node_values`: cost derivatives by input and parameters from those by the output.
+    def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
+        """Adjoint of `lagged_node_values`: cost derivatives by input and parameters from those by the output.
 
         Parameters
         ----------
@@ -258,7 +258,7 @@ class FirstOrderLag:
         return decay, ratio * (1 - decay), decay_slope, (1 - decay - decay * inverse) / self.time_step
 
     def _by_time(self, value: Array, followed: Array) -> Array:
-        """Derivative of `filter_node_values` by each channel's time constant, shape (N, k)."""
+        """Derivative of `lagged_node_values` by each channel's time constant, shape (N, k)."""
         decay, _, decay_slope, share_slope = self._factors()
         driven = np.zeros_like(value)
         driven[2:] = decay_slope * (followed[1:-1] - value[1:-1]) - share_slope * (value[2:] - value[1:-1])

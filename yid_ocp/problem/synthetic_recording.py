@@ -12,10 +12,10 @@ from yid_ocp.errors import SolverError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.sensors.base import values_by_joint
+from yid_ocp.sensors.base import expand_to_joint_values
 from yid_ocp.sensors.joints import (
-    EFFORT_GROUP,
-    POSITION_GROUP,
+    JOINT_EFFORT_GROUP_NAME,
+    JOINT_POSITION_GROUP_NAME,
     joint_angle_noise_std,
     joint_torque_bias_std,
     joint_torque_noise_std,
@@ -58,7 +58,7 @@ def recording_from_prediction(
                 )
             )  # fmt: skip
     groups = [_with_clamps(group, predictor, source) for group in groups]
-    own = predictor.episode_theta(episode, theta)
+    own = predictor.theta_with_episode_values(episode, theta)
     truth = dict(zip(system.parameters.names, map(float, own), strict=True))
     text = f"{description} Simulated with the inputs of {episode.name}.".strip()
     joints = _joints(predictor, episode, outcome, rng)
@@ -103,13 +103,15 @@ def _channel_groups(
         names = tuple(channel.removeprefix(f"{sensor.group_name}.") for channel in sensor.channel_names)
         choice = predictor.options.sensors.get(sensor.group_name, SensorOptions())
         stds: dict[str, Array] = {}
-        for attribute, own in zip(sensor.channel.std_fields, (choice.std, choice.bias_std), strict=True):
+        for attribute, own in zip(sensor.channel.std_attribute_names, (choice.std, choice.bias_std), strict=True):
             given = own if own is not None else original.stds.get(attribute)
             if given is not None:
-                stds[attribute] = values_by_joint(given, original.names, names, f"sensors.{sensor.group_name}")
-        read = predictor.model_functions.compiled_sensor(sensor)(predictor.node_values(outcome.rollout), theta).output
+                stds[attribute] = expand_to_joint_values(given, original.names, names, f"sensors.{sensor.group_name}")
+        read = predictor.model_functions.compiled_sensor_function(sensor)(
+            predictor.node_values(outcome.rollout), theta
+        ).output
         values = read.reshape(len(read), len(names), *([-1] if sensor.channel.components else []))
-        std, bias = (stds.get(attribute, np.zeros(len(names))) for attribute in sensor.channel.std_fields)
+        std, bias = (stds.get(attribute, np.zeros(len(names))) for attribute in sensor.channel.std_attribute_names)
         widen = (slice(None), *[None] * (values.ndim - 2))
         values = _noisy(values, np.broadcast_to(std[widen], values.shape), rng)
         values = values + _noisy(np.zeros(values.shape[1:]), np.broadcast_to(bias[widen], values.shape[1:]), rng)
@@ -192,7 +194,7 @@ def _commanded(
     between = np.stack([np.interp(times, source.t, column) for column in commands.T], axis=1)
     held = [predictor.system.servos[name].command_interpolation == "held" for name in names]
     std = joint_angle_noise_std(
-        source, names, predictor.options.sensors.get(POSITION_GROUP, SensorOptions()), episode.name
+        source, names, predictor.options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), episode.name
     )
     noisy = _noisy(position, np.broadcast_to(std, position.shape), rng)
     given = np.where(held, commands[rows], between)
@@ -213,14 +215,15 @@ def _levels(predictor: EpisodePredictor, episode: Episode, names: tuple[str, ...
     joints, driven = episode.recording.joints, predictor.system.driven
     assert joints is not None
     effort, position = (
-        predictor.options.sensors.get(group, SensorOptions()) for group in (EFFORT_GROUP, POSITION_GROUP)
+        predictor.options.sensors.get(group, SensorOptions())
+        for group in (JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME)
     )
     joint_angles = joints.position_std if position.std is None else position.std
     torques = joints.effort_std if effort.std is None else effort.std
     if episode.input_errors is None:
         angle, torque = (
-            None if given is None else values_by_joint(given, joints.names, names, f"sensors.{group}.std")
-            for group, given in ((POSITION_GROUP, joint_angles), (EFFORT_GROUP, torques))
+            None if given is None else expand_to_joint_values(given, joints.names, names, f"sensors.{group}.std")
+            for group, given in ((JOINT_POSITION_GROUP_NAME, joint_angles), (JOINT_EFFORT_GROUP_NAME, torques))
         )
         return _Levels(angle, torque, None)
     at, rest = [names.index(name) for name in driven], [i for i, name in enumerate(names) if name not in driven]
@@ -230,9 +233,11 @@ def _levels(predictor: EpisodePredictor, episode: Episode, names: tuple[str, ...
     torque[at] = joint_torque_noise_std(joints, driven, effort, episode.name)
     bias[at] = joint_torque_bias_std(joints, driven, effort)
     if other:
-        stated = ((angle, joint_angles, POSITION_GROUP), (torque, torques, EFFORT_GROUP))
+        stated = ((angle, joint_angles, JOINT_POSITION_GROUP_NAME), (torque, torques, JOINT_EFFORT_GROUP_NAME))
         for target, std, group in stated:
-            target[rest] = values_by_joint(0.0 if std is None else std, joints.names, other, f"sensors.{group}.std")
+            target[rest] = expand_to_joint_values(
+                0.0 if std is None else std, joints.names, other, f"sensors.{group}.std"
+            )
     return _Levels(angle, torque, bias)
 
 

@@ -17,7 +17,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem.options import ProblemOptions
 
 INITIAL_STATE_PREFIX = "start."
-MIN_LOG_RATIO = 1e-3
+SOFT_LOGARITHM_MIN_RATIO = 1e-3
 """Ratio of an unknown to its initial value below which the weak prior's logarithm is replaced by a parabola."""
 
 
@@ -52,26 +52,26 @@ class UnknownVectorLayout:
         """Free parameters, shared then local, in the order of one recording's derivative columns."""
         return (*self.shared_parameters, *self.local_parameters)
 
-    def recording_columns(self, recording: int) -> IntArray:
-        """Indices of one recording's (shared, local, start) unknowns in the vector."""
+    def unknown_indices_of_recording(self, recording: int) -> IntArray:
+        """Indices in the unknown vector of one recording's shared, local and initial state unknowns."""
         shared, own = len(self.shared_parameters), len(self.local_parameters) + len(self.initial_state_names)
         return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
 
-    def scatter_columns(self, block: Array, recording: int) -> Array:
+    def scatter_to_unknown_columns(self, block: Array, recording: int) -> Array:
         """Scatter derivative columns of one recording, (r, d), to the columns of the unknown vector, (r, nx)."""
         wide = np.zeros((len(block), len(self.unknown_names)))
-        wide[:, self.recording_columns(recording)] = block
+        wide[:, self.unknown_indices_of_recording(recording)] = block
         return wide
 
     def split(self, x: ArrayLike, recording: int, theta: Array, system: System) -> tuple[Array, Array]:
         """Return theta with one recording's values, and its initial state offset, from the unknown vector."""
-        own = np.asarray(x, float)[self.recording_columns(recording)]
+        own = np.asarray(x, float)[self.unknown_indices_of_recording(recording)]
         result = theta.copy()
         for name, value in zip(self.free_parameters, own, strict=False):
             result[system.parameters.index(name)] = value
         return result, own[len(self.free_parameters) :]
 
-    def pack(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
+    def pack_same_for_all_recordings(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
         """Pack shared values, and local values and an initial state offset equal in all recordings, into a vector."""
         parts = [np.asarray(shared, float)]
         parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
@@ -132,26 +132,26 @@ def estimated_initial_state_names(
     """
     found: list[str] = []
     if options.initial_state == "estimated":
-        known = {*(() if system.servos else system.driven_indices), *system.prescribed_indices}
+        known = {*(() if system.servos else system.driven_coordinate_indices), *system.prescribed_coordinate_indices}
         known |= {system.mechanism.joint_index(joint) for joint in system.joint_compliances}
         coordinates = [name for i, name in enumerate(system.mechanism.joint_names) if i not in known]
         found = [*(f"q.{name}" for name in coordinates), *(f"p.{name}" for name in coordinates)]
     for effect in system.effects:
-        if isinstance(effect, EffectBase) and effect.unknown_initial_state_bounds:
+        if isinstance(effect, EffectBase) and effect.max_abs_unknown_initial_states:
             index = system.parameters.index
             names = effect.amplitude_names
             if any(name in free or theta[index(name)] != effect.neutral_values[name] for name in names):
-                found += [f"z.{name}" for name in effect.unknown_initial_state_bounds]
+                found += [f"z.{name}" for name in effect.max_abs_unknown_initial_states]
     return tuple(found)
 
 
 def _unobserved_state_limits(system: System) -> dict[str, float]:
     """Unobserved initial internal coordinates of the effects, each with its largest magnitude."""
     effects = [effect for effect in system.effects if isinstance(effect, EffectBase)]
-    return {name: size for effect in effects for name, size in effect.unknown_initial_state_bounds.items()}
+    return {name: size for effect in effects for name, size in effect.max_abs_unknown_initial_states.items()}
 
 
-def initial_state_limits(system: System, names: Sequence[str]) -> Array:
+def initial_state_offset_limits(system: System, names: Sequence[str]) -> Array:
     """Largest offset of each estimated component of an initial state, infinite for coordinates and momenta."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
@@ -183,10 +183,10 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
             raise ConfigError(what, where=f"parameters.{name}", allowed="lower below upper", hint=hint)
 
 
-def soft_logarithm(ratio: Array) -> tuple[Array, Array]:
-    """Return log(ratio) and its slope, below `MIN_LOG_RATIO` those of the parabola that continues it."""
-    below = (ratio - MIN_LOG_RATIO) / MIN_LOG_RATIO
+def soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
+    """Return log(ratio) and its slope, below `SOFT_LOGARITHM_MIN_RATIO` those of the parabola that continues it."""
+    below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
     small = below < 0
-    kept = np.where(small, MIN_LOG_RATIO, ratio)
+    kept = np.where(small, SOFT_LOGARITHM_MIN_RATIO, ratio)
     value = np.log(kept) + np.where(small, below - below**2 / 2, 0.0)
-    return value, np.where(small, (1 - below) / MIN_LOG_RATIO, 1 / kept)
+    return value, np.where(small, (1 - below) / SOFT_LOGARITHM_MIN_RATIO, 1 / kept)

@@ -18,9 +18,9 @@ from yid_ocp.report.figures import (
     LINE_COLORS,
     SEQUENTIAL_COLORSCALE,
     TEXT_COLOR,
-    asymmetric_bars,
+    asymmetric_error_bars,
     line_color,
-    page_figure,
+    styled_report_figure,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ _SYMBOLS = ("circle", "diamond", "square", "cross")
 
 def _rows_figure(height: int, names: Sequence[str], title: str) -> plotly.graph_objects.Figure:
     """An empty figure with one named row for each name, the first on top."""
-    figure = page_figure(height, title, "")
+    figure = styled_report_figure(height, title, "")
     figure.update_yaxes(autorange="reversed", categoryorder="array", categoryarray=list(names), automargin=True)
     return figure
 
@@ -61,13 +61,13 @@ def estimates_figure(
     return figure
 
 
-def values_by_source_figure(
+def parameter_values_by_source_figure(
     rows: Mapping[str, Mapping[str, tuple[float, float | None]]], unit: str
 ) -> plotly.graph_objects.Figure:
     """Figure of values ± 2 std from several sources, one row per parameter and one color per source."""
     sources = list(dict.fromkeys(source for row in rows.values() for source in row))
     names = list(rows)
-    figure = page_figure(110 + max(36, 14 * len(sources)) * len(names), unit, "")
+    figure = styled_report_figure(110 + max(36, 14 * len(sources)) * len(names), unit, "")
     spread = 0.6 / max(len(sources), 1)
     for i, source in enumerate(sources):
         own = [(k, *rows[name][source]) for k, name in enumerate(names) if source in rows[name]]
@@ -92,7 +92,7 @@ def _heat_figure(
 ) -> plotly.graph_objects.Figure:
     """Figure of numbers between 0 and 1 for each pair of a row's and a column's name."""
     rows, columns = (list(own) for own in names)
-    figure = page_figure(height, titles[1], titles[0])
+    figure = styled_report_figure(height, titles[1], titles[0])
     figure.add_heatmap(
         x=columns, y=rows, z=parts.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
         colorscale=SEQUENTIAL_COLORSCALE, texttemplate="%{text}",
@@ -103,7 +103,7 @@ def _heat_figure(
     return figure
 
 
-def confusion_figure(
+def confusion_matrix_figure(
     rows: Sequence[str], columns: Sequence[str], counts: Array, row: str, column: str
 ) -> plotly.graph_objects.Figure:
     """Confusion-matrix figure of counts, colored by the fraction of their row."""
@@ -113,15 +113,17 @@ def confusion_figure(
     return figure.update_traces(text=text, hovertemplate="%{y}: said %{x}<extra></extra>")
 
 
-def matrix_figure(names: Sequence[str], values: Array, row: str, column: str) -> plotly.graph_objects.Figure:
-    """Parts of a whole `values` (n, n), between 0 and 1, in per cent for every pair of names."""
+def explained_fraction_matrix_figure(
+    names: Sequence[str], values: Array, row: str, column: str
+) -> plotly.graph_objects.Figure:
+    """Heat-map figure of explained fractions `values` (n, n), row explained by column, shown in per cent."""
     figure = _heat_figure(190 + 27 * len(names), (names, names), values, (row, column), -40)
     text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]
     return figure.update_traces(text=text, hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>")
 
 
 @dataclass(frozen=True)
-class BeforeAfter:
+class ValueBeforeAfter:
     """A value before and after a change, with standard deviations and an optional reference value."""
 
     before: float
@@ -131,8 +133,8 @@ class BeforeAfter:
     reference: float | None = None
 
 
-def before_after_figure(
-    rows: Mapping[str, BeforeAfter], axis: str, words: tuple[str, str, str]
+def values_before_after_figure(
+    rows: Mapping[str, ValueBeforeAfter], axis: str, words: tuple[str, str, str]
 ) -> plotly.graph_objects.Figure:
     """Figure of values before and after, one row each; error bars are two standard deviations.
 
@@ -175,7 +177,7 @@ def before_after_figure(
 
 
 @dataclass(frozen=True)
-class TimeMapRow:
+class TimeHeatMapRow:
     """One row of a heat map over time.
 
     Attributes
@@ -193,7 +195,7 @@ class TimeMapRow:
     hover_texts: Sequence[str]
 
 
-def time_map_figure(edges: Array, rows: Sequence[TimeMapRow], axis: str) -> plotly.graph_objects.Figure:
+def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> plotly.graph_objects.Figure:
     """Heat-map figure over time, one row per quantity; grey: not informed by the data.
 
     Parameters
@@ -210,7 +212,7 @@ def time_map_figure(edges: Array, rows: Sequence[TimeMapRow], axis: str) -> plot
     marks = [m for m in ((0, 1, 3, 10) if limit < 20 else (0, 10, 100, 1000, 10000)) if m <= limit]
     marks = sorted({-m for m in marks} | set(marks))
     bar = {"thickness": 14, "x": 1.2, "tickvals": _even(marks).tolist(), "ticktext": [str(m) for m in marks]}
-    figure = page_figure(120 + max(17 * len(rows), 100), "time [s]", "")
+    figure = styled_report_figure(120 + max(17 * len(rows), 100), "time [s]", "")
     figure.add_heatmap(
         x=edges.tolist(), y=list(range(len(rows))),
         z=[[v if np.isfinite(v) else None for v in row.tolist()] for row in _even(values)],
@@ -270,7 +272,7 @@ def candidate_ranking_figure(
     done = {entry.name: entry.closure_interval_percent for entry in entries if entry.closure_interval_percent}
     last = 2 if done else 1
     figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.08)
-    figure = page_figure(100 + 28 * len(entries), "", "", base=figure)
+    figure = styled_report_figure(100 + 28 * len(entries), "", "", base=figure)
     figure.add_bar(
         x=[entry.predicted_decrease for entry in entries], y=[entry.name for entry in entries], orientation="h",
         width=0.55, marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last,
@@ -280,7 +282,7 @@ def candidate_ranking_figure(
         values, lows, highs = zip(*done.values(), strict=True)
         figure.add_scatter(
             x=values, y=list(done), mode="markers", showlegend=False, row=1, col=1,
-            marker={"color": LINE_COLORS[0], "size": 11}, error_x=asymmetric_bars(values, lows, highs),
+            marker={"color": LINE_COLORS[0], "size": 11}, error_x=asymmetric_error_bars(values, lows, highs),
         )  # fmt: skip
         # what makes a prediction worse can do so without end
         left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for low in lows)]) - 6

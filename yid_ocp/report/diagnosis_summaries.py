@@ -10,19 +10,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.inference.uncertainty import VERDICT_WORDS, parameter_text
+from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, parameter_value_text
 from yid_ocp.report.terminal import (
     CodeBlock,
     SummaryBlock,
     SummaryStatement,
     SummaryTable,
     TableRows,
-    format_error_and_unit,
-    issue_blocks,
-    make_statements,
+    format_error_value_and_unit,
+    issue_summary_blocks,
+    nonempty_summary_statements,
     nonempty_tables,
     p_value_text,
-    torque_offset_rows,
+    torque_offset_table_rows,
 )
 
 _MIN_GAP_SHARE, _MAX_WINDOWS = 0.005, 6  # of places that are listed
@@ -39,7 +39,7 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     """Summary blocks of a `yid-diagnosis/2` result."""
     left = len(result["which"]) - _MAX_CANDIDATES
     blocks = [
-        *issue_blocks(result),
+        *issue_summary_blocks(result),
         SummaryStatement(result["summary"], "verdict"),
         *nonempty_tables(
             SummaryTable(_gap_error_rows(result), "Errors on held-out recordings", is_key_table=True),
@@ -47,14 +47,14 @@ def diagnose_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
             SummaryTable(_event_rows(result), "Events"),
             SummaryTable(_candidate_rows(result), "Candidates"),
         ),
-        *make_statements([
+        *nonempty_summary_statements([
             f"{left} more candidates are in result.json" if left > 0 else "",
             f"these recordings could not show: {', '.join(result['unseen'])}" if result.get("unseen") else "",
         ]),
         *nonempty_tables(
             SummaryTable(_baseline_rows(result), "Since the baseline"),
             SummaryTable(_counterfactual_rows(result), "Without the effects, and with them"),
-            SummaryTable(torque_offset_rows(result), "How far the torques are off"),
+            SummaryTable(torque_offset_table_rows(result), "How far the torques are off"),
         ),
     ]  # fmt: skip
     if result.get("doubts"):
@@ -71,7 +71,7 @@ def _gap_error_rows(result: Mapping[str, Any]) -> TableRows:
     rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
     for channel, error in before["rmse"].items():
         errors = [error, *(step["rmse"].get(channel) for step in steps)]
-        shown = [format_error_and_unit(value, before["unit"][channel]) for value in errors]
+        shown = [format_error_value_and_unit(value, before["unit"][channel]) for value in errors]
         rows.append((channel, *(text for text, _ in shown), shown[0][1]))
     return rows
 
@@ -116,7 +116,7 @@ def _baseline_rows(result: Mapping[str, Any]) -> TableRows:
     """Parameters in the baseline and now."""
     rows: TableRows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
-        values = (parameter_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
+        values = (parameter_value_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
         moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
         rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
     return rows
@@ -153,10 +153,10 @@ def blind_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     if alarms["of"]:
         said.append(f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm")
     tables = nonempty_tables(*others, replace(cases, is_page_only=True))
-    return [replace(score, is_key_table=True), *tables, *make_statements(said, "verdict")]
+    return [replace(score, is_key_table=True), *tables, *nonempty_summary_statements(said, "verdict")]
 
 
-def blind_markdown(result: Mapping[str, Any]) -> list[str]:
+def blind_tables_markdown(result: Mapping[str, Any]) -> list[str]:
     """The tables of a `yid-blind/1` result as Markdown, an empty line between two."""
     lines: list[str] = []
     for head, *rows in (table.rows for table in _blind_tables(result)):
@@ -274,7 +274,7 @@ def batch_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
         same = "No parameter differs among the runs by more than they state."
         said.append(f"{', '.join(drifted)} {verb} not the same in all runs." if drifted else same)
         said += [f"Distrust {', '.join(wrong)}: without it the others agree, or agree far better."] if wrong else []
-    return [*blocks, *make_statements(said, "verdict")]
+    return [*blocks, *nonempty_summary_statements(said, "verdict")]
 
 
 def _batch_rows(runs: Sequence[Mapping[str, Any]], names: Sequence[str], units: Mapping[str, str]) -> TableRows:
@@ -286,9 +286,9 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], names: Sequence[str], units: 
             if own["value"] is None:
                 cells.append("")
             elif own["verdict"] in _FOUND_VERDICTS:
-                cells.append(parameter_text(own["value"], own["std"], None))
+                cells.append(parameter_value_text(own["value"], own["std"], None))
             else:
-                cells.append(VERDICT_WORDS[own["verdict"]])
+                cells.append(VERDICT_TABLE_TEXTS[own["verdict"]])
         fit = "" if entry["chi2_per_dof"] is None else f"{entry['chi2_per_dof']:.3g}"
         time = "" if entry["seconds"] is None else f"{entry['seconds']:.1f} s"
         rows.append((entry["name"], entry["status"], fit, ", ".join(entry["effects"]), *cells, time))
@@ -301,14 +301,14 @@ def history_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
     for name, entry in result["parameters"].items():
         known = entry["values"]
-        cells = (parameter_text(known[r]["value"], known[r]["std"], None) if r in known else "" for r in runs)
+        cells = (parameter_value_text(known[r]["value"], known[r]["std"], None) if r in known else "" for r in runs)
         p = "" if len(known) < 2 else p_value_text(entry["p_value"])
-        together = parameter_text(entry["mean"], entry["mean_std"], None)
+        together = parameter_value_text(entry["mean"], entry["mean_std"], None)
         rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
     return [
         SummaryTable(rows, "Parameters", is_key_table=True),
         SummaryTable(_consistency_rows(result), "Runs"),
-        *make_statements(_history_sentences(result), "verdict"),
+        *nonempty_summary_statements(_history_sentences(result), "verdict"),
     ]
 
 

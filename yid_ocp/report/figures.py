@@ -37,7 +37,7 @@ _SHADE = {"fillcolor": GRID_COLOR, "opacity": 0.7, "line_width": 0, "layer": "be
 
 
 def line_color(i: int) -> str:
-    """Color of the line number i."""
+    """Color of the i-th line of a figure; the colors repeat."""
     return LINE_COLORS[i % len(LINE_COLORS)]
 
 
@@ -51,10 +51,10 @@ def figure_html(figure: plotly.graph_objects.Figure) -> str:
     )
 
 
-def page_figure(
+def styled_report_figure(
     height: int, x: str, y: str, log_y: bool = False, base: plotly.graph_objects.Figure | None = None
 ) -> plotly.graph_objects.Figure:
-    """A figure, an empty one or `base`, with height [px], axis titles, colors and fonts of the page."""
+    """A plotly figure (`base` or an empty one) with height [px], axis titles, and the report's colors and fonts."""
     import plotly.graph_objects as go
 
     figure = go.Figure() if base is None else base
@@ -78,7 +78,7 @@ def page_figure(
 
 def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_objects.Figure:
     """Figure of the cost at every accepted point, one curve per intermediate horizon."""
-    figure = page_figure(320, "accepted point", "cost", log_y=True)
+    figure = styled_report_figure(320, "accepted point", "cost", log_y=True)
     ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
     for stage, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
         figure.add_scatter(
@@ -89,7 +89,7 @@ def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.
 
 
 @dataclass(frozen=True)
-class TimePlot:
+class TimePlotData:
     """Data of one plot over time: measured points and predicted lines.
 
     Attributes
@@ -121,7 +121,7 @@ def prediction_and_residual_plots(
     std: Array,
     lines: Mapping[str, Array],
     course: tuple[Array, Array] | None = None,
-) -> tuple[TimePlot, TimePlot]:
+) -> tuple[TimePlotData, TimePlotData]:
     """Two plots: measured and predicted values, and their residual with a band of two noise standard deviations.
 
     Parameters
@@ -139,8 +139,10 @@ def prediction_and_residual_plots(
         drawn[next(iter(lines))] = course
     left = {name: _broken_at_gaps(t[seen], factor * (values - measured)[seen]) for name, values in lines.items()}
     noise = float(np.median(std[seen])) if seen.any() else 0.0
-    above = TimePlot(f"{title} [{unit}]", drawn, t, measured)
-    return above, TimePlot(f"residual [{shown}]", left, band_half_height=2 * factor * noise or None, is_low_row=True)
+    above = TimePlotData(f"{title} [{unit}]", drawn, t, measured)
+    return above, TimePlotData(
+        f"residual [{shown}]", left, band_half_height=2 * factor * noise or None, is_low_row=True
+    )
 
 
 def _broken_at_gaps(t: Array, values: Array) -> tuple[Array, Array]:
@@ -151,7 +153,7 @@ def _broken_at_gaps(t: Array, values: Array) -> tuple[Array, Array]:
 
 
 def time_plots_figure(
-    curves: Sequence[TimePlot], dots: str = LINE_COLORS[1], lines: Mapping[str, str] | None = None
+    curves: Sequence[TimePlotData], dots: str = LINE_COLORS[1], lines: Mapping[str, str] | None = None
 ) -> plotly.graph_objects.Figure:
     """Figure with measured points and lines, one row per plot.
 
@@ -171,7 +173,7 @@ def time_plots_figure(
     figure = make_subplots(
         rows=len(curves), cols=1, shared_xaxes=True, vertical_spacing=_ROW_GAP / inner, row_heights=heights
     )
-    figure = page_figure(inner + _TOP_MARGIN + _BOTTOM_MARGIN, "", "", base=figure)
+    figure = styled_report_figure(inner + _TOP_MARGIN + _BOTTOM_MARGIN, "", "", base=figure)
     told: set[str] = set()
     for row, curve in enumerate(curves, start=1):
         at = {"row": row, "col": 1}
@@ -205,14 +207,14 @@ def time_plots_figure(
     return figure
 
 
-def _add_axis_title(figure: plotly.graph_objects.Figure, curve: TimePlot, y: float) -> None:
+def _add_axis_title(figure: plotly.graph_objects.Figure, curve: TimePlotData, y: float) -> None:
     at = {"x": 0, "xref": "paper", "xanchor": "left", "y": y, "yref": "paper", "yanchor": "bottom"}
     figure.add_annotation(text=curve.axis_title, showarrow=False, font={"size": 12}, **at)
 
 
-def lines_over_time_figure(curve: TimePlot) -> plotly.graph_objects.Figure:
+def lines_over_time_figure(curve: TimePlotData) -> plotly.graph_objects.Figure:
     """Figure of the lines of one plot, each in its own color."""
-    figure = page_figure(320 + 8 * len(curve.lines), "time [s]", "")
+    figure = styled_report_figure(320 + 8 * len(curve.lines), "time [s]", "")
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
         dash = _LINE_DASHES[i // len(LINE_COLORS) % len(_LINE_DASHES)]
         style = {"color": line_color(i), "width": 1.5, "dash": dash}
@@ -226,9 +228,9 @@ def lines_over_time_figure(curve: TimePlot) -> plotly.graph_objects.Figure:
     return figure
 
 
-def residual_histogram_figure(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:
+def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:
     """Histogram figure of whitened residuals per sensor group, with the standard normal density."""
-    figure = page_figure(340, "residual in standard deviations", "density")
+    figure = styled_report_figure(340, "residual in standard deviations", "density")
     edge = max([4.0, *(float(np.quantile(np.abs(r), 0.995)) for r in residuals.values() if len(r))])
     for i, (name, values) in enumerate(residuals.items()):
         bins = np.linspace(-edge, edge, int(np.clip(2 * np.sqrt(len(values)), 8, 60)) + 1)
@@ -244,26 +246,28 @@ def residual_histogram_figure(residuals: Mapping[str, Array]) -> plotly.graph_ob
     return figure
 
 
-def cost_over_time_figure(costs: Mapping[str, tuple[Sequence[float], Sequence[float]]]) -> plotly.graph_objects.Figure:
+def excess_cost_over_time_figure(
+    costs: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+) -> plotly.graph_objects.Figure:
     """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
-    figure = page_figure(340, "wall time [s]", "cost over its lowest, less one", log_y=True)
+    figure = styled_report_figure(340, "wall time [s]", "cost over its lowest, less one", log_y=True)
     for i, (name, (seconds, cost)) in enumerate(costs.items()):
         known = [(s, c) for s, c in zip(seconds, cost, strict=True) if np.isfinite(c)]
         if known:
             figure.add_scatter(
-                x=[s for s, _ in known], y=relative_excess([c for _, c in known]),
+                x=[s for s, _ in known], y=relative_excess_costs([c for _, c in known]),
                 mode="lines+markers", name=name, line={"color": line_color(i)},
             )  # fmt: skip
     return figure
 
 
-def relative_excess(costs: Sequence[float]) -> list[float]:
-    """Costs over the lowest of them, less one; at least 1e-9."""
+def relative_excess_costs(costs: Sequence[float]) -> list[float]:
+    """Relative excess of costs over the lowest of them, cost / min(costs) - 1; at least 1e-9."""
     least = max(min(costs), 1e-300)
     return [max(cost / least - 1.0, 1e-9) for cost in costs]
 
 
-def asymmetric_bars(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
+def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
     """Error bars of values from `low` to `high`."""
     above, below = np.maximum(np.subtract(high, values), 0.0), np.maximum(np.subtract(values, low), 0.0)
     return {"type": "data", "symmetric": False, "array": above.tolist(), "arrayminus": below.tolist()}
@@ -276,7 +280,7 @@ def rate_intervals_figure(
 
     A calibration has its diagonal, all others a logarithmic axis.
     """
-    figure = page_figure(340, x, y)
+    figure = styled_report_figure(340, x, y)
     if is_calibration:
         line = {"color": MEASURED_COLOR, "dash": "dot"}
         figure.add_scatter(x=[0, 1], y=[0, 1], mode="lines", line=line, showlegend=False, hoverinfo="skip")
@@ -285,7 +289,7 @@ def rate_intervals_figure(
     for i, (name, known) in enumerate(curves.items()):
         rates, low, high = ([entry[key] for entry in known.values()] for key in ("rate", "low", "high"))
         figure.add_scatter(
-            x=list(known), y=rates, mode="lines+markers", name=name, error_y=asymmetric_bars(rates, low, high),
+            x=list(known), y=rates, mode="lines+markers", name=name, error_y=asymmetric_error_bars(rates, low, high),
             line={"color": line_color(i)},
         )  # fmt: skip
     figure.update_yaxes(range=[-0.03, 1.03])
@@ -296,7 +300,7 @@ def profile_likelihood_figure(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float
 ) -> plotly.graph_objects.Figure:
     """Profile-likelihood figure: increase of chi2 over the parameter's value relative to the estimate."""
-    figure = page_figure(380, "value over best value", "chi2 above the best")
+    figure = styled_report_figure(380, "value over best value", "chi2 above the best")
     for i, (name, (ratio, delta)) in enumerate(curves.items()):
         line = {"color": line_color(i), "dash": "solid" if i < len(LINE_COLORS) else "dash"}
         figure.add_scatter(x=list(ratio), y=list(delta), mode="lines+markers", name=name, line=line)

@@ -11,7 +11,7 @@ from importlib import util
 from pathlib import Path
 
 from yid_ocp.files import write_text
-from yid_ocp.inference.uncertainty import VERDICT_WORDS
+from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS
 from yid_ocp.report.figures import figure_html
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import CodeBlock, SummaryTable
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 _SHARED_SCRIPT_LEVELS = 2
 """Levels above a page where a script that it may share is looked for: a batch is two above the pages of its runs."""
 _WRAP_LENGTH = 24  # characters from which the cells of a column are wrapped
-_VERDICTS = {words: verdict for verdict, words in VERDICT_WORDS.items()}
+_VERDICTS = {words: verdict for verdict, words in VERDICT_TABLE_TEXTS.items()}
 _NUMBER = re.compile(
     r"^(–|-|unknown|failed|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$"
 )

@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from yid_ocp.analysis.compare import MethodComparison
-from yid_ocp.analysis.sparsity_patterns import NamedRange, SparsityPattern
+from yid_ocp.analysis.sparsity_patterns import NamedIndexRange, SparsityPattern
 from yid_ocp.errors import OutputError
-from yid_ocp.report.figures import LINE_COLORS, asymmetric_bars, relative_excess
+from yid_ocp.report.figures import LINE_COLORS, asymmetric_error_bars, relative_excess_costs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CALIBRATION_LABELS = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
+BLIND_CALIBRATION_LABELS = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
 """Kinds of the calibration of a blind validation."""
 
 
-def draw_convergence(path: Path, comparison: MethodComparison) -> None:
+def draw_method_convergence(path: Path, comparison: MethodComparison) -> None:
     """Write a PNG of each method's relative excess cost over iterations and over wall time.
 
     Raises
@@ -37,7 +37,7 @@ def draw_convergence(path: Path, comparison: MethodComparison) -> None:
     for run in comparison.method_results:
         history = [entry for entry in run.solution.history if np.isfinite(entry.cost) and not entry.note]
         if history:
-            relative = relative_excess([entry.cost for entry in history])
+            relative = relative_excess_costs([entry.cost for entry in history])
             by_iteration.plot(range(len(history)), relative, marker=".", label=run.method)
             by_time.plot([entry.seconds for entry in history], relative, marker=".", label=run.method)
     for axes, label in ((by_iteration, "iteration"), (by_time, "wall time [s]")):
@@ -96,7 +96,7 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     figure = Figure(figsize=(5.0, 4.6), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="grey", linewidth=1)
-    for key, label in CALIBRATION_LABELS.items():
+    for key, label in BLIND_CALIBRATION_LABELS.items():
         entries = [entry for entry in result["calibration"][key] if entry["of"]]
         _draw_rates(axes, [entry["level"] for entry in entries], entries, label)
     axes.set(xlabel="promised", ylabel="kept")
@@ -106,7 +106,7 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
 def _draw_rates(axes: Axes, places: list[float], rates: list[Mapping[str, Any]], label: str) -> None:
     if rates:
         values, low, high = ([own[key] for own in rates] for key in ("rate", "low", "high"))
-        bars = asymmetric_bars(values, low, high)
+        bars = asymmetric_error_bars(values, low, high)
         spread = [bars["arrayminus"], bars["array"]]
         axes.errorbar(places, values, yerr=spread, marker="o", capsize=3, label=label)
 
@@ -193,7 +193,7 @@ def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
     axes.tick_params(axis="x", labelrotation=90)
 
 
-def _ticks(labels: Sequence[str], spans: Sequence[NamedRange]) -> tuple[list[float], list[str]]:
+def _ticks(labels: Sequence[str], spans: Sequence[NamedIndexRange]) -> tuple[list[float], list[str]]:
     """Where labels go: every one, or one for all of the same owner (a tube, an arm) in a block."""
     if len(labels) <= _MAX_SINGLE_LABELS:
         return [float(i) for i in range(len(labels))], list(labels)

@@ -6,25 +6,31 @@ import statistics
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from yid_ocp.inference.uncertainty import VERDICT_WORDS, fit_message, interval_text, parameter_text, percent_text
+from yid_ocp.inference.uncertainty import (
+    VERDICT_TABLE_TEXTS,
+    goodness_of_fit_message,
+    interval_text,
+    parameter_value_text,
+    percent_text,
+)
 from yid_ocp.report.diagnosis_summaries import batch_summary, blind_summary, diagnose_summary, history_summary
 from yid_ocp.report.terminal import (
-    MAX_SINGLE_CHANNELS,
+    MAX_CHANNELS_SHOWN_SINGLY,
     CodeBlock,
     SummaryBlock,
     SummaryStatement,
     SummaryTable,
     TableRows,
-    bounds_text,
-    channel_unit,
-    discretisation_sentences,
+    channel_or_group_unit,
+    discretisation_shift_sentences,
     display_scale_and_unit,
-    format_error_and_unit,
-    issue_blocks,
-    make_statements,
-    misfit_blocks,
+    format_error_value_and_unit,
+    issue_summary_blocks,
+    misfit_summary_blocks,
+    nonempty_summary_statements,
     nonempty_tables,
-    torque_offset_rows,
+    parameter_bounds_text,
+    torque_offset_table_rows,
 )
 
 _BASELINE_DESCRIPTIONS = {
@@ -44,22 +50,29 @@ def solve_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     """Summary blocks of a `yid-solve/1` result."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
-    blocks: list[SummaryBlock] = [] if failed else misfit_blocks(result["fit"])
-    blocks += [*issue_blocks(result), SummaryTable(_estimate_rows(free, failed), "Parameters", is_key_table=True)]
+    blocks: list[SummaryBlock] = [] if failed else misfit_summary_blocks(result["fit"])
+    blocks += [
+        *issue_summary_blocks(result),
+        SummaryTable(_estimate_rows(free, failed), "Parameters", is_key_table=True),
+    ]
     rows: TableRows = [("channel", "error (rms)", "unit", "samples")]
-    rows += [(c, *format_error_and_unit(e["rmse"], e["unit"]), str(e["n"])) for c, e in result["residuals"].items()]
+    rows += [
+        (c, *format_error_value_and_unit(e["rmse"], e["unit"]), str(e["n"])) for c, e in result["residuals"].items()
+    ]
     blocks += nonempty_tables(SummaryTable(rows, "Errors where it was fitted"))
     blocks += _held_out_blocks(result)
-    blocks += nonempty_tables(SummaryTable(torque_offset_rows(result), "How far the torques are off"))
-    blocks += make_statements([*discretisation_sentences(result), *result.get("discretisation_notes", ())])
+    blocks += nonempty_tables(SummaryTable(torque_offset_table_rows(result), "How far the torques are off"))
+    blocks += nonempty_summary_statements(
+        [*discretisation_shift_sentences(result), *result.get("discretisation_notes", ())]
+    )
     if failed:
         said = "the values are the best point that was reached; nothing can be said about how sure they are"
         blocks.append(SummaryStatement(said, "verdict"))
     else:
-        blocks += make_statements(_found_and_lost(free), "verdict")
+        blocks += nonempty_summary_statements(_found_and_lost(free), "verdict")
         if result["fit"]["explains"]:
-            blocks.append(SummaryStatement(fit_message(result["fit"]["chi2_per_dof"], True), "conclusion"))
-    blocks += make_statements([result.get("safeguard", "")])
+            blocks.append(SummaryStatement(goodness_of_fit_message(result["fit"]["chi2_per_dof"], True), "conclusion"))
+    blocks += nonempty_summary_statements([result.get("safeguard", "")])
     ended = f"{result['status']}: {result['message']} ({result['iterations']} iterations, {result['seconds']:.1f} s)"
     return [*blocks, SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")]
 
@@ -70,9 +83,9 @@ def _estimate_rows(free: Mapping[str, Mapping[str, Any]], failed: bool) -> Table
         known = not failed and entry["std"] is not None and entry["verdict"] != "at_bound"
         std = f"{entry['std']:.2g}" if known else ""
         interval = "" if failed or entry["interval"] is None else interval_text(*entry["interval"])
-        verdict = "" if failed else VERDICT_WORDS[entry["verdict"]]
+        verdict = "" if failed else VERDICT_TABLE_TEXTS[entry["verdict"]]
         own = (f"{entry['value']:.4g}", std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}")
-        rows.append((name, *own, bounds_text(entry, 4)))
+        rows.append((name, *own, parameter_bounds_text(entry, 4)))
     return rows
 
 
@@ -83,9 +96,9 @@ def _held_out_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
     rows: TableRows = [("held-out recording", "channel", "error (rms)", "unit", "without a model")]
 
     def enter(recording: str, channel: str, rmse: float, guesses: Mapping[str, float]) -> None:
-        unit = channel_unit(units, channel)
-        without = (f"{format_error_and_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
-        rows.append((recording, channel, *format_error_and_unit(rmse, unit), ", ".join(without)))
+        unit = channel_or_group_unit(units, channel)
+        without = (f"{format_error_value_and_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
+        rows.append((recording, channel, *format_error_value_and_unit(rmse, unit), ", ".join(without)))
 
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
@@ -103,9 +116,11 @@ def _held_out_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
     legend = "; ".join(f"{name}, {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     lost = (entry for entry in result["held_out"] if "message" in entry)
     return [
-        *make_statements(f"held-out recording {e['recording']} could not be predicted: {e['message']}" for e in lost),
+        *nonempty_summary_statements(
+            f"held-out recording {e['recording']} could not be predicted: {e['message']}" for e in lost
+        ),
         *nonempty_tables(SummaryTable(rows, "Errors on held-out recordings, never touched by the fit")),
-        *make_statements([f"without a model: {legend}" if legend else ""]),
+        *nonempty_summary_statements([f"without a model: {legend}" if legend else ""]),
     ]
 
 
@@ -114,12 +129,12 @@ def _shown_channels(errors: Mapping[str, float]) -> list[str]:
     hidden: set[str] = set()
     for group in errors:
         members = {channel for channel in errors if channel.startswith(f"{group}.")}
-        hidden |= members if len(members) > MAX_SINGLE_CHANNELS else {group} if members else set()
+        hidden |= members if len(members) > MAX_CHANNELS_SHOWN_SINGLY else {group} if members else set()
     return [channel for channel in errors if channel not in hidden]
 
 
 def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    by = {v: [name for name, entry in free.items() if entry["verdict"] == v] for v in VERDICT_WORDS}
+    by = {v: [name for name, entry in free.items() if entry["verdict"] == v] for v in VERDICT_TABLE_TEXTS}
     found, weak, bound, lost = (by[v] for v in ("identifiable", "weak", "at_bound", "not_identifiable"))
     said = []
     if found:
@@ -128,9 +143,9 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> list[str]:
             f"their usual size: {', '.join(found)}"
         )
     if lost:
-        said.append(f"{VERDICT_WORDS['not_identifiable']} from these recordings: {', '.join(lost)}")
+        said.append(f"{VERDICT_TABLE_TEXTS['not_identifiable']} from these recordings: {', '.join(lost)}")
     if weak:
-        said.append(f"only {VERDICT_WORDS['weak']}: {', '.join(weak)}")
+        said.append(f"only {VERDICT_TABLE_TEXTS['weak']}: {', '.join(weak)}")
         if any(free[name]["interval"] is None for name in weak):
             said.append("`yid-ocp identifiability` gives intervals that need not be symmetric")
     if bound:
@@ -153,9 +168,9 @@ def compare_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
                 # elsewhere a curvature tells nothing of how sure it is
                 ended = entry["status"] not in ("stalled", "failed")
                 known = (found["std"], found["interval"]) if ended else (None, None)
-                cells.append(parameter_text(found["value"], *known))
+                cells.append(parameter_value_text(found["value"], *known))
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
-            rows.append((name, *cells, *others, VERDICT_WORDS[own["verdict"]]))
+            rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
     said = [f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged"]
     said += [f"{name} differs: {sentence}" for name, entry in methods.items() for sentence in entry["disagreements"]]
     said += result["explained"]
@@ -165,12 +180,12 @@ def compare_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
             "noise that drives the motion as well"
         )
     return [
-        *misfit_blocks(judged["fit"]),
-        *issue_blocks(result),
+        *misfit_summary_blocks(judged["fit"]),
+        *issue_summary_blocks(result),
         SummaryTable(rows, "Parameters by method", is_key_table=True),
         SummaryTable(_efforts(methods), "What it took"),
-        *make_statements([*said, *result["published_explained"]]),
-        *make_statements(_agreement(result), "conclusion"),
+        *nonempty_summary_statements([*said, *result["published_explained"]]),
+        *nonempty_summary_statements(_agreement(result), "conclusion"),
     ]
 
 
@@ -205,9 +220,9 @@ def _efforts(methods: Mapping[str, Mapping[str, Any]]) -> TableRows:
     ]
     units = {c: own["unit"] for entry in entries for c, own in entry["residuals"].items()}
     for channel in sorted({c for e in entries for h in e["held_out"] for c in h.get("rmse", {})}):
-        unit = channel_unit(units, channel)
+        unit = channel_or_group_unit(units, channel)
         errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in entries]
-        cells = (format_error_and_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
+        cells = (format_error_value_and_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
         rows.append((f"held out: {channel}" + (f" [{display_scale_and_unit(unit)[1]}]" if unit else ""), *cells))
     for words, key, form in (
         ("iterations", "iterations", "d"),
@@ -234,9 +249,11 @@ def identifiability_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     for name, entry in parameters.items():
         spread = (_relative(entry[key]) for key in ("std_relative", "std_relative_unknown", "std_alone"))
         interval = "" if entry["interval"] is None else interval_text(*entry["interval"])
-        rows.append((name, f"{entry['value']:.4g}", *spread, interval, entry["unit"], VERDICT_WORDS[entry["verdict"]]))
-    blocks: list[SummaryBlock] = [] if result["fit"] is None else misfit_blocks(result["fit"])
-    blocks += [*issue_blocks(result), SummaryTable(rows, "Parameters", is_key_table=True)]
+        rows.append(
+            (name, f"{entry['value']:.4g}", *spread, interval, entry["unit"], VERDICT_TABLE_TEXTS[entry["verdict"]])
+        )
+    blocks: list[SummaryBlock] = [] if result["fit"] is None else misfit_summary_blocks(result["fit"])
+    blocks += [*issue_summary_blocks(result), SummaryTable(rows, "Parameters", is_key_table=True)]
     hidden = [entry["words"] for entry in result["directions"] if entry["verdict"] != "identifiable"]
     said = hidden[:_MAX_DIRECTIONS]
     if len(hidden) > _MAX_DIRECTIONS:
@@ -244,12 +261,12 @@ def identifiability_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     if not result["profiles"]:
         said.append("intervals of parameters are worked out on request: --intervals NAME,NAME or --intervals all")
     said += [f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"]]
-    blocks += [*make_statements(said), *_what_if(result["what_if"], len(parameters))]
+    blocks += [*nonempty_summary_statements(said), *_what_if(result["what_if"], len(parameters))]
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
     text = f"{len(found) or 'none'} of {len(parameters)} parameters can be found from these recordings"
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     unknown = f"not found if start and grasps were unknown: {', '.join(lost)}" if lost else ""
-    return [*blocks, SummaryStatement(text, "conclusion"), *make_statements([unknown], "verdict")]
+    return [*blocks, SummaryStatement(text, "conclusion"), *nonempty_summary_statements([unknown], "verdict")]
 
 
 def _what_if(asked: Mapping[str, Any] | None, count: int) -> list[SummaryBlock]:
@@ -303,7 +320,7 @@ def _place_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
         said += [f"not counted, as their uncertainty is not known: {', '.join(lost)}"] if lost else []
     elif result["from"]["run"] is None:
         said.append("the parameters are those of the configuration, so nothing is said of how uncertain that is")
-    return make_statements(said, "verdict")
+    return nonempty_summary_statements(said, "verdict")
 
 
 def _information_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
@@ -311,7 +328,7 @@ def _information_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
     for name, own in result["parameters"].items():
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
         cells = ("unknown" if std is None else f"± {100 * std:.2g} %" for std in stds)
-        rows.append((name, *cells, VERDICT_WORDS[own["verdict"]]))
+        rows.append((name, *cells, VERDICT_TABLE_TEXTS[own["verdict"]]))
     effects: TableRows = [("effect", "beside what could be", "apart in the recordings", "apart in this motion")]
     for own in result["distances"]:
         apart = (f"{own[when]:.3g} std" for when in ("before", "after"))
@@ -331,7 +348,7 @@ def _information_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
     if result["from"]["run"] is None:
         said.append("the parameters are those of the configuration; where the true ones differ, so does what is told")
     tables = nonempty_tables(SummaryTable(rows, "What it tells"), SummaryTable(effects, "Effects"))
-    return [*tables, *make_statements(said, "verdict")]
+    return [*tables, *nonempty_summary_statements(said, "verdict")]
 
 
 # -- models, recordings and frames ------------------------------------------------------------------------------------
@@ -356,18 +373,20 @@ def check_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
         gaps = [f"{name} {1e3 * gap:.2g} mm" for name, gap in entry["grasp_gaps"].items()]
         said += ["grasp gaps " + ", ".join(gaps)] if gaps else []
         rests.append(f"{entry['recording']}: {'; '.join(said)}" if said else "")
-    moved = discretisation_sentences(result)
+    moved = discretisation_shift_sentences(result)
     ended = "nothing stands in the way of a run"
     if result.get("doubts") or result["warnings"]:
         ended = f"a run is possible; see {'what is in doubt' if result.get('doubts') else 'the warnings'}"
     return [
-        *make_statements([size, *(entry["words"] for entry in result["mechanics"].values() if entry["agrees"])]),
+        *nonempty_summary_statements(
+            [size, *(entry["words"] for entry in result["mechanics"].values() if entry["agrees"])]
+        ),
         *nonempty_tables(SummaryTable(rows, "Recordings", is_key_table=True)),
-        *make_statements(rests),
+        *nonempty_summary_statements(rests),
         *_convergence(result["convergence"]),
-        *make_statements(["if the initial values were the estimates:", *moved] if moved else []),
-        *issue_blocks(result),
-        *make_statements((f"warning: {text}" for text in result["warnings"]), "verdict"),
+        *nonempty_summary_statements(["if the initial values were the estimates:", *moved] if moved else []),
+        *issue_summary_blocks(result),
+        *nonempty_summary_statements((f"warning: {text}" for text in result["warnings"]), "verdict"),
         SummaryStatement(ended, "conclusion"),
     ]
 
@@ -378,7 +397,7 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
     for part in ("", ".effort", ".position"):
         known = noise.get(f"{name}{part}")
         if known is not None and known["std"] is not None:
-            words = " ".join(format_error_and_unit(known["std"], known["unit"]))
+            words = " ".join(format_error_value_and_unit(known["std"], known["unit"]))
             words += f", offset {known['bias_std']:.3g}" if known.get("bias_std") else ""
             said.append(words + (" (estimated)" if known.get("estimated") else ""))
     return "; ".join(said)
@@ -392,7 +411,10 @@ def _convergence(convergence: Mapping[str, Any]) -> list[SummaryBlock]:
             remark = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
             rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
         blocks += nonempty_tables(SummaryTable(rows, f"Frequencies by {head}"))
-    return [*blocks, *make_statements([f"frequencies: {convergence['message']}" if convergence["message"] else ""])]
+    return [
+        *blocks,
+        *nonempty_summary_statements([f"frequencies: {convergence['message']}" if convergence["message"] else ""]),
+    ]
 
 
 def inspect_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
@@ -404,7 +426,7 @@ def inspect_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     parameters: TableRows = [("parameter", "value", "unit", "bounds", "")]
     for name, entry in result["parameters"].items():
         free = "free" if entry["free"] else ""
-        parameters.append((name, f"{entry['value']:.6g}", entry["unit"], bounds_text(entry, 6), free))
+        parameters.append((name, f"{entry['value']:.6g}", entry["unit"], parameter_bounds_text(entry, 6), free))
     functions: TableRows = [("function", "operations", "nonzeros")]
     functions += [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
     blocks: list[SummaryBlock] = [
@@ -421,12 +443,15 @@ def inspect_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     for name, norm in linear["norms"].items():
         rows.append((name, f"{norm:.4g}", f"{linear['finite_difference_errors'][name]:.1e}"))
     blocks += [*_patterns(result), SummaryStatement(said, "verdict"), SummaryTable(rows, "Linearised step")]
-    blocks += make_statements(["matrices: linearisation.h5", *_dependence(result)])
+    blocks += nonempty_summary_statements(["matrices: linearisation.h5", *_dependence(result)])
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         blocks += [CodeBlock("\n".join(entry["lines"]))]
         blocks += [] if entry["zero"] else [CodeBlock(f"which is {value} at {linear['at']}")]
-    return [*blocks, *make_statements([f"exported: {', '.join(result['exported'])}" if result["exported"] else ""])]
+    return [
+        *blocks,
+        *nonempty_summary_statements([f"exported: {', '.join(result['exported'])}" if result["exported"] else ""]),
+    ]
 
 
 def _dependence(result: Mapping[str, Any]) -> list[str]:
@@ -454,7 +479,7 @@ def _patterns(result: Mapping[str, Any]) -> list[SummaryBlock]:
             f"variables, {nlp['constraints']} constraints; {nlp['jacobian_nonzeros']} entries of the constraints' "
             f"Jacobian and {nlp['hessian_nonzeros']} of their Hessian can differ from zero"
         ) + (f"; without {', '.join(nlp['left_out'])}" if nlp["left_out"] else "")
-    return [SummaryTable(rows, "Patterns"), *make_statements([said])]
+    return [SummaryTable(rows, "Patterns"), *nonempty_summary_statements([said])]
 
 
 def simulate_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
@@ -482,10 +507,10 @@ def track_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     dropped = (f"dropped {number}: {reason}" for reason, number in result["dropped"].items())
     notes = [*dropped, result["camera"]["message"], *result["sizes"]["messages"], result["root"]]
     return [
-        *issue_blocks(result),
+        *issue_summary_blocks(result),
         *nonempty_tables(SummaryTable(rows, "Points", is_key_table=True)),
         SummaryStatement(said, "verdict"),
-        *make_statements([*notes, *(thing["text"] for thing in result["things"])]),
+        *nonempty_summary_statements([*notes, *(thing["text"] for thing in result["things"])]),
     ]
 
 
@@ -508,7 +533,7 @@ def export_summary(manifest: Mapping[str, Any]) -> list[SummaryBlock]:
         return [*blocks, SummaryStatement(f"not replayed: {gate['reason']}")]
     rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
     for name, entry in gate["channels"].items():
-        sizes = (format_error_and_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
+        sizes = (format_error_value_and_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
         rows.append((name, *sizes, display_scale_and_unit(entry["unit"])[1]))
     blocks.append(SummaryTable(rows))
     if gate["fall"] is not None:

@@ -9,15 +9,15 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from yid_ocp.data import Recording
-from yid_ocp.data.issues import ISSUE_CAUSES
-from yid_ocp.data.readers import FileContents
-from yid_ocp.inference.uncertainty import fit_message
+from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS
+from yid_ocp.data.readers import FilePreview
+from yid_ocp.inference.uncertainty import goodness_of_fit_message
 
 TableRows = list[Sequence[str]]
 _StatementKind = Literal["note", "verdict", "conclusion"]
 _MAX_ISSUES_PER_CAUSE = 3
 _MAX_OFFSET_RECORDINGS = 4  # recordings side by side
-MAX_SINGLE_CHANNELS = 4  # a group of more points is shown as a whole; result.json has every point
+MAX_CHANNELS_SHOWN_SINGLY = 4  # a group of more points is shown as a whole; result.json has every point
 _PROSE_WIDTH, _NOTE_WIDTH, _MAX_UNWRAPPED_NOTE = 100, 118, 200
 """Widths to which sentences and notes are wrapped, and characters of a note that is left in one line."""
 
@@ -67,8 +67,8 @@ class CodeBlock:
 SummaryBlock = SummaryStatement | SummaryTable | CodeBlock
 
 
-def make_statements(texts: Iterable[str], kind: _StatementKind = "note") -> list[SummaryBlock]:
-    """Statements made from all non-empty texts."""
+def nonempty_summary_statements(texts: Iterable[str], kind: _StatementKind = "note") -> list[SummaryBlock]:
+    """Summary statements of one kind, one per non-empty text."""
     return [SummaryStatement(text, kind) for text in texts if text]
 
 
@@ -85,7 +85,7 @@ def display_scale_and_unit(unit: str) -> tuple[float, str]:
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
-def format_error_and_unit(value: float | None, unit: str) -> tuple[str, str]:
+def format_error_value_and_unit(value: float | None, unit: str) -> tuple[str, str]:
     """Formatted value and display unit of an error; a dash for None."""
     factor, shown = display_scale_and_unit(unit)
     return ("–" if value is None else f"{factor * value:.3g}"), shown
@@ -96,18 +96,18 @@ def p_value_text(p_value: float) -> str:
     return f"{p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
 
 
-def channel_unit(units: Mapping[str, str], channel: str) -> str:
+def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
     """Unit of a channel, or of the first member of a group; empty where it is not known."""
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
-def issue_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
+def issue_summary_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
     """Summary blocks on issues of the recordings: a table and advice; empty without issues."""
     doubts = result.get("doubts", ())
     rows: TableRows = [("in doubt", "where", "how sure", "times its limit")]
     advice: list[SummaryBlock] = []
     for cause in dict.fromkeys(entry["cause"] for entry in doubts):
-        alike, words = [entry for entry in doubts if entry["cause"] == cause], ISSUE_CAUSES[cause]
+        alike, words = [entry for entry in doubts if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
         more = [""] * (_MAX_ISSUES_PER_CAUSE - 1) + [f" and {len(alike) - _MAX_ISSUES_PER_CAUSE} more"]
         shown = alike[:_MAX_ISSUES_PER_CAUSE]
         for entry, others in zip(shown, more if len(alike) > len(shown) else [""] * len(shown), strict=True):
@@ -120,20 +120,24 @@ def issue_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
     return [*nonempty_tables(SummaryTable(rows, "In doubt")), *advice]
 
 
-def misfit_blocks(fit: Mapping[str, Any]) -> list[SummaryBlock]:
-    """What is said before anything else: a guess does better, or the model does not explain the recordings."""
+def misfit_summary_blocks(fit: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Conclusions on a poor fit: a model-free guess predicts better, or the model does not explain the recordings."""
     worse, said = fit.get("worse_than_guess", ()), []
-    for entry in worse[:MAX_SINGLE_CHANNELS]:
-        own, other = (" ".join(format_error_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
+    for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
+        own, other = (
+            " ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess")
+        )
         where = f"{entry['channel']} of {entry['recording']}"
         said.append(f"worse than a guess without a model: {where}, {own} against {other} ({entry['baseline']})")
-    if len(worse) > MAX_SINGLE_CHANNELS:
-        said.append(f"and so for {len(worse) - MAX_SINGLE_CHANNELS} more channels, in result.json")
-    return make_statements([*said, "" if fit["explains"] else fit_message(fit["chi2_per_dof"], False)], "conclusion")
+    if len(worse) > MAX_CHANNELS_SHOWN_SINGLY:
+        said.append(f"and so for {len(worse) - MAX_CHANNELS_SHOWN_SINGLY} more channels, in result.json")
+    return nonempty_summary_statements(
+        [*said, "" if fit["explains"] else goodness_of_fit_message(fit["chi2_per_dof"], False)], "conclusion"
+    )
 
 
-def discretisation_sentences(result: Mapping[str, Any]) -> list[str]:
-    """One sentence per refinement on the estimates that it shifts by more than their standard deviation."""
+def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
+    """One sentence per refined discretisation on the estimates it shifts by more than their standard deviation."""
     said = []
     for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
@@ -146,7 +150,7 @@ def discretisation_sentences(result: Mapping[str, Any]) -> list[str]:
     return said
 
 
-def torque_offset_rows(result: Mapping[str, Any]) -> TableRows:
+def torque_offset_table_rows(result: Mapping[str, Any]) -> TableRows:
     """Table rows of the torque offsets of a result, one per joint; only the header without offsets."""
     offsets: Mapping[str, Mapping[str, Any]] = result.get("torque_offsets", {})
     shown = dict(list(offsets.items())[:_MAX_OFFSET_RECORDINGS])
@@ -161,7 +165,7 @@ def torque_offset_rows(result: Mapping[str, Any]) -> TableRows:
     return rows
 
 
-def bounds_text(entry: Mapping[str, Any], digits: int) -> str:
+def parameter_bounds_text(entry: Mapping[str, Any], digits: int) -> str:
     """Bounds of a parameter, `-inf` and `inf` where it has none."""
     ends = ((entry["lower"], "-inf"), (entry["upper"], "inf"))
     return " to ".join(free if end is None else f"{end:.{digits}g}" for end, free in ends)
@@ -170,7 +174,7 @@ def bounds_text(entry: Mapping[str, Any], digits: int) -> str:
 # -- on a terminal -----------------------------------------------------------------------------------------------------
 
 
-def terminal_lines(blocks: Sequence[SummaryBlock]) -> list[str]:
+def summary_terminal_lines(blocks: Sequence[SummaryBlock]) -> list[str]:
     """Text lines of summary blocks: aligned tables, wrapped sentences and notes."""
     result: list[str] = []
     for block in blocks:
@@ -197,7 +201,7 @@ def recording_summary_lines(recording: Recording) -> list[str]:
     return [*aligned_table_lines(rows), "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
 
 
-def file_contents_lines(contents: FileContents) -> list[str]:
+def third_party_file_summary_lines(contents: FilePreview) -> list[str]:
     """Text lines on the contents of a file of another tool."""
     rows: TableRows = [("source", "type", "count", "Hz", "becomes", "note")]
     for source in contents.sources:

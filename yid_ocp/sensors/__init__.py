@@ -3,15 +3,15 @@
 from importlib import import_module
 from pkgutil import iter_modules
 
-from yid_ocp.sensors.base import CHANNELS as CHANNELS
+from yid_ocp.sensors.base import CHANNEL_KINDS as CHANNEL_KINDS
 from yid_ocp.sensors.base import SENSOR_READERS as SENSOR_READERS
-from yid_ocp.sensors.base import Channel as Channel
+from yid_ocp.sensors.base import ChannelKind as ChannelKind
 from yid_ocp.sensors.base import Sensor as Sensor
-from yid_ocp.sensors.base import SensorContext as SensorContext
 from yid_ocp.sensors.base import SensorData as SensorData
 from yid_ocp.sensors.base import SensorOptions as SensorOptions
+from yid_ocp.sensors.base import SensorReadingContext as SensorReadingContext
 from yid_ocp.sensors.base import recorded_joint_columns as recorded_joint_columns
-from yid_ocp.sensors.base import sensor_function as sensor_function
+from yid_ocp.sensors.base import sensor_reading_function as sensor_reading_function
 from yid_ocp.sensors.joints import EffortSensor as EffortSensor
 from yid_ocp.sensors.joints import PositionSensor as PositionSensor
 from yid_ocp.sensors.points import PointSensor as PointSensor

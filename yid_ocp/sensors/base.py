@@ -70,8 +70,8 @@ class SensorOptions:
 
 
 @dataclass(frozen=True)
-class Channel:
-    """A kind of recorded values: where a recording holds them, their unit, and what settings must add.
+class ChannelKind:
+    """Kind of recorded quantity: where a recording holds it, its unit, and which constants settings may give.
 
     The noise stands in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`, of points in the dataset `std`.
 
@@ -94,8 +94,8 @@ class Channel:
     constants: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def std_fields(self) -> tuple[str, str]:
-        """Attributes of the group that state white noise and a constant error."""
+    def std_attribute_names(self) -> tuple[str, str]:
+        """Names of the group's attributes that hold the stds of white noise and of a constant error."""
         return f"{self.quantity}_std", f"{self.quantity}_bias_std"
 
     def is_in_group(self, name: str) -> bool:
@@ -103,17 +103,17 @@ class Channel:
         return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
 
-CHANNELS: Registry[Channel] = Registry("recorded channel")
+CHANNEL_KINDS: Registry[ChannelKind] = Registry("recorded channel")
 """Kinds of recorded values; those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
-def declared_channels(group: str) -> tuple[Channel, ...]:
+def declared_channel_kinds(group: str) -> tuple[ChannelKind, ...]:
     """Channels that a sensor declares for a group of a recording other than joints and points."""
-    found = (CHANNELS[name] for name in CHANNELS)
+    found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.is_in_group(group))
 
 
-class PointData(Protocol):
+class RecordedPointGroup(Protocol):
     """A recorded group of points, as in `data.recording.PointGroup`."""
 
     @property
@@ -132,7 +132,7 @@ class PointData(Protocol):
     def pose(self) -> Array | None: ...  # noqa: D102
 
 
-class JointData(Protocol):
+class RecordedJoints(Protocol):
     """Recorded joints, as in `data.recording.JointGroup`."""
 
     @property
@@ -153,7 +153,7 @@ class JointData(Protocol):
     def position_std(self) -> float | Array | None: ...  # noqa: D102
 
 
-class ChannelData(Protocol):
+class RecordedChannelGroup(Protocol):
     """A recorded group of declared channels, as in `data.recording.ChannelGroup`."""
 
     @property
@@ -174,14 +174,14 @@ class _RecordingData(Protocol):
     @property
     def name(self) -> str: ...
     @property
-    def joints(self) -> JointData | None: ...
+    def joints(self) -> RecordedJoints | None: ...
     @property
-    def points(self) -> Sequence[PointData]: ...
+    def points(self) -> Sequence[RecordedPointGroup]: ...
     @property
-    def channel_groups(self) -> Sequence[ChannelData]: ...
+    def channel_groups(self) -> Sequence[RecordedChannelGroup]: ...
 
 
-def recorded_joint_columns(joints: JointData, names: tuple[str, ...], where: str) -> list[int]:
+def recorded_joint_columns(joints: RecordedJoints, names: tuple[str, ...], where: str) -> list[int]:
     """Column indices of the named joints in a recording; `DataError` for a joint that is not recorded."""
     for name in names:
         if name not in joints.names:
@@ -193,7 +193,7 @@ def recorded_joint_columns(joints: JointData, names: tuple[str, ...], where: str
     return [joints.names.index(name) for name in names]
 
 
-def values_by_joint(
+def expand_to_joint_values(
     given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
 ) -> Array:
     """One value per joint in `names`, from one value for all, one per recorded joint, or a mapping."""
@@ -216,7 +216,7 @@ class Sensor(ABC):
 
     Attributes
     ----------
-    channel : Channel
+    channel : ChannelKind
         What a recording holds of it.
     group_name : str
         Key of its settings: a group of points, such as `points_camera`, or `joints.effort`.
@@ -228,7 +228,7 @@ class Sensor(ABC):
         The mechanism's frame that each channel marks and its recorded name; none for joints.
     """
 
-    channel: ClassVar[Channel]
+    channel: ClassVar[ChannelKind]
     group_name: str
     naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
     has_paper_weight: ClassVar[bool] = True
@@ -237,12 +237,12 @@ class Sensor(ABC):
 
     @property
     def unit(self) -> str:
-        """Of the readings."""
+        """Unit of the sensor's readings."""
         return self.channel.unit
 
     @property
     def outputs_per_channel(self) -> int:
-        """3 for a point, 1 for a joint."""
+        """Number of outputs of each channel: 3 for a point, 1 for a joint."""
         return max(len(self.channel.components), 1)
 
     @property
@@ -282,7 +282,7 @@ class Sensor(ABC):
         """What the sensor reads at a node without effects, shape (outputs_per_channel * len(channel_names), 1)."""
 
 
-def sensor_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
+def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
     """A CasADi function for readings y(q, v, z, load, lam; theta), effects included, with their derivatives.
 
     Parameters
@@ -337,7 +337,7 @@ class _SmoothingFilter(Protocol):
 
 
 @dataclass(frozen=True)
-class SensorContext:
+class SensorReadingContext:
     """What is needed to read a sensor's measurements from a recording.
 
     Attributes
@@ -391,5 +391,5 @@ class SensorData:
     noise_correlation: Array | None = None
 
 
-SENSOR_READERS: Registry[Callable[[SensorContext], list[SensorData]]] = Registry("kind of sensor")
+SENSOR_READERS: Registry[Callable[[SensorReadingContext], list[SensorData]]] = Registry("kind of sensor")
 """Functions that take all measurements of one kind of sensor from a recording, by kind."""

@@ -14,23 +14,23 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
-    CHANNELS,
+    CHANNEL_KINDS,
     SENSOR_READERS,
-    Channel,
-    JointData,
-    PointData,
+    ChannelKind,
+    RecordedJoints,
+    RecordedPointGroup,
     Sensor,
-    SensorContext,
     SensorData,
     SensorOptions,
+    SensorReadingContext,
+    expand_to_joint_values,
     recorded_joint_columns,
-    values_by_joint,
 )
 
-EFFORT_GROUP = "joints.effort"
-POSITION_GROUP = "joints.position"
-_EFFORT = CHANNELS.register(EFFORT_GROUP)(Channel("joints", "effort", "N m"))
-_POSITION = CHANNELS.register(POSITION_GROUP)(Channel("joints", "position", "rad"))
+JOINT_EFFORT_GROUP_NAME = "joints.effort"
+JOINT_POSITION_GROUP_NAME = "joints.position"
+_EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(ChannelKind("joints", "effort", "N m"))
+_POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(ChannelKind("joints", "position", "rad"))
 NOISE_DIFFERENCE_ORDER = 6
 """Order of the differences that estimate a noise level; they remove any motion that is slow against the sampling."""
 
@@ -49,8 +49,8 @@ class JointSensor(Sensor):
         """`group.quantity.JOINT` for every joint."""
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
-    def select_joints(self, values: ca.SX, state: NodeState) -> ca.SX:
-        """Rows of all joints' values (n, 1) that are the sensor's joints, shape (nj, 1)."""
+    def select_sensor_joint_rows(self, values: ca.SX, state: NodeState) -> ca.SX:
+        """Entries for the sensor's joints among values of all joints (n, 1), shape (nj, 1)."""
         return ca.vertcat(*(values[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
 
@@ -60,11 +60,11 @@ class PositionSensor(JointSensor):
 
     channel = _POSITION
     has_paper_weight = False
-    group_name: str = POSITION_GROUP
+    group_name: str = JOINT_POSITION_GROUP_NAME
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         """Angles of the joints, shape (nj, 1) [rad]."""
-        return self.select_joints(state.q, state)
+        return self.select_sensor_joint_rows(state.q, state)
 
 
 @dataclass(frozen=True)
@@ -73,27 +73,27 @@ class EffortSensor(JointSensor):
 
     channel = _EFFORT
     naive_prediction = "zero"
-    group_name: str = EFFORT_GROUP
+    group_name: str = JOINT_EFFORT_GROUP_NAME
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
-        """All its joints."""
+        """Names of all joints of the sensor: it reads the effort of each."""
         return self.joint_names
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         """Efforts of the joints, shape (nj, 1) [N m]."""
-        return self.select_joints(state.load, state)
+        return self.select_sensor_joint_rows(state.load, state)
 
 
-def is_measured_by_arm(group: PointData) -> bool:
+def is_measured_by_arm(group: RecordedPointGroup) -> bool:
     """Whether the arm itself measured these points, usually from its encoders."""
     return "arm" in (group.sensor, group.name.rpartition("_")[2])
 
 
-@SENSOR_READERS.register(POSITION_GROUP)
-def _read_joint_angles(around: SensorContext) -> list[SensorData]:
+@SENSOR_READERS.register(JOINT_POSITION_GROUP_NAME)
+def _read_joint_angles(around: SensorReadingContext) -> list[SensorData]:
     """Measurements of driven joints' angles without the first sample, which defines the initial configuration."""
-    joints, choice, system = around.recording.joints, around.sensor_usage(POSITION_GROUP), around.system
+    joints, choice, system = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME), around.system
     names = system.driven if joints is not None else ()
     arm = [group.name for group in around.recording.points if is_measured_by_arm(group)]
     arm = [name for name in arm if around.sensor_usage(name).use is not False]
@@ -113,10 +113,10 @@ def _read_joint_angles(around: SensorContext) -> list[SensorData]:
     return [SensorData(PositionSensor(names), joints.t[later], value, std)]
 
 
-@SENSOR_READERS.register(EFFORT_GROUP)
-def _read_joint_efforts(around: SensorContext) -> list[SensorData]:
+@SENSOR_READERS.register(JOINT_EFFORT_GROUP_NAME)
+def _read_joint_efforts(around: SensorReadingContext) -> list[SensorData]:
     """Measurements of prescribed joints' efforts, low-pass filtered and thinned out to independent samples."""
-    joints, choice = around.recording.joints, around.sensor_usage(EFFORT_GROUP)
+    joints, choice = around.recording.joints, around.sensor_usage(JOINT_EFFORT_GROUP_NAME)
     if joints is None or joints.effort is None or choice.use is False:
         return []
     names = tuple(name for name in around.system.prescribed if name in joints.names)
@@ -128,16 +128,23 @@ def _read_joint_efforts(around: SensorContext) -> list[SensorData]:
         raise DataError(
             "the noise level of the joint efforts is neither recorded nor given",
             where=around.recording.name,
-            hint=f"set sensors.{EFFORT_GROUP}.std [N m], from a stretch at rest or the data sheet",
+            hint=f"set sensors.{JOINT_EFFORT_GROUP_NAME}.std [N m], from a stretch at rest or the data sheet",
         )
-    std = values_by_joint(given, joints.names, names, f"sensors.{EFFORT_GROUP}.std")
+    std = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
     is_sample = joints.effort_kind_or_default == "sample"
     bias = joint_torque_bias_std(joints, names, choice)
     return [smoothed_effort_data(around, EffortSensor(names), joints.t, effort, std, bias, is_sample=is_sample)]
 
 
 def smoothed_effort_data(
-    around: SensorContext, sensor: JointSensor, t: Array, values: Array, std: Array, bias: Array, *, is_sample: bool
+    around: SensorReadingContext,
+    sensor: JointSensor,
+    t: Array,
+    values: Array,
+    std: Array,
+    bias: Array,
+    *,
+    is_sample: bool,
 ) -> SensorData:
     """Measurements of a sensor of efforts, low-pass filtered and thinned out to independent samples.
 
@@ -187,34 +194,38 @@ def smoothed_effort_data(
 # -- noise levels -----------------------------------------------------------------------------------------------------
 
 
-def is_noise_std_stated(joints: JointData, group: str, choice: SensorOptions) -> bool:
+def is_noise_std_stated(joints: RecordedJoints, group: str, choice: SensorOptions) -> bool:
     """Whether the recording or the settings state the noise std of `joints.effort` or `joints.position`."""
-    return choice.std is not None or getattr(joints, CHANNELS[group].std_fields[0]) is not None
+    return choice.std is not None or getattr(joints, CHANNEL_KINDS[group].std_attribute_names[0]) is not None
 
 
-def joint_angle_noise_std(joints: JointData, names: Sequence[str], choice: SensorOptions, where: str) -> Array:
+def joint_angle_noise_std(joints: RecordedJoints, names: Sequence[str], choice: SensorOptions, where: str) -> Array:
     """Noise standard deviation of driven joints' encoders, stated or estimated, shape (len(names),) [rad]."""
-    return _joint_noise_std(joints, names, choice, where, POSITION_GROUP)
+    return _joint_noise_std(joints, names, choice, where, JOINT_POSITION_GROUP_NAME)
 
 
-def joint_torque_noise_std(joints: JointData, names: Sequence[str], choice: SensorOptions, where: str) -> Array:
+def joint_torque_noise_std(joints: RecordedJoints, names: Sequence[str], choice: SensorOptions, where: str) -> Array:
     """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
-    return _joint_noise_std(joints, names, choice, where, EFFORT_GROUP)
+    return _joint_noise_std(joints, names, choice, where, JOINT_EFFORT_GROUP_NAME)
 
 
-def _joint_noise_std(joints: JointData, names: Sequence[str], choice: SensorOptions, where: str, group: str) -> Array:
-    channel = CHANNELS[group]
-    given = choice.std if choice.std is not None else getattr(joints, channel.std_fields[0])
+def _joint_noise_std(
+    joints: RecordedJoints, names: Sequence[str], choice: SensorOptions, where: str, group: str
+) -> Array:
+    channel = CHANNEL_KINDS[group]
+    given = choice.std if choice.std is not None else getattr(joints, channel.std_attribute_names[0])
     if given is None:
         values = getattr(joints, channel.quantity)[:, recorded_joint_columns(joints, tuple(names), where)]
         return _estimated_noise_std(values, where, group, channel.unit)
-    return values_by_joint(given, joints.names, names, f"sensors.{group}.std")
+    return expand_to_joint_values(given, joints.names, names, f"sensors.{group}.std")
 
 
-def joint_torque_bias_std(joints: JointData, names: Sequence[str], choice: SensorOptions) -> Array:
+def joint_torque_bias_std(joints: RecordedJoints, names: Sequence[str], choice: SensorOptions) -> Array:
     """Standard deviation of a constant error of recorded torques, zero if unknown, shape (len(names),) [N m]."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
-    return values_by_joint(0.0 if given is None else given, joints.names, names, f"sensors.{EFFORT_GROUP}.bias_std")
+    return expand_to_joint_values(
+        0.0 if given is None else given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.bias_std"
+    )
 
 
 def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
@@ -235,7 +246,7 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
 
 
 def _smoothed_effort_noise(
-    around: SensorContext, names: tuple[str, ...], std: Array, period: float, times: Array
+    around: SensorReadingContext, names: tuple[str, ...], std: Array, period: float, times: Array
 ) -> tuple[Array, Array | None]:
     """Noise of filtered efforts at some times, from the effort sensors and from accelerations of noisy encoders.
 
@@ -246,10 +257,12 @@ def _smoothed_effort_noise(
     is not stated.
     """
     value_gain, _, second_gain = around.effort_filter.noise_gains(period)
-    joints, encoders = around.recording.joints, around.sensor_usage(POSITION_GROUP)
+    joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     assert joints is not None
     known = encoders.std if encoders.std is not None else joints.position_std
-    angle = values_by_joint(0.0 if known is None else known, joints.names, names, f"sensors.{POSITION_GROUP}.std")
+    angle = expand_to_joint_values(
+        0.0 if known is None else known, joints.names, names, f"sensors.{JOINT_POSITION_GROUP_NAME}.std"
+    )
     own = (std * value_gain) ** 2
     if not np.any(angle > 0):
         return np.broadcast_to(np.sqrt(own), (len(times), len(names))), None

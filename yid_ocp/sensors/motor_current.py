@@ -11,22 +11,24 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
-    CHANNELS,
+    CHANNEL_KINDS,
     SENSOR_READERS,
-    Channel,
-    ChannelData,
-    SensorContext,
+    ChannelKind,
+    RecordedChannelGroup,
     SensorData,
-    values_by_joint,
+    SensorReadingContext,
+    expand_to_joint_values,
 )
 from yid_ocp.sensors.joints import JointSensor, smoothed_effort_data
 
 _CONSTANT = "torque_constant"
-_CURRENT = CHANNELS.register("motors.current")(Channel("motors", "current", "A", constants={_CONSTANT: "N m/A"}))
+_CURRENT = CHANNEL_KINDS.register("motors.current")(
+    ChannelKind("motors", "current", "A", constants={_CONSTANT: "N m/A"})
+)
 
 
 @dataclass(frozen=True)
-class MotorCurrentSensor(JointSensor):
+class _MotorCurrentSensor(JointSensor):
     """Motor currents of named prescribed joints, current = joint effort / torque constant.
 
     Attributes
@@ -42,7 +44,7 @@ class MotorCurrentSensor(JointSensor):
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
-        """All its joints."""
+        """Names of all joints of the sensor: each current is computed from that joint's effort."""
         return self.joint_names
 
     @property
@@ -52,11 +54,11 @@ class MotorCurrentSensor(JointSensor):
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         """Currents of the motors, shape (nj, 1) [A]."""
-        return self.select_joints(state.load, state) / ca.DM(self.torque_constants)
+        return self.select_sensor_joint_rows(state.load, state) / ca.DM(self.torque_constants)
 
 
 @SENSOR_READERS.register("motors.current")
-def _read_motor_currents(around: SensorContext) -> list[SensorData]:
+def _read_motor_currents(around: SensorReadingContext) -> list[SensorData]:
     """Measurements of prescribed joints' motor currents, filtered like joint efforts."""
     return [
         found
@@ -65,7 +67,7 @@ def _read_motor_currents(around: SensorContext) -> list[SensorData]:
     ]
 
 
-def _currents(around: SensorContext, group: ChannelData) -> SensorData | None:
+def _currents(around: SensorReadingContext, group: RecordedChannelGroup) -> SensorData | None:
     key, where = f"{group.name}.{_CURRENT.quantity}", f"{around.recording.name}: {group.name}"
     choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
     if choice.use is False or not names or around.recording.joints is None:
@@ -78,7 +80,7 @@ def _currents(around: SensorContext, group: ChannelData) -> SensorData | None:
         choice.constants.get(_CONSTANT),
         *(
             given if given is not None else group.stds.get(attribute)
-            for given, attribute in zip((choice.std, choice.bias_std), _CURRENT.std_fields, strict=True)
+            for given, attribute in zip((choice.std, choice.bias_std), _CURRENT.std_attribute_names, strict=True)
         ),
     )
     if constants is None:
@@ -88,11 +90,11 @@ def _currents(around: SensorContext, group: ChannelData) -> SensorData | None:
         what = "the noise level of the motor currents is neither recorded nor given"
         raise DataError(what, where=where, hint=f"set sensors.{key}.std [A]")
     by_joint = [
-        values_by_joint(given, group.names, names, f"sensors.{key}.{setting}")
+        expand_to_joint_values(given, group.names, names, f"sensors.{key}.{setting}")
         for given, setting in ((constants, "constants"), (std, "std"), (0.0 if bias is None else bias, "bias_std"))
     ]
     if not np.all(by_joint[0] != 0):
         raise DataError("a torque constant is zero", where=where, allowed="a number that is not zero [N m/A]")
-    sensor = MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
+    sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
     values = group.values[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
     return smoothed_effort_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)

@@ -12,17 +12,17 @@ from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.model.mechanism import Placement
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
-    CHANNELS,
+    CHANNEL_KINDS,
     SENSOR_READERS,
-    Channel,
-    PointData,
+    ChannelKind,
+    RecordedPointGroup,
     Sensor,
-    SensorContext,
     SensorData,
     SensorOptions,
+    SensorReadingContext,
 )
 
-_POINTS = CHANNELS.register("points")(Channel("points", "position", "m", ("x", "y", "z")))
+_POINTS = CHANNEL_KINDS.register("points")(ChannelKind("points", "position", "m", ("x", "y", "z")))
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class PointSensor(Sensor):
 
 
 @SENSOR_READERS.register("points")
-def _read_point_groups(around: SensorContext) -> list[SensorData]:
+def _read_point_groups(around: SensorReadingContext) -> list[SensorData]:
     """Measurements of every used group of points."""
     return [
         _points(around, group, around.sensor_usage(group.name))
@@ -72,7 +72,7 @@ def _read_point_groups(around: SensorContext) -> list[SensorData]:
     ]
 
 
-def _points(around: SensorContext, group: PointData, choice: SensorOptions) -> SensorData:
+def _points(around: SensorReadingContext, group: RecordedPointGroup, choice: SensorOptions) -> SensorData:
     where = around.recording.name
     wanted = choice.points if choice.points is not None else group.names
     frames = {p: choice.frames.get(p, p) for p in wanted}
@@ -119,7 +119,7 @@ def _points(around: SensorContext, group: PointData, choice: SensorOptions) -> S
     return SensorData(sensor, group.t[inside], value, std)
 
 
-def recorded_camera_pose(group: PointData) -> tuple[tuple[float, ...], ...] | None:
+def recorded_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
     """4x4 pose of the camera that saw a group of points; None where no camera saw it.
 
     A group is a camera's when it has a pose, or when its name or its sensor says `camera`; without a pose the camera

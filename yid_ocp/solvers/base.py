@@ -18,26 +18,26 @@ import threadpoolctl
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ConfigError, YidError
-from yid_ocp.inference.linearized_residual import is_stationary
-from yid_ocp.inference.null_test import DEFAULT_GAP_CRITERIA, GapCriteria
+from yid_ocp.inference.linearized_residual import is_stationary_point
+from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
 from yid_ocp.inference.uncertainty import (
-    VERDICT_WORDS,
+    VERDICT_TABLE_TEXTS,
     GoodnessOfFit,
     ParameterEstimate,
     assess_goodness_of_fit,
-    covariance_and_chi2,
-    covariance_of_fit,
     finite_or_none,
+    misfit_widened_covariance,
     parameter_estimates,
-    parameter_text,
+    parameter_value_text,
+    unknowns_covariance_and_reduced_chi2,
 )
-from yid_ocp.inference.whitening import whitened_at, whitened_by_sensor_noise
+from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.prediction_errors import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
-from yid_ocp.solvers.initial_guess import initialize_free_effects
+from yid_ocp.solvers.initial_guess import unknowns_with_active_effects
 
 if TYPE_CHECKING:
     import pandas
@@ -83,7 +83,7 @@ class Solution(ReprMixin):
         In the order of `x`, the unknown vector of lowest cost, shape (nx,).
     covariance : ndarray, shape (nx, nx)
         From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one, and
-        counting the misfit where the model does not explain the data (`uncertainty.covariance_of_fit`).
+        counting the misfit where the model does not explain the data (`uncertainty.misfit_widened_covariance`).
     parameters : dict of str to ParameterEstimate
         Free parameters shared by all recordings, and the fixed ones that the problem's model has.
     goodness_of_fit : GoodnessOfFit
@@ -113,9 +113,9 @@ class Solution(ReprMixin):
 
     def _summary(self) -> ReprSummary:
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
-        words = {name: parameter_text(e.value, finite_or_none(e.std), e.interval) for name, e in free.items()}
+        words = {name: parameter_value_text(e.value, finite_or_none(e.std), e.interval) for name, e in free.items()}
         rows = [("parameter", "value", "unit", "")]
-        rows += [(name, words[name], e.unit, VERDICT_WORDS[e.verdict]) for name, e in free.items()]
+        rows += [(name, words[name], e.unit, VERDICT_TABLE_TEXTS[e.verdict]) for name, e in free.items()]
         told = [f"{name} = {words[name]} {e.unit}" for name, e in free.items() if e.verdict == "identifiable"][:3]
         more = f"and {count_with_noun(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""
         fit = f"chi2 per degree of freedom {self.goodness_of_fit.chi2_per_dof:.3g}"
@@ -137,7 +137,7 @@ class Solution(ReprMixin):
         """Prediction of each recording from its recorded torques minus their offsets, or why its rollout fails."""
         if self.evaluation is None or self.problem is None or not self.problem.has_process_noise:
             return () if self.evaluation is None else self.evaluation.episode_predictions
-        problem = whitened_by_sensor_noise(self.problem)
+        problem = problem_whitened_by_sensor_noise(self.problem)
         found = problem.evaluate(self.x, False, self.evaluation.equilibrium_guesses)
         if found.ok:
             return found.episode_predictions
@@ -146,8 +146,8 @@ class Solution(ReprMixin):
             for i, episode in enumerate(problem.episodes)
         )
 
-    def channel_predictions(self) -> tuple[ChannelPrediction, ...]:
-        """Measured and predicted samples of every channel of the recordings at `x`; empty without a result."""
+    def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:
+        """Measured and predicted samples of every channel of the recordings at the estimate; empty without one."""
         pairs = zip(() if self.problem is None else self.problem.episodes, self.episode_predictions, strict=False)
         return tuple(
             s for episode, result in pairs if not isinstance(result, str) for s in channel_predictions(episode, result)
@@ -169,7 +169,10 @@ class Solution(ReprMixin):
             raise ConfigError("pandas is not installed", hint="pip install 'yid-ocp[pandas]'") from error
         entries = sorted(self.parameters.items(), key=lambda entry: not entry[1].free)
         columns = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"]
-        rows = {name: (e.value, e.std, *e.interval_ends, e.unit, e.verdict, e.free, e.initial) for name, e in entries}
+        rows = {
+            name: (e.value, e.std, *e.confidence_interval_ends, e.unit, e.verdict, e.free, e.initial)
+            for name, e in entries
+        }
         return pandas.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
 
 
@@ -236,7 +239,7 @@ class IterationRecorder:
     def result(
         self, status: Status, message: str, x: Array, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> SolverResult:
-        """Result of a search that ended at `x`."""
+        """Solver result of a search that ended at the unknown vector `x`, with the iterates recorded so far."""
         return SolverResult(status, message, x, tuple(self.history), self.n_evaluations, equilibrium_guesses)
 
 
@@ -245,7 +248,7 @@ _HORIZON_FRACTIONS = (0.06, 0.12, 0.25, 0.5)
 # A fit whose chi2 per degree of freedom exceeds this may be a wrong valley (a soft object has several shapes at rest):
 # it is started again from these multiples of the initial values, and the best is kept.
 _POOR_CHI2_PER_DOF = 5.0
-RESTART_FACTORS = (4.0, 2.0, 10.0)
+INITIAL_VALUE_RESTART_FACTORS = (4.0, 2.0, 10.0)
 # Beside noise that drives the motion a wrong valley may hide in chi2 per degree of freedom of 1.03. Where anything is
 # known worse than this part of its value, or has fallen below that part of its start, another start is tried.
 _LOOSE_RELATIVE_STD, _COLLAPSED_FRACTION = 0.1, 0.02
@@ -267,16 +270,16 @@ def solve(
     solver: Solver | None = None,
     initial_unknowns: Sequence[float] | None = None,
     callback: IterationCallback | None = None,
-    limits: GapCriteria = DEFAULT_GAP_CRITERIA,
+    limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     restarts: bool = True,
 ) -> Solution:
     """Solve an estimation problem and return estimates with uncertainty and verdicts.
 
-    Free effects begin off their neutral value (`initialize_free_effects`) unless a start is given. Where the rollout
-    fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first seconds only, and
-    then over longer and longer horizons. A poor fit is started again from other initial values. Where noise drives the
-    motion, methods that can weigh residuals by it do so in several passes, its covariance frozen in each
-    (`whitened_at`); the answer of one that has its errors as unknowns is judged in the same way.
+    Free effects begin off their neutral value (`unknowns_with_active_effects`) unless a start is given. Where the
+    rollout fails at the start (a soft object snaps, an arm falls), the problem is first solved over its first seconds
+    only, and then over longer and longer horizons. A poor fit is started again from other initial values. Where noise
+    drives the motion, methods that can weigh residuals by it do so in several passes, its covariance frozen in each
+    (`problem_whitened_at`); the answer of one that has its errors as unknowns is judged in the same way.
 
     Parameters
     ----------
@@ -286,7 +289,7 @@ def solve(
         The problem's when absent.
     callback : callable, optional
         Called with every `Iterate`.
-    limits : GapCriteria
+    limits : ExcessResidualCriteria
         Criteria for a residual that exceeds noise.
     restarts : bool
         Whether a poor fit is started again from other initial values.
@@ -299,7 +302,7 @@ def solve(
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
         if initial_unknowns is None:
-            start = initialize_free_effects(problem, problem.initial_unknowns)
+            start = unknowns_with_active_effects(problem, problem.initial_unknowns)
         else:
             start = np.clip(np.asarray(initial_unknowns, float), *problem.bounds)
         search = _MultiStartSearch(problem, solver or SOLVERS[_DEFAULT_SOLVER](), callback, start)
@@ -333,16 +336,20 @@ class _MultiStartSearch:
     def _best(self) -> _Fit:
         return min(self._fits, key=lambda fit: fit.evaluation.cost)
 
-    def restart(self, first: Array, limits: GapCriteria) -> None:
+    def restart(self, first: Array, limits: ExcessResidualCriteria) -> None:
         """Try other starts as far as the best fit so far gives reason to."""
-        noisy, most = self._problem.has_process_noise, 1 + len(RESTART_FACTORS)
-        for factor in RESTART_FACTORS:
+        noisy, most = self._problem.has_process_noise, 1 + len(INITIAL_VALUE_RESTART_FACTORS)
+        for factor in INITIAL_VALUE_RESTART_FACTORS:
             if _good_fit(self._problem, self._best.evaluation):
                 break
             self._try(self._multiple(first, factor), f"initial values x {factor:g}", most)
         once = len(self._fits) == 1 and noisy and _accounts_for_process_noise(self._solver)
         if once and np.any(_doubtful(self._best, first)):
-            self._try(self._multiple(first, RESTART_FACTORS[0]), f"initial values x {RESTART_FACTORS[0]:g}", 2)
+            self._try(
+                self._multiple(first, INITIAL_VALUE_RESTART_FACTORS[0]),
+                f"initial values x {INITIAL_VALUE_RESTART_FACTORS[0]:g}",
+                2,
+            )
         if not uses_process_noise_covariance(self._solver):
             return
         most = self._n_starts + len(_NEARBY_START_FACTORS)
@@ -357,7 +364,7 @@ class _MultiStartSearch:
             self._try(near, "another valley", most)
 
     def _multiple(self, x: Array, factor: float) -> Array:
-        return np.where(self._problem.is_positive, np.clip(x * factor, *self._problem.bounds), x)
+        return np.where(self._problem.positive_unknowns_mask, np.clip(x * factor, *self._problem.bounds), x)
 
     def _try(self, x: Array, what: str, most: int) -> None:
         self._n_starts += 1
@@ -371,11 +378,11 @@ class _MultiStartSearch:
             return
         self._fits.append(replace(again, history=[replace(entry, note=note) for entry in again.history]))
 
-    def solution(self, limits: GapCriteria) -> Solution:
+    def solution(self, limits: ExcessResidualCriteria) -> Solution:
         """Solution of the best fit, with its uncertainty."""
         result, finish, problem = self._best.result, self._best.evaluation, self._best.weighted
         fit = assess_goodness_of_fit(problem, finish, limits)
-        covariance = covariance_of_fit(problem, finish, fit)
+        covariance = misfit_widened_covariance(problem, finish, fit)
         status, message = self._status_and_message()
         return Solution(
             status,
@@ -399,12 +406,12 @@ class _MultiStartSearch:
         status, message = result.status, result.message
         if self._problem.has_process_noise and not _accounts_for_process_noise(solver):
             message += "; weighted by the sensors' noise alone, without the noise that drives the motion"
-        constant = any(episode.has_constant_sensor_errors for episode in self._problem.episodes)
+        constant = any(episode.has_uncertain_sensor_biases for episode in self._problem.episodes)
         if constant and not getattr(solver, "needs_rollout", True):
             message += "; weighted without the constant errors that measured efforts may have"
         if not finish.ok:
             return Status.FAILED, finish.message
-        ended = result.stopped_at_noise_level or is_stationary(self._best.weighted, result.x, finish)
+        ended = result.stopped_at_noise_level or is_stationary_point(self._best.weighted, result.x, finish)
         if status == Status.CONVERGED and not ended:
             stopped = f"the search stopped where a further step would lower the cost ({message})"
             return Status.STALLED, f"{stopped}; {_STALLED_REMEDY}"
@@ -427,7 +434,7 @@ def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: It
         for fraction in _HORIZON_FRACTIONS:
             note = f"first {fraction * longest:.3g} s"
             try:
-                shorter = problem.truncated_to(fraction * longest)
+                shorter = problem.truncated_to_duration(fraction * longest)
                 if not shorter.evaluate(x, derivatives=False).ok:
                     continue
                 part = solver.minimize_cost(shorter, x, _noting(callback, note))
@@ -442,7 +449,7 @@ def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: It
     passes = _MAX_WHITENING_PASSES if problem.has_process_noise and uses_process_noise_covariance(solver) else 1
     weighted, warm = problem, None
     for number in range(passes):
-        weighted = whitened_at(weighted, x, warm) if passes > 1 else problem
+        weighted = problem_whitened_at(weighted, x, warm) if passes > 1 else problem
         which = f"pass {number + 1} of at most {passes}" if passes > 1 else ""
         result = solver.minimize_cost(weighted, x, _noting(callback, which))
         x, warm, evaluations = result.x, result.equilibrium_guesses, evaluations + result.n_evaluations
@@ -452,7 +459,7 @@ def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: It
             break
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
         # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
-        weighted = whitened_at(problem, x, warm, rounds=2)
+        weighted = problem_whitened_at(problem, x, warm, rounds=2)
     return _Fit(result, weighted.evaluate(x, equilibrium_guesses=warm), weighted, evaluations, history)
 
 
@@ -461,9 +468,9 @@ def _doubtful(fit: _Fit, first: Array) -> BoolArray:
     x = fit.result.x
     if not fit.evaluation.ok or fit.evaluation.jacobian is None:
         return np.zeros(len(x), bool)
-    std = np.sqrt(np.maximum(np.diag(covariance_and_chi2(fit.weighted, fit.evaluation)[0]), 0.0))
+    std = np.sqrt(np.maximum(np.diag(unknowns_covariance_and_reduced_chi2(fit.weighted, fit.evaluation)[0]), 0.0))
     loose = (std > _LOOSE_RELATIVE_STD * np.abs(x)) & (std < 100 * np.abs(first))
-    return fit.weighted.is_positive & (loose | (x < _COLLAPSED_FRACTION * first))
+    return fit.weighted.positive_unknowns_mask & (loose | (x < _COLLAPSED_FRACTION * first))
 
 
 def _other_valleys(fit: _Fit) -> list[Array]:
@@ -471,12 +478,12 @@ def _other_valleys(fit: _Fit) -> list[Array]:
     problem, finish, x = fit.weighted, fit.evaluation, fit.result.x
     if not finish.ok or finish.jacobian is None or not problem.has_process_noise:
         return []
-    covariance, _ = covariance_and_chi2(problem, finish)
+    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, finish)
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     found: list[tuple[float, Array]] = []
     # what is hardly known stays where it is
     known = std < np.abs(x)
-    for i in np.flatnonzero(problem.is_positive & known & (std > _MIN_SCANNED_RELATIVE_STD * np.abs(x))):
+    for i in np.flatnonzero(problem.positive_unknowns_mask & known & (std > _MIN_SCANNED_RELATIVE_STD * np.abs(x))):
         for factor in _SCAN_FACTORS:
             along = np.where(known, covariance[:, i] / covariance[i, i], 0.0)
             moved = np.clip(x + along * (factor - 1.0) * x[i], *problem.bounds)
@@ -504,7 +511,7 @@ def _good_fit(problem: EstimationProblem, finish: Evaluation) -> bool:
     """Whether a fit needs no other start: good, or with a cost that says nothing of noise."""
     if problem.options.weighting == "paper" or not finish.ok:
         return finish.ok
-    return covariance_and_chi2(problem, finish)[1] < _POOR_CHI2_PER_DOF
+    return unknowns_covariance_and_reduced_chi2(problem, finish)[1] < _POOR_CHI2_PER_DOF
 
 
 def projected_gradient_norm(x: Array, gradient: Array, lower: Array, upper: Array, scale: Array) -> float:

@@ -11,12 +11,12 @@ from annotated_types import Ge, Gt
 
 from yid_ocp.arrays import Array
 from yid_ocp.inference.linearized_residual import (
-    achievable_reduction,
-    bounded_least_squares_step,
-    is_stationary,
-    predicted_reduction,
+    achievable_cost_reduction,
+    bounded_levenberg_marquardt_step,
+    is_stationary_point,
+    predicted_cost_reduction,
 )
-from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, covariance_and_chi2
+from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, unknowns_covariance_and_reduced_chi2
 from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EvaluateFunction, Evaluation
@@ -46,8 +46,8 @@ class GaussNewton:
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised. A short step, or one that damping keeps from promising
-    anything, is no end (`is_stationary`). Many steps that are worth nothing beside the noise are one: where the valley
-    is rough (friction that turns, fast waves over many seconds) the linear model promises what no step keeps.
+    anything, is no end (`is_stationary_point`). Many steps that are worth nothing beside the noise are one: where the
+    valley is rough (friction that turns, fast waves over many seconds) the linear model promises what no step keeps.
 
     References
     ----------
@@ -61,7 +61,9 @@ class GaussNewton:
         OptionInfo("converged when no unknown moves by more than this fraction of its size, and none should"),
     ] = 1e-5
     cost_tolerance: Annotated[
-        float, Gt(0), OptionInfo("converged when the predicted_reduction relative reduction of the cost is below this")
+        float,
+        Gt(0),
+        OptionInfo("converged when the predicted relative reduction of the cost is below this"),
     ] = 1e-8
     initial_damping: Annotated[
         float, Gt(0), OptionInfo("initial mu, in units of the largest diagonal entry of the scaled normal matrix")
@@ -108,12 +110,12 @@ class GaussNewton:
                 remedy = "raise solver.max_iterations or free fewer parameters"
                 return ended(Status.ITERATION_LIMIT, f"no convergence in {self.max_iterations} iterations; {remedy}")
             # the linear model is good for a factor, not for a jump to a bound at zero, whence little leads back
-            guarded = problem.is_positive & (x > _NEAR_ZERO_FRACTION * scale)
+            guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
             low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
-            step = size * bounded_least_squares_step(jacobian * size, residual, mu, low, (upper - x) / size)
-            promised = predicted_reduction(jacobian, residual, step)
+            step = size * bounded_levenberg_marquardt_step(jacobian * size, residual, mu, low, (upper - x) / size)
+            promised = predicted_cost_reduction(jacobian, residual, step)
             # damping makes any step promise little
-            if promised <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary(problem, x, now):
+            if promised <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary_point(problem, x, now):
                 return ended(Status.CONVERGED, _LOWEST)
             trial = evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
             recorder.n_evaluations += 1
@@ -122,7 +124,7 @@ class GaussNewton:
                 moved = float(np.max(np.abs(step) / size))
                 x, now, rejected = np.clip(x + step, lower, upper), trial, 0
                 mu = max(mu * (0.2 if gain > 0.5 else 1.0 if gain > 0.2 else 3.0), 1e-12)
-                if moved < self.step_tolerance and now.jacobian is not None and is_stationary(problem, x, now):
+                if moved < self.step_tolerance and now.jacobian is not None and is_stationary_point(problem, x, now):
                     slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
                     recorder.record_iterate(now.cost, x, slope)
                     return ended(Status.CONVERGED, "the step is below its tolerance")
@@ -130,7 +132,7 @@ class GaussNewton:
             rejected += 1
             mu = max(mu * 8.0, 1e-6)
             if mu > 1e10 or rejected > 40:
-                if is_stationary(problem, x, now):
+                if is_stationary_point(problem, x, now):
                     return ended(Status.CONVERGED, _LOWEST)
                 reason = f"no step lowers the cost ({trial.message or 'the linear model does not hold'})"
                 return ended(Status.STALLED, f"{reason}; start nearer, shorten the recording, or use multiple_shooting")
@@ -141,10 +143,10 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
     if len(history) <= _PATIENCE_STEPS:
         return None
     before, last = history[-1 - _PATIENCE_STEPS], history[-1]
-    saved, unit = before.cost - last.cost, problem.data_noise_unit**2
+    saved, unit = before.cost - last.cost, problem.data_residual_noise_std**2
     if saved > _NEGLIGIBLE_COST_REDUCTION * unit:
         return None
-    if achievable_reduction(problem, last.x, now) > 0.5 * CHI2_95_TWO_SIDED * unit:
+    if achievable_cost_reduction(problem, last.x, now) > 0.5 * CHI2_95_TWO_SIDED * unit:
         return None
-    std = np.sqrt(np.maximum(np.diag(covariance_and_chi2(problem, now)[0]), 0.0))
+    std = np.sqrt(np.maximum(np.diag(unknowns_covariance_and_reduced_chi2(problem, now)[0]), 0.0))
     return saved if np.all(np.abs(last.x - before.x) <= _NEGLIGIBLE_MOVE_STDS * std) else None

@@ -11,7 +11,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects import EffectBase
-from yid_ocp.inference.linearized_residual import bounded_least_squares_step, predicted_reduction
+from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction
 from yid_ocp.integrator.rollout import generalized_momentum, simulate
 from yid_ocp.integrator.tracking_feedback import lqr_feedback
 from yid_ocp.problem.episodes import Episode, InitialState
@@ -40,7 +40,7 @@ _EQUILIBRIUM_SPACING = 0.1
 
 @dataclass(frozen=True)
 class NodeStateGuess:
-    """Initial guess of the unknowns x, and of every recording's initial state at x, nodes and multipliers.
+    """Guess of the unknown vector, and of each recording's initial state, node states and constraint multipliers.
 
     Node states have the shape (K + 1, nx), multipliers (K, m) or (N, m).
     """
@@ -63,10 +63,10 @@ def guess_node_states(
     lower, upper = problem.bounds
     best: tuple[float, NodeStateGuess] | None = None
     for factor in _PARAMETER_FACTORS:
-        moved = np.where(problem.is_positive, np.clip(factor * x, lower, upper), x)
+        moved = np.where(problem.positive_unknowns_mask, np.clip(factor * x, lower, upper), x)
         begins, states, multipliers, total = [], [], [], 0.0
         for i, episode in enumerate(problem.episodes):
-            theta = problem.predictor.episode_theta(episode, problem.split(moved, i)[0])
+            theta = problem.predictor.theta_with_episode_values(episode, problem.split(moved, i)[0])
             begins.append(problem.initial_state(episode, theta))
             found: list[tuple[Array, Array]] = []
             if not begins[-1].failure_message:
@@ -81,13 +81,13 @@ def guess_node_states(
             total += min(sizes) / len(problem.episodes)
         if best is None or total < best[0]:
             best = total, NodeStateGuess(moved, tuple(begins), tuple(states), tuple(multipliers))
-        if best[0] <= _POOR_GUESS_CHI2 or not np.any(problem.is_positive):
+        if best[0] <= _POOR_GUESS_CHI2 or not np.any(problem.positive_unknowns_mask):
             break
     assert best is not None
     return best[1]
 
 
-def mean_square_residual(problem: EstimationProblem, i: int, trajectory: Array, theta: Array) -> float:
+def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, theta: Array) -> float:
     """Mean square whitened residual of a trajectory (N + 1, nx) of recording `i`, without effort channels."""
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameters)))
     parts = [np.zeros(1)]
@@ -105,7 +105,7 @@ def _tracked(
     feedback = episode.tracking_feedback
     if feedback is None and problem.system.driven and not problem.system.servos:
         smooth = LowPassFilter(problem.options.path_cutoff)(episode.grid.node_times, episode.measured_driven_angles)
-        arms = problem.model_functions.arms_only_step
+        arms = problem.model_functions.arms_only_integrator_step
         feedback = lqr_feedback(problem.step, smooth, episode.torque, theta, arms=arms)
     inputs = episode.grid.steps, episode.torque, episode.prescribed_path, feedback
     rollout = simulate(problem.step, theta, start, *inputs)
@@ -137,7 +137,7 @@ def _resting(
     for table in (state, pull):
         for column in range(table.shape[1]):
             table[:, column] = np.interp(times, times[chosen], table[chosen, column])
-    driven = list(problem.system.driven_indices)
+    driven = list(problem.system.driven_coordinate_indices)
     state[:, driven] = episode.measured_driven_angles[nodes]
     velocity = np.gradient(state[:, :n], times, axis=0)
     state[:, n : 2 * n] += generalized_momentum(step, state[:, :n], velocity, theta)
@@ -147,7 +147,7 @@ def _resting(
 # -- free effects ------------------------------------------------------------------------------------------------------
 
 
-def initialize_free_effects(problem: EstimationProblem, x: Array) -> Array:
+def unknowns_with_active_effects(problem: EstimationProblem, x: Array) -> Array:
     """An initial unknown vector at which every free effect is slightly active, shape (nx,).
 
     At its neutral value an effect's shape (where a spring is relaxed, how fast a branch creeps) moves nothing, and the
@@ -180,7 +180,7 @@ def initialize_free_effects(problem: EstimationProblem, x: Array) -> Array:
 def _with_effect_begun(problem: EstimationProblem, x: Array, effect: EffectBase, place: dict[str, int]) -> Array | None:
     """The start with an effect at its best shape; None where only its amplitude is free, and seen at neutral."""
     amplitudes = [place[name] for name in effect.amplitude_names if name in place]
-    shapes = [place[name] for name in effect.shape_names if name in place]
+    shapes = [place[name] for name in effect.shape_parameter_names if name in place]
     expected = {place[name]: limits for name, limits in effect.prior_ranges.items() if name in place}
     grids = [[float(x[at]), *np.linspace(*expected[at], _N_SHAPE_VALUES)] for at in shapes]
     best, most, blind = x.copy(), -np.inf, True
@@ -217,5 +217,5 @@ def _amplitude(problem: EstimationProblem, x: Array, found: Evaluation, amplitud
     # the others may move by their size, no further: the model is linear about a start
     low[others], high[others] = np.maximum(low[others], -1.0), np.minimum(high[others], 1.0)
     scaled = found.jacobian * size
-    step = bounded_least_squares_step(scaled, found.residual, 1e-10, low, high)
-    return step[amplitudes] * size[amplitudes], predicted_reduction(scaled, found.residual, step)
+    step = bounded_levenberg_marquardt_step(scaled, found.residual, 1e-10, low, high)
+    return step[amplitudes] * size[amplitudes], predicted_cost_reduction(scaled, found.residual, step)

@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
-from yid_ocp.inference.linearized_residual import bounded_least_squares_step, predicted_reduction
+from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.options import OptionInfo, check_option_bounds
@@ -27,13 +27,18 @@ from yid_ocp.solvers.base import (
     Status,
     projected_gradient_norm,
 )
-from yid_ocp.solvers.initial_guess import guess_node_states, mean_square_residual
-from yid_ocp.solvers.nonlinear_program import QUIET_OPTIONS, HessianKind, NonlinearProgram, available_memory
+from yid_ocp.solvers.initial_guess import guess_node_states, mean_square_residual_without_efforts
+from yid_ocp.solvers.nonlinear_program import (
+    QUIET_NLPSOL_OPTIONS,
+    HessianKind,
+    NonlinearProgram,
+    available_memory_bytes,
+)
 from yid_ocp.solvers.symbolic_transcription import (
     MIN_RIDGE_FACTOR,
-    check_inputs_as_recorded,
+    check_no_effect_changes_inputs,
+    problem_unknowns_from_program,
     transcribe,
-    unknowns_from_program,
 )
 
 log = logging.getLogger(__name__)
@@ -141,7 +146,7 @@ class MultipleShooting:
         assert program.ridge is not None
         ridge = _AdaptiveRidge(program.ridge.scale, program.w.numel())
         program = replace(program, ridge=replace(program.ridge, factor=ridge))
-        needed, free = program.estimated_memory(self.hessian), available_memory()
+        needed, free = program.estimated_solver_memory(self.hessian), available_memory_bytes()
         size = f"{program.w.numel()} unknowns, {program.g.numel()} equations, about {needed / 1e9:.2g} GB of memory"
         log.log(logging.WARNING if needed > _MEMORY_WARNING_BYTES else logging.INFO, "IPOPT on %s", size)
         if needed > free:
@@ -159,7 +164,7 @@ class MultipleShooting:
         status, message = self._ipopt_status(stats["return_status"], defect)
         n = problem.step.sizes["n"]
         warm = tuple(w[program.variables[f"q[{episode.name}]"].index[:n, 0]] for episode in problem.episodes)
-        x = unknowns_from_program(problem, program, w)
+        x = problem_unknowns_from_program(problem, program, w)
         return SolverResult(status, message, x, tuple(recorder.history), int(stats["n_call_nlp_g"]), warm)
 
     def _solver_options(self, cost_factor: float) -> dict[str, Any]:
@@ -186,7 +191,7 @@ class MultipleShooting:
             "acceptable_obj_change_tol": 1e-5,
             "fixed_variable_treatment": "make_parameter",
         }
-        return {**QUIET_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **self.ipopt}}
+        return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **self.ipopt}}
 
     def _ipopt_status(self, returned: str, defect: float) -> tuple[Status, str]:
         closed = f"largest defect {defect:.1e}"
@@ -216,8 +221,10 @@ class MultipleShooting:
             gradient = now.jacobian.T @ now.residual
             recorder.record_iterate(now.cost, x, projected_gradient_norm(x, gradient, *problem.bounds, size))
             closed = now.residual + now.by_defect
-            step = size * bounded_least_squares_step(now.jacobian * size, closed, mu, *_step_bounds(problem, x, size))
-            promised = predicted_reduction(now.jacobian, closed, step)
+            step = size * bounded_levenberg_marquardt_step(
+                now.jacobian * size, closed, mu, *_step_bounds(problem, x, size)
+            )
+            promised = predicted_cost_reduction(now.jacobian, closed, step)
             moved = float(np.max(np.abs(step) / size, initial=0.0))
             flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
             if moved < self.step_tolerance or flat:
@@ -285,7 +292,7 @@ class _Watch(ca.Callback):
         self.recorder, self.best, self._ridge = recorder, program.initial_guess, ridge
         self._problem, self._program, self._functions = problem, program, functions
         cost = float(functions(program.initial_guess, program.parameter_values)[0])
-        self.unit = max(cost, 0.5 * program.residual.numel() * problem.data_noise_unit**2)
+        self.unit = max(cost, 0.5 * program.residual.numel() * problem.data_residual_noise_std**2)
         nw, ng = program.w.numel(), program.g.numel()
         self._sizes = {"x": nw, "f": 1, "g": ng, "lam_x": nw, "lam_g": ng, "lam_p": program.p.numel()}
         self.construct("watch", {})
@@ -304,7 +311,7 @@ class _Watch(ca.Callback):
         at = self._program.ridge.index
         self._ridge.update(self.best[at], w[at])
         self.best = w
-        x = unknowns_from_program(self._problem, self._program, w)
+        x = problem_unknowns_from_program(self._problem, self._program, w)
         self.recorder.n_evaluations += 1
         note = "" if self.recorder.history else "start"
         self.recorder.record_iterate(float(cost), x, float(ca.norm_inf(slope)) / self.unit, note)
@@ -357,8 +364,8 @@ def _step_bounds(problem: EstimationProblem, x: Array, size: Array) -> tuple[Arr
     """Bounds of a step in units of `size`; the linear model is good for a factor, not for a jump to a bound."""
     lower, upper = problem.bounds
     largest = np.maximum(x, 1e-3 * problem.unknown_scales) * _MAX_CHANGE_FACTOR
-    low = np.where(problem.is_positive, np.maximum(lower, x / _MAX_CHANGE_FACTOR), lower)
-    high = np.where(problem.is_positive, np.minimum(upper, largest), upper)
+    low = np.where(problem.positive_unknowns_mask, np.maximum(lower, x / _MAX_CHANGE_FACTOR), lower)
+    high = np.where(problem.positive_unknowns_mask, np.minimum(upper, largest), upper)
     return (low - x) / size, (high - x) / size
 
 
@@ -366,7 +373,7 @@ class _ShootingIntervals:
     """Recordings cut at nodes, each interval a rollout from its node state; condensed onto the parameters."""
 
     def __init__(self, problem: EstimationProblem, node_interval: int) -> None:
-        check_inputs_as_recorded(problem, "multiple shooting")
+        check_no_effect_changes_inputs(problem, "multiple shooting")
         self.problem, self.node_steps = problem, list[IntArray]()
         for episode in problem.episodes:
             steps = episode.grid.steps
@@ -403,14 +410,14 @@ class _ShootingIntervals:
         return x, list(found.node_states)
 
     def _misfit(self, i: int, nodes: Array, x: Array) -> float:
-        theta = self.problem.predictor.episode_theta(self.problem.episodes[i], self.problem.split(x, i)[0])
+        theta = self.problem.predictor.theta_with_episode_values(self.problem.episodes[i], self.problem.split(x, i)[0])
         rollouts = [self._rollout(i, j, nodes[j], theta, None) for j in range(len(nodes) - 1)]
         trajectory = np.vstack([*(rollout.state[:-1] for rollout in rollouts), rollouts[-1].state[-1:]])
-        return mean_square_residual(self.problem, i, trajectory, theta)
+        return mean_square_residual_without_efforts(self.problem, i, trajectory, theta)
 
     def moved(self, nodes: list[Array], now: _Linearization, step: Array, factor: float) -> list[Array]:
         """Node states after a part of a step of the unknowns that also closes as large a part of the defects."""
-        columns = self.problem.unknowns.recording_columns
+        columns = self.problem.unknowns.unknown_indices_of_recording
         return [
             state + factor * (by_x @ step[columns(i)] + by_defect)
             for i, (state, (by_x, by_defect)) in enumerate(zip(nodes, now.node_slopes, strict=True))
@@ -422,7 +429,7 @@ class _ShootingIntervals:
         cost, defect, residuals, jacobians, changes, slopes = 0.0, 0.0, [], [], [], []
         for i, episode in enumerate(problem.episodes):
             theta, offset = problem.split(x, i)
-            theta = problem.predictor.episode_theta(episode, theta)
+            theta = problem.predictor.theta_with_episode_values(episode, theta)
             start = problem.initial_state(episode, theta, offset, self.equilibrium_guesses[i])
             condensed = start.failure_message or self._condensed(i, theta, start, nodes[i])
             if isinstance(condensed, str):
@@ -436,9 +443,9 @@ class _ShootingIntervals:
                 assert part.jacobian is not None
                 cost += part.cost
                 residuals.append(part.residual)
-                jacobians.append(problem.unknowns.scatter_columns(part.jacobian[:, :-1], i))
+                jacobians.append(problem.unknowns.scatter_to_unknown_columns(part.jacobian[:, :-1], i))
                 changes.append(part.jacobian[:, -1])
-        prior, by_x_prior = problem.prior_residual(x)
+        prior, by_x_prior = problem.prior_residual_and_jacobian(x)
         residual, jacobian = np.concatenate([*residuals, prior]), np.vstack([*jacobians, by_x_prior])
         change = np.concatenate([*changes, np.zeros(len(prior))])
         return _Linearization(cost + 0.5 * float(prior @ prior), defect, residual, jacobian, change, tuple(slopes))

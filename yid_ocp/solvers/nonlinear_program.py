@@ -23,12 +23,12 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import SolverError, nearest_name_hint
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.solvers.program_terms import (
-    MadeOnce,
     ProgramTerm,
     ResidualTerm,
     RidgeRegularization,
-    assemble_sparse,
-    sum_duplicate_entries,
+    ThreadSafeCachedProperty,
+    sparse_matrix_from_entries,
+    sparse_matrix_summing_duplicates,
 )
 
 HessianKind = Literal["gauss_newton", "exact"]
@@ -37,14 +37,14 @@ _BYTES_PER_ENTRY = 250.0
 
 # A trial point that cannot be worked out is the solver's to reject, not for the screen; multipliers of the parameters,
 # which are thousands, are for whoever asks.
-QUIET_OPTIONS = {"show_eval_warnings": False, "error_on_fail": False, "print_time": False, "calc_lam_p": False}
+QUIET_NLPSOL_OPTIONS = {"show_eval_warnings": False, "error_on_fail": False, "print_time": False, "calc_lam_p": False}
 
 # Options that fit programs of one size only.
 _SIZE_DEPENDENT_OPTIONS = ("iteration_callback", "discrete", "equality", "structure_detection", "N", "nx", "nu", "ng")
 
 
 @dataclass(frozen=True)
-class VectorBlock:
+class _VectorBlock:
     """Named block of a program's variables or parameters: indices in the vector, shape (rows, columns), rows' names."""
 
     index: IntArray
@@ -53,17 +53,17 @@ class VectorBlock:
 
 
 @dataclass
-class VectorLayout:
-    """A vector of blocks that are laid one after the other, with values and bounds."""
+class ProgramVectorLayout:
+    """Layout of a program's variables or parameters: blocks one after the other, with values and bounds."""
 
     size: int = 0
-    blocks: dict[str, VectorBlock] = field(default_factory=dict)
+    blocks: dict[str, _VectorBlock] = field(default_factory=dict)
     values: list[Array] = field(default_factory=list)
     lower: list[Array] = field(default_factory=list)
     upper: list[Array] = field(default_factory=list)
 
     def extend(self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf) -> IntArray:
-        """Lay values down; their places."""
+        """Append values with their bounds and return their indices in the vector."""
         self.values.append(values)
         self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
         self.upper.append(np.broadcast_to(upper, values.shape).astype(float))
@@ -71,12 +71,12 @@ class VectorLayout:
         return np.arange(self.size - len(values), self.size)
 
     def name(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
-        """Name places, unless there are none."""
+        """Register indices of the vector as a named block, unless there are none."""
         if index.size:
-            self.blocks[name] = VectorBlock(index, tuple(rows), unit)
+            self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
     def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IntArray:
-        """Lay a block down, column by column; its places, (rows, columns)."""
+        """Append a named block, column by column, and return its indices, shape (rows, columns)."""
         table = np.asarray(values, float)
         table = table[:, None] if table.ndim == 1 else table
         index = self.extend(table.ravel(order="F")).reshape(table.shape, order="F")
@@ -94,7 +94,7 @@ class _UserTerms:
     upper: Array
 
 
-def available_memory() -> float:
+def available_memory_bytes() -> float:
     """Available memory [bytes]; infinite where the system does not report it."""
     told = Path("/proc/meminfo")
     lines = told.read_text(encoding="ascii", errors="replace").splitlines() if told.is_file() else []
@@ -111,7 +111,7 @@ class NonlinearProgram(ReprMixin):
 
     Attributes
     ----------
-    variables, parameters : mapping of str to VectorBlock
+    variables, parameters : mapping of str to _VectorBlock
         What the columns `w` of unknowns and `p` of parameters are made of.
     constraint_terms : tuple of ProgramTerm
         Equalities, one below the other in `g`.
@@ -125,8 +125,8 @@ class NonlinearProgram(ReprMixin):
         What `with_user_terms` added.
     """
 
-    variables: Mapping[str, VectorBlock]
-    parameters: Mapping[str, VectorBlock]
+    variables: Mapping[str, _VectorBlock]
+    parameters: Mapping[str, _VectorBlock]
     constraint_terms: tuple[ProgramTerm, ...]
     residual_terms: tuple[ResidualTerm, ...]
     lower: Array
@@ -145,7 +145,7 @@ class NonlinearProgram(ReprMixin):
 
     # -- what it is made of -------------------------------------------------------------------------------------------
 
-    def block(self, name: str) -> VectorBlock:
+    def block(self, name: str) -> _VectorBlock:
         """Return a block by its name; with one recording, `[NAME]` may be left out.
 
         Raises
@@ -188,15 +188,15 @@ class NonlinearProgram(ReprMixin):
         ]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def f(self) -> ca.MX:
-        """Objective."""
+        """Symbolic objective f(w, p), a scalar."""
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
         return sum(self._losses, ca.MX(0)) + own
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def g(self) -> ca.MX:
-        """Constraints, shape (ng, 1)."""
+        """Symbolic constraint functions g(w, p), shape (ng, 1)."""
         terms = (term.values(self.w, self.p) for term in self.constraint_terms)
         return ca.vertcat(ca.MX(0, 1), *terms, *(extra.constraints for extra in self.user_terms))
 
@@ -215,11 +215,11 @@ class NonlinearProgram(ReprMixin):
 
     # -- derivatives --------------------------------------------------------------------------------------------------
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def _residuals(self) -> list[ca.MX]:
         return [term.values(self.w, self.p) for term in self.residual_terms]
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def _slopes(self) -> list[ca.MX]:
         return [term.jacobian(self.w, self.p) for term in self.residual_terms]
 
@@ -227,50 +227,50 @@ class NonlinearProgram(ReprMixin):
     def _losses(self) -> list[ca.MX]:
         return [term.evaluate_loss(r) for term, r in zip(self.residual_terms, self._residuals, strict=True)]
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def residual(self) -> ca.MX:
-        """All residuals, shape (nr, 1)."""
+        """Symbolic residuals r(w, p) of the objective's least-squares terms, shape (nr, 1)."""
         return ca.vertcat(ca.MX(0, 1), *self._residuals)
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def jac_r(self) -> ca.MX:
-        """dr/dw, sparse."""
+        """Jacobian of all residuals r by the unknowns w, sparse."""
         return ca.vertcat(ca.MX(0, self.w.numel()), *self._slopes)
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def jac_g(self) -> ca.MX:
-        """dg/dw, sparse."""
+        """Jacobian of the constraints g by the unknowns w, sparse."""
         entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for term in self.constraint_terms:
-            row, column = term.jacobian_indices()
-            entries.append(term.jacobian_entries(self.w, self.p))
+            row, column = term.jacobian_nonzero_indices()
+            entries.append(term.jacobian_nonzero_values(self.w, self.p))
             rows.append(at + row)
             columns.append(column)
             at += term.n_values
         where = np.concatenate(rows), np.concatenate(columns)
-        placed = assemble_sparse(ca.vertcat(*entries), *where, (at, self.w.numel()))
+        placed = sparse_matrix_from_entries(ca.vertcat(*entries), *where, (at, self.w.numel()))
         return ca.vertcat(placed, *(ca.jacobian(extra.constraints, self.w) for extra in self.user_terms))
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def grad_f(self) -> ca.MX:
-        """df/dw, shape (nw, 1)."""
+        """Gradient of the objective f by the unknowns w, shape (nw, 1)."""
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
         total = ca.gradient(own, self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
         for term, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
-            total += ca.mtimes(slope.T, term.loss_gradient(r))
+            total += ca.mtimes(slope.T, term.loss_gradient_by_residual(r))
         return total
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def lam_f(self) -> ca.MX:
         """Factor on the objective in the Lagrangian, of which `hessian` is an expression."""
         return ca.MX.sym("lam_f")
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def lam_g(self) -> ca.MX:
         """Multipliers of the constraints in the Lagrangian, shape (ng, 1)."""
         return ca.MX.sym("lam_g", self.g.numel())
 
-    @MadeOnce
+    @ThreadSafeCachedProperty
     def _hessians(self) -> dict[HessianKind, ca.MX]:
         return {}
 
@@ -287,11 +287,11 @@ class NonlinearProgram(ReprMixin):
     def _data_curvature(self, exact: bool) -> ca.MX:
         total = ca.MX(self.w.numel(), self.w.numel())
         for residual, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
-            weight = residual.hessian_weight(r, exact)
+            weight = residual.loss_hessian_residual_weights(r, exact)
             weighted = slope if weight is None else ca.mtimes(ca.diag(weight), slope)
             total += self.lam_f * ca.mtimes(slope.T, weighted)
             if exact:
-                matrix, pull = residual.jacobian_by_values(self.p), residual.loss_gradient(r)
+                matrix, pull = residual.residual_jacobian_by_term_values(self.p), residual.loss_gradient_by_residual(r)
                 pull = pull if matrix is None else ca.mtimes(matrix.T, pull)
                 total += self._curvature(residual.term, self.lam_f * pull)
         return total
@@ -311,8 +311,8 @@ class NonlinearProgram(ReprMixin):
 
     def _curvature(self, term: ProgramTerm, weight: ca.MX) -> ca.MX | int:
         """Hessian of weight . values of a term."""
-        curved = term.hessian_entries(self.w, self.p, weight)
-        return 0 if curved is None else sum_duplicate_entries(*curved, self.w.numel())
+        curved = term.weighted_hessian_triplets(self.w, self.p, weight)
+        return 0 if curved is None else sparse_matrix_summing_duplicates(*curved, self.w.numel())
 
     def _ridge(self, ridge: RidgeRegularization) -> ca.MX:
         count = sum(residual.n_residuals for residual in self.residual_terms)
@@ -322,7 +322,7 @@ class NonlinearProgram(ReprMixin):
         factor = ridge.factor(self.w) if isinstance(ridge.factor, ca.Function) else ridge.factor
         return ca.MX(pattern, factor * 2 * sum(self._losses, ca.MX(0)) / count / size**2)
 
-    def estimated_memory(self, hessian: HessianKind = "gauss_newton") -> float:
+    def estimated_solver_memory(self, hessian: HessianKind = "gauss_newton") -> float:
         """Estimated additional memory of an interior-point method with a direct linear solver [bytes]."""
         return _BYTES_PER_ENTRY * float(self.jac_g.nnz() + self.hessian(hessian).nnz())
 
@@ -377,7 +377,7 @@ class NonlinearProgram(ReprMixin):
             CasADi does not have the plug-in, or refuses the options.
         """
         with CASADI_LOCK:
-            options = {**QUIET_OPTIONS, **options}
+            options = {**QUIET_NLPSOL_OPTIONS, **options}
             try:
                 asked = _asked_for(plugin, options)
                 made = {name: self._derivatives(name, *ends, hessian) for name, ends in asked.items()}

@@ -15,19 +15,19 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.integrator.compiler import compiled_function
+from yid_ocp.integrator.compiler import compiled_casadi_function
 from yid_ocp.parallel import CASADI_LOCK
 
 
-class MadeOnce(cached_property[Any]):
-    """A property that is made once, by one thread at a time."""
+class ThreadSafeCachedProperty(cached_property[Any]):
+    """A cached property, computed once under CasADi's lock, so by one thread at a time."""
 
     def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
         with CASADI_LOCK:
             return super().__get__(instance, owner)
 
 
-class LocalFunction:
+class LocalVariableFunction:
     """Function y(v; d, s) of the columns v (local variables), d (data) and s (shared data), with its derivatives.
 
     The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. With `use_compiler`
@@ -49,11 +49,11 @@ class LocalFunction:
         self.jacobian = self._compiled(ca.Function(f"{name}_slope", self._inputs, ca.cse([ca.sparsify(slopes)])))
 
     def _compiled(self, function: ca.Function) -> ca.Function:
-        return compiled_function(function) if self._use_compiler else function
+        return compiled_casadi_function(function) if self._use_compiler else function
 
-    @MadeOnce
-    def curvature(self) -> ca.Function | None:
-        """Second derivative of weight . y by v at (v, d, s, weight), sparse; None where y is linear."""
+    @ThreadSafeCachedProperty
+    def weighted_hessian_function(self) -> ca.Function | None:
+        """CasADi function (v, d, s, weight) of the sparse Hessian of weight . y by v; None where y is linear."""
         # one product with a direction, for each colour of the pattern: the whole would be millions of operations
         v, weight = self._inputs[0], ca.SX.sym("weight", self._expression.numel())
         gradient = ca.gradient(ca.dot(weight, self._expression), v)
@@ -77,7 +77,7 @@ class LocalFunction:
 
 @dataclass(frozen=True)
 class ProgramTerm:
-    """One local function applied at K places of a program.
+    """A function of a few unknowns, evaluated at K places of a nonlinear program, such as at every step.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class ProgramTerm:
 
     name: str
     row_names: tuple[str, ...]
-    local_function: LocalFunction
+    local_function: LocalVariableFunction
     variable_indices: IntArray
     data_indices: IntArray
     shared_data_indices: IntArray
@@ -112,22 +112,22 @@ class ProgramTerm:
         return mapped(*local, p[self.shared_data_indices.tolist()], *more)
 
     def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Values place by place, shape (ny K, 1)."""
+        """The local function's ny outputs at all K places, one place after another, shape (ny K, 1)."""
         return ca.vec(self._map_over_places(self.local_function.value, w, p))
 
-    def jacobian_entries(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Nonzero entries of the Jacobian, in the order of `jacobian_indices`."""
+    def jacobian_nonzero_values(self, w: ca.MX, p: ca.MX) -> ca.MX:
+        """Nonzero entries of the Jacobian, in the order of `jacobian_nonzero_indices`."""
         return _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))
 
-    def jacobian_indices(self) -> tuple[IntArray, IntArray]:
-        """Row and column indices of the Jacobian's entries."""
+    def jacobian_nonzero_indices(self) -> tuple[IntArray, IntArray]:
+        """Row and column indices of the nonzeros of the Jacobian of all values by w."""
         row, column = (np.array(x, np.int64) for x in self.local_function.jacobian.sparsity_out(0).get_triplet())
         first = len(self.row_names) * np.arange(len(self.variable_indices))[:, None]
         return (first + row).ravel(), self.variable_indices[:, column].ravel()
 
-    def hessian_entries(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
-        """Hessian of weight . values as entries, rows and columns, which may repeat; None where it is zero."""
-        function = self.local_function.curvature
+    def weighted_hessian_triplets(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
+        """Hessian of weight . values by w as entries, rows, columns (positions may repeat); None where it is zero."""
+        function = self.local_function.weighted_hessian_function
         if function is None:
             return None
         weights = ca.reshape(weight, len(self.row_names), len(self.variable_indices))
@@ -161,8 +161,8 @@ class ResidualTerm:
         """Number of residuals."""
         return self.term.n_values if self.combination is None else self.combination.size1()
 
-    def jacobian_by_values(self, p: ca.MX) -> ca.MX | None:
-        """Jacobian dr/dvalues, sparse; None for the identity."""
+    def residual_jacobian_by_term_values(self, p: ca.MX) -> ca.MX | None:
+        """Jacobian of the residuals r by the program term's values, sparse; None for the identity."""
         if self.combination is None and self.weight_indices is None:
             return None
         combination = ca.DM.eye(self.n_residuals) if self.combination is None else self.combination
@@ -173,8 +173,8 @@ class ResidualTerm:
         return ca.MX(combination.sparsity(), factors * ca.MX(ca.DM(combination.nonzeros())))
 
     def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """r, shape (nr, 1)."""
-        matrix, value = self.jacobian_by_values(p), self.term.values(w, p)
+        """Residuals r at the program's unknowns w and parameters p, shape (nr, 1)."""
+        matrix, value = self.residual_jacobian_by_term_values(p), self.term.values(w, p)
         result = value if matrix is None else ca.mtimes(matrix, value)
         if self.target_indices is None:
             return result
@@ -182,10 +182,10 @@ class ResidualTerm:
         return result - (target if self.weight_indices is None else p[self.weight_indices.tolist()] * target)
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """dr/dw, shape (nr, nw), sparse."""
-        entries, shape = self.term.jacobian_entries(w, p), (self.term.n_values, w.numel())
-        placed = assemble_sparse(entries, *self.term.jacobian_indices(), shape)
-        matrix = self.jacobian_by_values(p)
+        """Jacobian of the residuals r by the program's unknowns w, shape (nr, nw), sparse."""
+        entries, shape = self.term.jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
+        placed = sparse_matrix_from_entries(entries, *self.term.jacobian_nonzero_indices(), shape)
+        matrix = self.residual_jacobian_by_term_values(p)
         return placed if matrix is None else ca.mtimes(matrix, placed)
 
     def evaluate_loss(self, r: ca.MX) -> ca.MX:
@@ -195,12 +195,12 @@ class ResidualTerm:
         size, limit = ca.fabs(r), self.huber_threshold
         return ca.sum1(ca.if_else(size <= limit, r**2 / 2, limit * (size - limit / 2)))
 
-    def loss_gradient(self, r: ca.MX) -> ca.MX:
-        """Gradient of the loss by r."""
+    def loss_gradient_by_residual(self, r: ca.MX) -> ca.MX:
+        """Gradient of the loss by the residuals r, shape (nr, 1)."""
         limit = self.huber_threshold
         return r if math.isinf(limit) else ca.fmax(ca.fmin(r, limit), -limit)
 
-    def hessian_weight(self, r: ca.MX, exact: bool) -> ca.MX | None:
+    def loss_hessian_residual_weights(self, r: ca.MX, exact: bool) -> ca.MX | None:
         """Weight of each residual in the Hessian of the loss; None for ones.
 
         Exactly it is one or zero; Gauss-Newton's, that of weighted squares with the same gradient, is never zero.
@@ -231,7 +231,7 @@ def _nonzero_values(matrix: ca.MX) -> ca.MX:
     return ca.MX(ca.Sparsity.dense(matrix.nnz(), 1), matrix.nz[:])
 
 
-def assemble_sparse(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
+def sparse_matrix_from_entries(entries: ca.MX, row: IntArray, column: IntArray, shape: tuple[int, int]) -> ca.MX:
     """Assemble a sparse matrix from entries at distinct positions."""
     order = np.lexsort((row, column))
     start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=shape[1]))])
@@ -239,7 +239,7 @@ def assemble_sparse(entries: ca.MX, row: IntArray, column: IntArray, shape: tupl
     return ca.MX(sparsity, entries[order.tolist()])
 
 
-def sum_duplicate_entries(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:
+def sparse_matrix_summing_duplicates(entries: ca.MX, row: IntArray, column: IntArray, size: int) -> ca.MX:
     """Assemble a sparse square matrix from entries, summing those at the same position."""
     keys, place = np.unique(column * size + row, return_inverse=True)
     start = np.concatenate([[0], np.cumsum(np.bincount(keys // size, minlength=size))])

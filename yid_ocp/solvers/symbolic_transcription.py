@@ -30,11 +30,11 @@ from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.unknown_vector import MIN_LOG_RATIO
-from yid_ocp.sensors import Sensor, sensor_function
-from yid_ocp.solvers.initial_guess import NodeStateGuess, guess_node_states, mean_square_residual
-from yid_ocp.solvers.nonlinear_program import NonlinearProgram, VectorLayout
-from yid_ocp.solvers.program_terms import LocalFunction, ProgramTerm, ResidualTerm, RidgeRegularization
+from yid_ocp.problem.unknown_vector import SOFT_LOGARITHM_MIN_RATIO
+from yid_ocp.sensors import Sensor, sensor_reading_function
+from yid_ocp.solvers.initial_guess import NodeStateGuess, guess_node_states, mean_square_residual_without_efforts
+from yid_ocp.solvers.nonlinear_program import NonlinearProgram, ProgramVectorLayout
+from yid_ocp.solvers.program_terms import LocalVariableFunction, ProgramTerm, ResidualTerm, RidgeRegularization
 
 # Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
 MIN_RIDGE_FACTOR = 0.1
@@ -87,9 +87,9 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
     return problem.with_episodes(episodes, problem.held_out)
 
 
-def check_inputs_as_recorded(problem: EstimationProblem, where: str) -> None:
+def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
     """Raise `SolverError` where an effect changes recorded inputs, which nodes do not carry."""
-    if not problem.has_uncorrected_inputs:
+    if not problem.uses_inputs_as_recorded:
         raise SolverError(
             "an effect changes recorded inputs, times or what the tracking filter follows",
             where=where,
@@ -100,7 +100,7 @@ def check_inputs_as_recorded(problem: EstimationProblem, where: str) -> None:
 
 def _check_transcribable(problem: EstimationProblem, where: str) -> None:
     """Raise `SolverError` for problems that the program does not support."""
-    check_inputs_as_recorded(problem, where)
+    check_no_effect_changes_inputs(problem, where)
     names = [episode.name for episode in problem.episodes]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
@@ -116,14 +116,14 @@ def _check_transcribable(problem: EstimationProblem, where: str) -> None:
             raise SolverError(f"{name} is free and has a known value in a recording", where=f"{where}: {episode.name}")
 
 
-def unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
-    """Problem's unknown vector at a point `w` of its program, shape (nx,)."""
+def problem_unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
+    """Unknown vector of the estimation problem that the program's variables `w` stand for, shape (nx,)."""
     x = problem.initial_unknowns.copy()
     shared, own = len(problem.shared_parameters), len(problem.local_parameters)
     x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
-    rows = list(problem.predictor.estimated_state_indices)
+    rows = list(problem.predictor.estimated_initial_state_indices)
     for i, episode in enumerate(problem.episodes):
-        columns = problem.unknowns.recording_columns(i)[shared:]
+        columns = problem.unknowns.unknown_indices_of_recording(i)[shared:]
         if own:
             x[columns[:own]] = w[program.variables[f"local[{episode.name}]"].index.ravel()]
         if rows:
@@ -177,7 +177,7 @@ class _DrivenStage:
     `function` gives the stage's rows; `effort` of prescribed joints and `torque` of driven ones have their slopes by v.
     """
 
-    function: LocalFunction
+    function: LocalVariableFunction
     v: ca.SX
     data: ca.SX
     state_before: ca.SX
@@ -229,7 +229,7 @@ def _driven_stage(
     (rows, by_v), effort = made
     by_torque = ca.horzcat(ca.SX(nu, len(freed.names)), by_before, ca.SX(nu, nx + m), by_errors)
     v, data = ca.vertcat(freed.free, before, after, lam, errors), ca.vertcat(nominal, gain, reference)
-    function = LocalFunction("step", [v, data, freed.nominal], rows, by_v, use_compiler)
+    function = LocalVariableFunction("step", [v, data, freed.nominal], rows, by_v, use_compiler)
     return _DrivenStage(function, v, data, before, after, effort, (torque, by_torque))
 
 
@@ -240,7 +240,7 @@ class _Maker:
         self._problem, self._compiled = problem, compiled
         self._step, self._sizes = problem.step, problem.step.sizes
         self._names = problem.unknowns.free_parameters
-        self._w, self._p = VectorLayout(), VectorLayout()
+        self._w, self._p = ProgramVectorLayout(), ProgramVectorLayout()
         system = problem.system
         free, fixed = ca.SX.sym("free", len(self._names)), ca.SX.sym("theta", len(system.parameters))
         theta = ca.SX(fixed)
@@ -249,7 +249,7 @@ class _Maker:
         self._freed = _FreeParameterSymbols(self._names, free, fixed, theta)
         self._stage = nlp_stage(self._step.equations, self._step.time_step)
         self._stages: dict[tuple[bool, bool], _DrivenStage] = {}
-        self._sensors: dict[tuple[Sensor, bool, bool], tuple[LocalFunction, bool]] = {}
+        self._sensors: dict[tuple[Sensor, bool, bool], tuple[LocalVariableFunction, bool]] = {}
 
     def program(self, x: Array) -> NonlinearProgram:
         """The program, its guess made near the problem's unknown vector `x`."""
@@ -264,7 +264,7 @@ class _Maker:
         residuals: list[ResidualTerm] = []
         ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
         for i, episode in enumerate(problem.episodes):
-            at = problem.unknowns.recording_columns(i)[shared : shared + len(problem.local_parameters)]
+            at = problem.unknowns.unknown_indices_of_recording(i)[shared : shared + len(problem.local_parameters)]
             local = self._w.extend(x[at], low[at], high[at])
             self._w.name(f"local[{episode.name}]", local[:, None], problem.local_parameters)
             columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
@@ -301,21 +301,21 @@ class _Maker:
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
-        theta = problem.predictor.episode_theta(episode, problem.split(found.x, i)[0])
+        theta = problem.predictor.theta_with_episode_values(episode, problem.split(found.x, i)[0])
         rest = np.zeros(0)
         sought = list(problem.model_functions.equilibrium_solver.free_coordinates)
         if (found_rest := begin.equilibrium) is not None:
             parts = found_rest.state[sought], found_rest.state[2 * n :], found_rest.constraint_reactions
             rest = np.concatenate(parts)
         joints = system.mechanism.joint_names
-        grasped = [name for grasp in system.grasps for name in grasp.equation_names]
+        grasped = [name for grasp in system.grasps for name in grasp.constraint_equation_names]
         at_rest = [*(joints[k] for k in sought), *system.internal_coordinates, *grasped]
         rest_at = self._w.extend(rest)
         self._w.name(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
         table = np.zeros((3, len(state), nx + m))
         table[0, :, :nx], table[0, :-1, nx:] = state, pull
         table[1], table[2] = -np.inf, np.inf
-        for column, joint in enumerate(system.prescribed_indices):
+        for column, joint in enumerate(system.prescribed_coordinate_indices):
             table[:, :, joint] = episode.prescribed_path[:, column]
         # the last node has no multipliers
         at = self._w.extend(*(part.ravel()[: part.size - m] for part in table))
@@ -343,8 +343,10 @@ class _Maker:
         return gain, self._p.add(f"reference[{episode.name}]", feedback.reference.T, followed)
 
     def _misfit(self, i: int, nodes: Array, x: Array) -> float:
-        theta = self._problem.predictor.episode_theta(self._problem.episodes[i], self._problem.split(x, i)[0])
-        return mean_square_residual(self._problem, i, nodes, theta)
+        theta = self._problem.predictor.theta_with_episode_values(
+            self._problem.episodes[i], self._problem.split(x, i)[0]
+        )
+        return mean_square_residual_without_efforts(self._problem, i, nodes, theta)
 
     def _driven(self, episode: Episode) -> _DrivenStage:
         """The stage as a recording drives it."""
@@ -352,7 +354,7 @@ class _Maker:
         if key not in self._stages:
             feedback = episode.tracking_feedback
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
-            momentum = self._problem.model_functions.momentum_shift.momentum_by_torque(self._problem.theta)
+            momentum = self._problem.model_functions.momentum_shift.momentum_derivative_by_torque(self._problem.theta)
             made = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
             self._stages[key] = made
         return self._stages[key]
@@ -395,8 +397,8 @@ class _Maker:
     def _begun(self, episode: Episode, places: _Places) -> tuple[ProgramTerm, list[ResidualTerm]]:
         """What fixes the first state, and the prior of what is free of it."""
         problem, name, nx = self._problem, episode.name, self._sizes["nx"]
-        loose = list(problem.predictor.estimated_state_indices)
-        fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_indices, *loose}]
+        loose = list(problem.predictor.estimated_initial_state_indices)
+        fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_coordinate_indices, *loose}]
         joints = problem.system.mechanism.joint_names
         rows = [*(f"{part}.{joint}" for part in "qp" for joint in joints), *problem.system.internal_coordinates]
         first = ca.SX.sym("x0", nx)
@@ -428,10 +430,12 @@ class _Maker:
             data, shared = np.concatenate([given[:, 0], places.torque[:, 0]])[None, :], places.theta
         labels = [f"rest.{k}" for k in range(balance.numel())] + [f"start.{rows[k]}" for k in fixed]
         value = ca.densify(ca.vertcat(balance, (first - state)[fixed]))
-        term = ProgramTerm(f"start[{name}]", tuple(labels), LocalFunction("start", inputs, value), at, data, shared)
+        term = ProgramTerm(
+            f"start[{name}]", tuple(labels), LocalVariableFunction("start", inputs, value), at, data, shared
+        )
         if not loose:
             return term, []
-        offset = LocalFunction("offset", inputs, ca.densify((first - state)[loose]))
+        offset = LocalVariableFunction("offset", inputs, ca.densify((first - state)[loose]))
         weight = self._p.add(f"weight.start[{name}]", 1.0 / problem.initial_state_prior_std, [rows[k] for k in loose])
         named = tuple(f"offset.{rows[k]}" for k in loose)
         free = ProgramTerm(f"offset[{name}]", named, offset, at, data, shared)
@@ -441,7 +445,11 @@ class _Maker:
         """Samples of one sensor, predicted linearly between the two nodes beside them."""
         sensor, nodes, n = samples.sensor, samples.evaluation_nodes, self._sizes["n"]
         read, loaded = self._reading(sensor, episode)
-        smooth = self._problem.predictor.effort_smoother(episode, self._problem.theta) if sensor.effort_joints else None
+        smooth = (
+            self._problem.predictor.predicted_effort_smoother(episode, self._problem.theta)
+            if sensor.effort_joints
+            else None
+        )
         if smooth is not None:
             nodes = np.arange(episode.grid.steps)
         if loaded:
@@ -456,7 +464,7 @@ class _Maker:
             at, data = np.hstack([free, states[:, :n], states[:, 2 * n :]]), np.zeros((len(nodes), 0), np.int64)
         rows = sensor.output_names
         term = ProgramTerm(f"{sensor.group_name}[{episode.name}]", rows, read, at, data, places.theta)
-        seen, between = samples.is_used, _between(samples, nodes if smooth is None else smooth.nodes)
+        seen, between = samples.used_output_mask, _between(samples, nodes if smooth is None else smooth.nodes)
         if smooth is not None:
             between = between @ scipy.sparse.kron(smooth.matrix, scipy.sparse.eye_array(seen.shape[1]))
         threshold = self._problem.options.huber_threshold
@@ -470,11 +478,11 @@ class _Maker:
         weight = self._p.add(f"weight.{term.name}", samples.weight.T, rows)
         return ResidualTerm(term, _constant(between), weight.T[seen], value.T[seen], threshold)
 
-    def _reading(self, sensor: Sensor, episode: Episode) -> tuple[LocalFunction, bool]:
+    def _reading(self, sensor: Sensor, episode: Episode) -> tuple[LocalVariableFunction, bool]:
         """What a sensor reads at a node, and whether it depends on efforts, that is, on the step from there."""
         key = (sensor, *_kind(episode))
         if key not in self._sensors:
-            function = sensor_function(self._problem.system, sensor, self._names)
+            function = sensor_reading_function(self._problem.system, sensor, self._names)
             if function.size2_out(2) + function.size2_out(5):
                 raise SolverError(
                     f"'{sensor.group_name}' depends on velocities or constraint forces, which node states do not carry",
@@ -486,19 +494,19 @@ class _Maker:
             self._sensors[key] = made, loaded
         return self._sensors[key]
 
-    def _unloaded(self, function: ca.Function) -> LocalFunction:
+    def _unloaded(self, function: ca.Function) -> LocalVariableFunction:
         n = self._sizes["n"]
         q, z, still, lam = ca.SX.sym("q", n), ca.SX.sym("z", self._sizes["nz"]), ca.SX(n, 1), ca.SX(self._sizes["m"], 1)
         y, by_q, _, by_z, _, _, by_free = function(q, still, z, still, lam, self._freed.theta)
         inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.nominal]
-        return LocalFunction("reading", inputs, y, ca.horzcat(by_free, by_q, by_z))
+        return LocalVariableFunction("reading", inputs, y, ca.horzcat(by_free, by_q, by_z))
 
-    def _loaded(self, function: ca.Function, step: _DrivenStage) -> LocalFunction:
+    def _loaded(self, function: ca.Function, step: _DrivenStage) -> LocalVariableFunction:
         system, n, nx = self._problem.system, self._sizes["n"], self._sizes["nx"]
         last, size = ca.SX.sym("last"), step.v.numel()
         node = (1 - last) * step.state_before + last * step.state_after
         load, by_v = ca.SX(ca.DM.zeros(n)), ca.SX(n, size)
-        pairs = ((system.prescribed_indices, *step.effort), (system.driven_indices, *step.torque))
+        pairs = ((system.prescribed_coordinate_indices, *step.effort), (system.driven_coordinate_indices, *step.torque))
         for index, values, by_these in pairs:
             for k, row in enumerate(index):
                 load[row], by_v[row, :] = values[k], by_these[k, :]
@@ -508,16 +516,18 @@ class _Maker:
         rest = ca.SX(y.numel(), size - len(self._names) - 2 * nx)
         slopes = ca.mtimes(by_load, by_v) + ca.horzcat(by_free, (1 - last) * at_node, last * at_node, rest)
         inputs = [step.v, ca.vertcat(step.data, last), self._freed.nominal]
-        return LocalFunction("reading_under_load", inputs, y, slopes)
+        return LocalVariableFunction("reading_under_load", inputs, y, slopes)
 
     def _priors(self, columns: dict[int, int]) -> list[ResidualTerm]:
         """Stated priors of parameters, and the weak ones."""
         problem = self._problem
-        _, slopes = problem.prior_residual(problem.initial_unknowns)
+        _, slopes = problem.prior_residual_and_jacobian(problem.initial_unknowns)
         v, about = ca.SX.sym("v"), ca.SX.sym("about")
         ratio = v / about
-        below = (ratio - MIN_LOG_RATIO) / MIN_LOG_RATIO
-        soft = ca.log(ca.fmax(ratio, MIN_LOG_RATIO)) + ca.if_else(ratio < MIN_LOG_RATIO, below - below**2 / 2, 0)
+        below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
+        soft = ca.log(ca.fmax(ratio, SOFT_LOGARITHM_MIN_RATIO)) + ca.if_else(
+            ratio < SOFT_LOGARITHM_MIN_RATIO, below - below**2 / 2, 0
+        )
         stated = problem.residual_rows.stated_priors.stop - problem.residual_rows.stated_priors.start
         found = []
         kinds = (("prior", slice(0, stated), v - about), ("weak_prior", slice(stated, None), soft))
@@ -537,7 +547,7 @@ class _Maker:
             start = self._p.add(f"{name}.start", problem.initial_unknowns[unknown], names)
             rows = [names[k] for k in last]
             weights = self._p.add(f"{name}.weight", weight, rows)
-            local = LocalFunction(name, [v, about, ca.SX(0, 1)], value)
+            local = LocalVariableFunction(name, [v, about, ca.SX(0, 1)], value)
             at = np.array([[columns[int(k)]] for k in unknown])
             term = ProgramTerm(name, (name,), local, at, start, np.zeros(0, np.int64))
             found.append(ResidualTerm(term, mixed, weights[:, 0]))
@@ -550,9 +560,9 @@ def _kind(episode: Episode) -> tuple[bool, bool]:
     return feedback is not None and not (errors and errors.has_encoder_measurements), errors is not None
 
 
-def _itself(size: int) -> LocalFunction:
+def _itself(size: int) -> LocalVariableFunction:
     v = ca.SX.sym("v", size)
-    return LocalFunction("itself", [v, ca.SX(0, 1), ca.SX(0, 1)], v)
+    return LocalVariableFunction("itself", [v, ca.SX(0, 1), ca.SX(0, 1)], v)
 
 
 def _constant(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> ca.DM:
@@ -564,7 +574,7 @@ def _constant(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> ca.DM:
 def _between(samples: Measurements, nodes: IntArray) -> scipy.sparse.csc_matrix:
     """What makes predictions of samples, those that count, from readings at nodes, node by node."""
     width = samples.value.shape[1]
-    sample, column = np.nonzero(samples.is_used)
+    sample, column = np.nonzero(samples.used_output_mask)
     row, before = np.arange(len(sample)), np.searchsorted(nodes, samples.node[sample])
     fraction = samples.fraction[sample]
     after = np.minimum(before + 1, len(nodes) - 1)

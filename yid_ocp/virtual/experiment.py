@@ -13,20 +13,25 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
-from yid_ocp.effects.base import joints_by_arm
+from yid_ocp.effects.base import joint_names_by_arm
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.model.objects.foam_y import y_object
+from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.joint_motion import (
-    BAXTER_ARM_JOINTS,
+    BAXTER_ARM_JOINT_NAMES,
     MultisineMotion,
     MultisineOptions,
     grasping_joint_angles,
-    random_multisine,
+    random_multisine_motion,
 )
 from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
-from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, SimulatorTerms, simulate_in_mujoco
+from yid_ocp.virtual.mujoco_simulation import (
+    InjectedSimulatorTerms,
+    SimulationOptions,
+    SimulationResult,
+    simulate_in_mujoco,
+)
 
 _Generators = Mapping[str, np.random.Generator]
 
@@ -44,10 +49,10 @@ def baxter_foam_y_system(arms: int) -> System:
     if arms not in (1, 2):
         raise ConfigError(f"arms = {arms}", where="paper_system", allowed="1 or 2")
     sides = ("left", "right")[:arms]
-    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_ARM_JOINTS]
+    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_ARM_JOINT_NAMES]
     robot = read_urdf("package:baxter", joints=names)
     grasps = [Grasp(side, f"{side}_gripper", held) for side, held in zip(sides, ("w_T2", "w_T3"), strict=False)]
-    return System.build(robot, objects=[(y_object(), None, None)], grasps=grasps, driven=names, damping=0.05)
+    return System.build(robot, objects=[(foam_y_object(), None, None)], grasps=grasps, driven=names, damping=0.05)
 
 
 @dataclass(frozen=True)
@@ -102,12 +107,12 @@ class VirtualExperiment:
     Attributes
     ----------
     motion : MultisineMotion, optional
-        `random_multisine` with `seed` where absent.
+        `random_multisine_motion` with `seed` where absent.
     initial_joint_angles : mapping of str to float, optional
         Initial angles [rad or m]; `grasping_joint_angles` where absent.
     camera : PointCamera, optional
         None for no camera.
-    injected_terms : SimulatorTerms, optional
+    injected_terms : InjectedSimulatorTerms, optional
         Forces and model changes that are not in the system's description.
     seed : int
         Seed of all noise; each sensor has its own stream, so that leaving one out changes no other.
@@ -122,7 +127,7 @@ class VirtualExperiment:
     simulation: SimulationOptions = field(default_factory=SimulationOptions)
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
     camera: PointCamera | None = field(default_factory=PointCamera)
-    injected_terms: SimulatorTerms | None = None
+    injected_terms: InjectedSimulatorTerms | None = None
     seed: int = 0
     recording_name: str = "virtual"
     description: str = ""
@@ -157,7 +162,9 @@ def run_virtual_experiment(
         posture = grasping_joint_angles(system, values)
     if motion is None:
         excitation = MultisineOptions(duration=duration)
-        motion = random_multisine(system, values, seed=chosen.seed, initial_joint_angles=posture, excitation=excitation)
+        motion = random_multisine_motion(
+            system, values, seed=chosen.seed, initial_joint_angles=posture, excitation=excitation
+        )
     held = tuple(dict.fromkeys(grasp.held_frame for grasp in system.grasps if grasp.held_frame in system.point_frames))
     visible = () if chosen.camera is None else _visible(system, held, chosen.camera)
     times = np.empty(0)
@@ -186,7 +193,7 @@ def _visible(system: System, held: tuple[str, ...], camera: PointCamera) -> tupl
 
 
 def _joints(system: System, run: SimulationResult, experiment: VirtualExperiment, streams: _Generators) -> JointGroup:
-    driven, noise = list(system.driven_indices), experiment.arm_noise
+    driven, noise = list(system.driven_coordinate_indices), experiment.arm_noise
     names = ("effort_std", "effort_bias_std")
     white, bias = (_by_joint(getattr(noise, name), len(driven), f"ArmSensorNoise.{name}") for name in names)
     offset = bias * streams["effort_bias"].standard_normal(len(driven))
@@ -295,10 +302,10 @@ _JOINT_SENSOR_ERRORS: Mapping[str, tuple[str, Callable[[Array, Array, Mapping[st
 }
 
 
-def with_sensor_error(
+def recording_with_sensor_error(
     recording: Recording, system: System, kind: str, place: str, values: Mapping[str, float]
 ) -> Recording:
-    """The recording as sensors with one error, an effect of the library, would have measured it."""
+    """Copy of a recording as it would be if its sensors had one error, a sensor effect of the library."""
     if kind.startswith("camera") or kind == "surface_offset":
         last = recording.duration
         points = (g if g.pose is None else _camera_error(g, system, kind, values, last) for g in recording.points)
@@ -310,7 +317,7 @@ def with_sensor_error(
     if kind == "effort_delay":
         effort = joints.effort.copy()
         # what is recorded now acts only after the delay
-        for name in joints_by_arm(system)[place]:
+        for name in joint_names_by_arm(system)[place]:
             column = joints.names.index(name)
             effort[:, column] = np.interp(joints.t + values["delay"], joints.t, joints.effort[:, column])
         return replace(recording, joints=replace(joints, effort=effort))

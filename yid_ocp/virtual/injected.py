@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.effects.base import object_joints
+from yid_ocp.effects.base import object_joint_names
 from yid_ocp.errors import ConfigError, ModelError, unknown_name_details
 from yid_ocp.model.system import System
-from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment, with_sensor_error
+from yid_ocp.virtual.experiment import VirtualExperiment, recording_with_sensor_error, run_virtual_experiment
 from yid_ocp.virtual.mjcf import ParameterEvaluator, import_mujoco
 
 _ForceCallback = Callable[[Any, Any], None]  # of MuJoCo's model and data; adds to `qfrc_passive`
@@ -202,7 +202,7 @@ def _aerodynamic_drag(scene: _EffectContext, model: Any, place: str, size: _Valu
 
 
 def _gravity_scale(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    bodies = sorted({int(model.jnt_bodyid[model.joint(joint).id]) for joint in object_joints(scene.system)})
+    bodies = sorted({int(model.jnt_bodyid[model.joint(joint).id]) for joint in object_joint_names(scene.system)})
     gravity = np.array(model.opt.gravity)
     return _in_turn([_body_force(body, size["fraction"] * model.body_mass[body] * gravity) for body in bodies])
 
@@ -283,7 +283,7 @@ _FORCES: Mapping[str, Callable[[_EffectContext, Any, str, _Values], _ForceCallba
 }
 """Forces of the library's effects that are worked out here."""
 _FORCE_KINDS = tuple(_FORCES)
-INJECTABLE_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCE_KINDS, *_SENSOR_ERROR_KINDS)
+INJECTABLE_EFFECT_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCE_KINDS, *_SENSOR_ERROR_KINDS)
 """Effect kinds of the library that can be simulated in MuJoCo."""
 
 
@@ -449,7 +449,7 @@ OUT_OF_LIBRARY_EFFECTS: Mapping[str, Callable[[_EffectContext, Any, str, float],
 
 @dataclass(frozen=True)
 class InjectedEffect:
-    """An effect present in the data and absent from the model, of `INJECTABLE_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
+    """An effect in the data but not in the model, of `INJECTABLE_EFFECT_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
 
     `values` are as in the vocabulary; for kinds outside it `size`, in the unit of the force that it makes.
     """
@@ -464,7 +464,7 @@ class InjectedEffect:
         return f"{self.kind}@{self.location}"
 
 
-def run_injected_experiment(
+def run_experiment_with_effects(
     system: System,
     values: Mapping[str, float],
     effects: Sequence[InjectedEffect],
@@ -476,7 +476,7 @@ def run_injected_experiment(
     own `injected_terms` are replaced. `ConfigError` of a kind that cannot be done here, `ModelError` of a payload that
     is too far off or takes away what is not there, else as `run_virtual_experiment`.
     """
-    known = (*INJECTABLE_KINDS, *OUT_OF_LIBRARY_EFFECTS)
+    known = (*INJECTABLE_EFFECT_KINDS, *OUT_OF_LIBRARY_EFFECTS)
     for effect in effects:
         if effect.kind not in known:
             what, details = f"{effect.kind} cannot be done in MuJoCo here", unknown_name_details(effect.kind, known)
@@ -491,7 +491,7 @@ def run_injected_experiment(
     made = run_virtual_experiment(changed, values, chosen)
     for effect in effects:
         if effect.kind in _SENSOR_ERROR_KINDS and effect.location not in play:
-            made = with_sensor_error(made, system, effect.kind, effect.location, effect.values)
+            made = recording_with_sensor_error(made, system, effect.kind, effect.location, effect.values)
     return made
 
 

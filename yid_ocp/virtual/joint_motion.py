@@ -14,16 +14,16 @@ from scipy.optimize import least_squares
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import ModelError
-from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_derivatives
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Mechanism, Placement
 from yid_ocp.model.system import System
 from yid_ocp.virtual.mjcf import ParameterEvaluator
 
-BAXTER_ARM_JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
+BAXTER_ARM_JOINT_NAMES = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
 _ELBOW_UP_ANGLES: Mapping[str, float] = {
     f"{side}_{joint}": sign * value if joint in ("s0", "e0", "w0", "w2") else value
     for side, sign in (("left", 1.0), ("right", -1.0))
-    for joint, value in zip(BAXTER_ARM_JOINTS, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
+    for joint, value in zip(BAXTER_ARM_JOINT_NAMES, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
 }  # of Baxter, where a search begins [rad]: elbow above the hand, the right arm mirrored
 _PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
 
@@ -105,7 +105,7 @@ class MultisineOptions:
     max_shake_speed: float = 0.15
 
 
-def random_multisine(
+def random_multisine_motion(
     system: System,
     values: Mapping[str, float] | None = None,
     *,
@@ -130,8 +130,8 @@ def random_multisine(
     q0 = np.zeros(system.n_coordinates)
     q0[[tree.joint_index(name) for name in start]] = list(start.values())
     holders = [tree.frame(grasp.holder_frame) for grasp in system.grasps]
-    chains = [tree.ancestor_joints(frame.joint_index) for frame in holders]
-    arms = [[i for i, j in enumerate(system.driven_indices) if j in chain] for chain in chains]
+    chains = [tree.ancestor_joint_indices(frame.joint_index) for frame in holders]
+    arms = [[i for i, j in enumerate(system.driven_coordinate_indices) if j in chain] for chain in chains]
     for arm in arms:  # the same angle near the base moves the hand further
         motion = _scaled(motion, arm, np.linspace(0.5, 1.0, len(arm)))
     q = ca.SX.sym("q", system.n_coordinates)
@@ -139,7 +139,7 @@ def random_multisine(
     for frame, arm in zip(holders, arms, strict=True):
         tip = ca.Function("tip", [q], [kinematics.frame_position(frame)]).map(len(times))
         waves = np.array([motion.offset_and_derivatives(t)[:2] for t in times])[:, :, arm]
-        scale = _scale(chosen, tip, q0, [system.driven_indices[i] for i in arm], waves)
+        scale = _scale(chosen, tip, q0, [system.driven_coordinate_indices[i] for i in arm], waves)
         motion = _scaled(motion, arm, np.full(len(arm), scale))
     if not holders:
         fastest = max(float(np.abs(motion.offset_and_derivatives(t)[1]).max()) for t in times)
@@ -147,9 +147,11 @@ def random_multisine(
         motion = _scaled(motion, joints, np.full(len(joints), chosen.max_joint_speed / fastest))
     if chosen.shake_torque_rms == 0.0:
         return motion
-    rigid = rigid_body_derivatives(kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), ca.SX(ca.DM.zeros(3)))
+    rigid = rigid_body_lagrangian_derivatives(
+        kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), ca.SX(ca.DM.zeros(3))
+    )
     inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass_matrix(rigid, tree)])(q0))))
-    return _shaken(motion, chosen, inertia[list(system.driven_indices)], rng)
+    return _shaken(motion, chosen, inertia[list(system.driven_coordinate_indices)], rng)
 
 
 def _scaled(motion: MultisineMotion, joints: Sequence[int], factors: Array) -> MultisineMotion:
@@ -233,12 +235,14 @@ def grasping_joint_angles(
     value = ParameterEvaluator(system, values)
     posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})
     elastic = {spring.joint_name for spring in system.elastic_joints}
-    holding = {j for grasp in system.grasps for j in tree.ancestor_joints(tree.frame(grasp.holder_frame).joint_index)}
+    holding = {
+        j for grasp in system.grasps for j in tree.ancestor_joint_indices(tree.frame(grasp.holder_frame).joint_index)
+    }
     sought = [j for j, joint in enumerate(tree.joints) if j in holding and joint.name not in elastic]
     if sought:
         gap = _gap_function(system, tree, value, offsets or {}, sought)
         posture = _reached(system, tree, posture, sought, gap)
-    wanted = sorted(set(sought) | set(system.driven_indices))
+    wanted = sorted(set(sought) | set(system.driven_coordinate_indices))
     return {tree.joints[j].name: float(posture[j]) for j in wanted}
 
 

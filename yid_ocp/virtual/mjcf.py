@@ -22,10 +22,10 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
-from yid_ocp.model.servos_and_springs import TORQUE_LIMIT_POWER, UNLIMITED_EFFORT
+from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, MidpointState, RecordingErrorEffect, System
 
-MODEL_ASPECTS: Mapping[str, str] = {
+MODEL_ASPECT_DESCRIPTIONS: Mapping[str, str] = {
     "stiffness": "stiffness of joints",
     "rest": "angles at which springs are relaxed",
     "damping": "viscous damping of joints",
@@ -56,12 +56,14 @@ _DRY_FRICTION_PARAMETERS: Mapping[str, str] = {"joint_coulomb": "tau_c", "joint_
 
 _POINTS = 3  # at which equations are compared
 _ROUNDING = 1e-9
-EMULATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
+MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 """Aspects that MuJoCo can only approximate."""
 # aspects of sensors and recorded torques, which do not enter the mechanics
 _IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
 # aspects for which MuJoCo has an equivalent term
-_NATIVE_ASPECTS = frozenset(MODEL_ASPECTS) - EMULATED_ASPECTS - _IGNORED_ASPECTS - {"clock", "memory", "force"}
+_NATIVE_ASPECTS = (
+    frozenset(MODEL_ASPECT_DESCRIPTIONS) - MUJOCO_APPROXIMATED_ASPECTS - _IGNORED_ASPECTS - {"clock", "memory", "force"}
+)
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
 _ROTOR = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
@@ -69,7 +71,7 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 
 @dataclass(frozen=True)
-class JointDynamics:
+class JointDynamicsTerms:
     """Terms at one joint in SI units of its coordinate: the force is constant - stiffness q - cubic q^3 - damping v."""
 
     stiffness: float = 0.0
@@ -79,8 +81,8 @@ class JointDynamics:
     armature: float = 0.0
     dry_friction: float = 0.0
 
-    def __add__(self, other: JointDynamics) -> JointDynamics:
-        return JointDynamics(*(getattr(self, name) + getattr(other, name) for name in vars(self)))
+    def __add__(self, other: JointDynamicsTerms) -> JointDynamicsTerms:
+        return JointDynamicsTerms(*(getattr(self, name) + getattr(other, name) for name in vars(self)))
 
 
 class ParameterEvaluator:
@@ -93,7 +95,7 @@ class ParameterEvaluator:
         """Values of an expression that depends on parameters only."""
         return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
 
-    def is_zero(self, expression: ca.SX) -> bool:
+    def is_identically_zero(self, expression: ca.SX) -> bool:
         """Whether an expression is zero for all values of its other symbols."""
         return bool(ca.sparsify(self.with_parameter_values(expression)).is_zero())
 
@@ -102,8 +104,8 @@ class ParameterEvaluator:
         return ca.substitute(expression, self._symbols, ca.DM(self._theta))
 
 
-def aspects_of_parameters(system: System, symbols: ca.SX) -> set[str]:
-    """Keys of `MODEL_ASPECTS` for the parts of the description that depend on given parameters."""
+def model_aspects_of_parameters(system: System, symbols: ca.SX) -> set[str]:
+    """Keys of `MODEL_ASPECT_DESCRIPTIONS` for the parts of the description that depend on given parameters."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
     placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
@@ -126,15 +128,15 @@ def aspects_of_parameters(system: System, symbols: ca.SX) -> set[str]:
     return {name for name, parts in entered.items() if any(_depends(part, symbols) for part in parts)}
 
 
-def effect_terms_and_aspects(
+def effect_joint_terms_and_aspects(
     system: System, effect: Effect, value: ParameterEvaluator
-) -> tuple[dict[str, JointDynamics], set[str]]:
-    """Terms that the equations of a system's effect add at single joints, and the `MODEL_ASPECTS` it changes."""
-    aspects = aspects_of_parameters(system, effect.parameters.symbols)
-    terms: dict[str, JointDynamics] = {}
+) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
+    """Terms that a system's effect adds at single joints, and the `MODEL_ASPECT_DESCRIPTIONS` it changes."""
+    aspects = model_aspects_of_parameters(system, effect.parameters.symbols)
+    terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_PARAMETERS:
         size = effect.parameters[f"{effect.kind}@{effect.location}.{_DRY_FRICTION_PARAMETERS[effect.kind]}"].symbol
-        terms = {effect.location: JointDynamics(dry_friction=float(value(size)[0]))}
+        terms = {effect.location: JointDynamicsTerms(dry_friction=float(value(size)[0]))}
         aspects.add("dry_friction")
     elif effect.internal_coordinates:
         aspects.add("memory")
@@ -155,27 +157,27 @@ def effect_terms_and_aspects(
     return terms, aspects or {"reading"}
 
 
-def joint_dynamics(system: System, value: ParameterEvaluator) -> dict[str, JointDynamics]:
+def joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms]:
     """Springs, dampers, rotor inertia and friction by joint, from the description and from effects.
 
-    Of other effects only these parts are included; the aspects of `effect_terms_and_aspects` show what is missing.
+    Of other effects only these parts; aspects of `effect_joint_terms_and_aspects` show what is missing.
     """
-    found: dict[str, JointDynamics] = {}
+    found: dict[str, JointDynamicsTerms] = {}
 
-    def add(joint: str, own: JointDynamics) -> None:
-        found[joint] = found.get(joint, JointDynamics()) + own
+    def add(joint: str, own: JointDynamicsTerms) -> None:
+        found[joint] = found.get(joint, JointDynamicsTerms()) + own
 
     for joint, coefficient in system.joint_damping.items():
-        add(joint, JointDynamics(damping=float(value(coefficient)[0])))
+        add(joint, JointDynamicsTerms(damping=float(value(coefficient)[0])))
     for spring in system.elastic_joints:
         stiffness, rest, damping = (float(value(x)[0]) for x in (spring.stiffness, spring.rest_angle, spring.damping))
-        add(spring.joint_name, JointDynamics(stiffness, stiffness * rest, damping=damping))
+        add(spring.joint_name, JointDynamicsTerms(stiffness, stiffness * rest, damping=damping))
     for joint, compliance in system.joint_compliances.items():
-        if not value.is_zero(compliance):
+        if not value.is_identically_zero(compliance):
             stiffness = 1 / float(value(compliance)[0])
-            add(joint, JointDynamics(stiffness, damping=system.joint_relaxation_times.get(joint, 0.0) * stiffness))
+            add(joint, JointDynamicsTerms(stiffness, damping=system.joint_relaxation_times.get(joint, 0.0) * stiffness))
     for effect in system.effects:
-        for joint, own in effect_terms_and_aspects(system, effect, value)[0].items():
+        for joint, own in effect_joint_terms_and_aspects(system, effect, value)[0].items():
             add(joint, own)
     return found
 
@@ -193,15 +195,15 @@ def _actuation(
     channel = f"joints.{'effort' if servo is None else 'position'}.{joint}"
     for effect in reversed(known):
         true = effect.corrected_reading(channel, true, true)
-    late = sum((effect.added_delay(f"torque.{joint}", False) for effect in known), ca.SX(0))
-    lag = sum((effect.lag_time_constant(f"torque.{joint}") for effect in known), ca.SX(0))
+    late = sum((effect.added_channel_delay(f"torque.{joint}", False) for effect in known), ca.SX(0))
+    lag = sum((effect.channel_lag_time_constant(f"torque.{joint}") for effect in known), ca.SX(0))
     gain = ca.jacobian(true, reading)
     numbers = [ca.substitute(part, reading, 0) for part in (gain, true)] + [late, lag]
     one, none, delay, constant = (float(value(number)[0]) for number in numbers)
     return one, -none, delay, constant
 
 
-def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> dict[str, JointDynamics] | None:
+def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms] | None:
     """Springs, dampers and rotors that an effect's equations are, by joint; None where they are something else."""
     n = system.n_coordinates
     q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
@@ -239,7 +241,7 @@ def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> d
     if not (constant and apart and springs) or np.any(loose):
         return None
     return {
-        joint: JointDynamics(-slope[i], pull[i], -twisted[i] / 6, -damping[i], armature[i])
+        joint: JointDynamicsTerms(-slope[i], pull[i], -twisted[i] / 6, -damping[i], armature[i])
         for i, joint in enumerate(system.mechanism.joint_names)
         if np.any(np.abs([slope[i], pull[i], twisted[i], damping[i], armature[i]]) > scale)
     }
@@ -258,7 +260,7 @@ def mujoco_xml(
     actuators: bool = False,
     gear_play: Mapping[str, float] | None = None,
 ) -> str:
-    """The MJCF text of a system.
+    """The MuJoCo model (MJCF, an XML text) of a system.
 
     Joints keep their names. Consecutive joints that carry no mass and sit at one place become one body with several
     joints, which is the same kinematics. Every point and every end of a grasp is a site: points under their own name,
@@ -301,15 +303,15 @@ def mujoco_xml(
     # the Newton solver of MuJoCo 4.0 does not converge on fine chains in its sparse form
     search = {"iterations": "100", "tolerance": "1e-14", "jacobian": "dense"}
     # the twist of a thin tube has a damping time of some 10 us, which an explicit rule cannot follow
-    rules = {"timestep": xml_numbers([time_step]), "integrator": "implicitfast"}
-    rules["gravity"] = xml_numbers(value(system.gravity))
+    rules = {"timestep": format_xml_numbers([time_step]), "integrator": "implicitfast"}
+    rules["gravity"] = format_xml_numbers(value(system.gravity))
     option = SubElement(root, "option", {**rules, **search})
     SubElement(option, "flag", contact="disable")
     sites = _sites(system, tree, value)
     base = SubElement(SubElement(root, "worldbody"), "body", name="world_base")
     SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # Pinocchio asks for one
     gears = {name: _play_attributes(width, time_step) for name, width in (gear_play or {}).items()}
-    elements = _bodies(tree, weights, joint_dynamics(system, value), sites, base, gears)
+    elements = _bodies(tree, weights, joint_dynamics_terms(system, value), sites, base, gears)
     for name, frame in sites:
         SubElement(elements[frame.joint_index], "site", {"name": name, **_pose(frame.placement)})
     _add_grasps(system, value, root, time_step)
@@ -322,7 +324,7 @@ def mujoco_xml(
 def _bodies(
     tree: Mechanism,
     weights: Mapping[str, float],
-    terms: Mapping[str, JointDynamics],
+    terms: Mapping[str, JointDynamicsTerms],
     sites: list[tuple[str, Frame]],
     world: Element,
     gears: Mapping[str, Mapping[str, str]],
@@ -342,12 +344,12 @@ def _bodies(
         else:
             place = {"name": f"{joint.name}_body", **_pose(joint.placement)}
             elements[j] = SubElement(elements[joint.parent_index], "body", place)
-        attributes = _joint_attributes(joint, terms.get(joint.name, JointDynamics()))
+        attributes = _joint_attributes(joint, terms.get(joint.name, JointDynamicsTerms()))
         moved = SubElement(elements[j], "joint", attributes)
         if joint.name in gears:
             motor, name = elements[j], joint.name
             motor.set("name", f"{name}_motor")
-            moved.attrib.setdefault("armature", xml_numbers([_ROTOR]))
+            moved.attrib.setdefault("armature", format_xml_numbers([_ROTOR]))
             SubElement(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
             elements[j] = SubElement(motor, "body", {"name": f"{name}_body"})
             kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}
@@ -359,7 +361,7 @@ def _bodies(
         body = merge_bodies(joint.bodies)
         if body is not None:
             if joint.name in weights:
-                elements[j].set("gravcomp", xml_numbers([1 - weights[joint.name]]))
+                elements[j].set("gravcomp", format_xml_numbers([1 - weights[joint.name]]))
             SubElement(elements[j], "inertial", _inertial(body))
         elif not any(_shares_body(tree, k) and tree.joints[k].parent_index == j for k in range(len(tree.joints))):
             allowed = "a body with mass on every joint, or several joints at one place with a body on the last"
@@ -381,41 +383,48 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
     return replace(tree, joints=joints), weights
 
 
-def _joint_attributes(joint: Joint, terms: JointDynamics) -> dict[str, str]:
-    attributes = {"name": joint.name, "axis": xml_numbers(joint.axis), "damping": xml_numbers([terms.damping])}
+def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]:
+    attributes = {
+        "name": joint.name,
+        "axis": format_xml_numbers(joint.axis),
+        "damping": format_xml_numbers([terms.damping]),
+    }
     attributes["type"] = "hinge" if joint.kind == "revolute" else "slide"
     if terms.stiffness > 0:
-        attributes["stiffness"] = xml_numbers([terms.stiffness])
-        attributes["springref"] = xml_numbers([terms.constant_force / terms.stiffness])
+        attributes["stiffness"] = format_xml_numbers([terms.stiffness])
+        attributes["springref"] = format_xml_numbers([terms.constant_force / terms.stiffness])
     if terms.cubic_stiffness:
         if terms.constant_force or not hasattr(import_mujoco().MjModel, "jnt_stiffnesspoly"):
             what = f"the spring at '{joint.name}' has a cubic part"
             allowed = "none beside a rest angle, and MuJoCo with polynomial stiffness (3.6 or newer)"
             raise ModelError(what, where="mujoco_xml", allowed=allowed)
-        attributes["stiffness"] = xml_numbers([terms.stiffness, 0.0, terms.cubic_stiffness])
+        attributes["stiffness"] = format_xml_numbers([terms.stiffness, 0.0, terms.cubic_stiffness])
     if terms.armature:
-        attributes["armature"] = xml_numbers([terms.armature])
+        attributes["armature"] = format_xml_numbers([terms.armature])
     if terms.dry_friction:
-        attributes["frictionloss"] = xml_numbers([terms.dry_friction])
+        attributes["frictionloss"] = format_xml_numbers([terms.dry_friction])
     return attributes
 
 
 def _play_attributes(width: float, time_step: float) -> dict[str, str]:
     """A joint with stops at half the width either way."""
-    ends = {"limited": "true", "range": xml_numbers([-width / 2, width / 2])}
-    return {**ends, "solreflimit": xml_numbers([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
+    ends = {"limited": "true", "range": format_xml_numbers([-width / 2, width / 2])}
+    return {**ends, "solreflimit": format_xml_numbers([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
 
 
 def _add_grasps(system: System, value: ParameterEvaluator, root: Element, time_step: float) -> None:
     equality = SubElement(root, "equality")
-    firm = {"solref": xml_numbers([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
+    firm = {"solref": format_xml_numbers([2 * time_step, 1.0]), "solimp": "0.9999 0.9999 0.001 0.5 2"}
     for grasp in system.grasps:
         ends = [f"grasp_{grasp.name}_{end}" for end in ("holder", "held")]
         compliance = float(value(grasp.compliance)[0])
         if compliance > 0:
             # a tendon of no length pulls with its stiffness, and damps, along the line between both ends
             relaxation = 0.0 if grasp.relaxation_time is None else float(value(grasp.relaxation_time)[0])
-            sizes = {"stiffness": xml_numbers([1 / compliance]), "damping": xml_numbers([relaxation / compliance])}
+            sizes = {
+                "stiffness": format_xml_numbers([1 / compliance]),
+                "damping": format_xml_numbers([relaxation / compliance]),
+            }
             tendons = root.find("tendon")
             tendons = SubElement(root, "tendon") if tendons is None else tendons
             attributes = {"name": f"grasp_{grasp.name}", "springlength": "0", **sizes}
@@ -439,20 +448,20 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element,
             own, damping, late, tightness = (float(value(x)[0]) for x in servo.coefficients)
             gain, bias, delay = own * gain, [own * bias[0], -own, -damping], delay + late
             between = "zoh" if servo.command_interpolation == "held" else "linear"
-            limit = tightness ** (-1 / TORQUE_LIMIT_POWER) if tightness > 0 else math.inf
-            if limit < UNLIMITED_EFFORT:
-                attributes |= {"forcelimited": "true", "forcerange": xml_numbers([-limit, limit])}
-        attributes["gainprm"] = xml_numbers([gain])
+            limit = tightness ** (-1 / TORQUE_SATURATION_EXPONENT) if tightness > 0 else math.inf
+            if limit < UNLIMITED_EFFORT_THRESHOLD:
+                attributes |= {"forcelimited": "true", "forcerange": format_xml_numbers([-limit, limit])}
+        attributes["gainprm"] = format_xml_numbers([gain])
         if any(bias):
-            attributes |= {"biastype": "affine", "biasprm": xml_numbers(bias)}
+            attributes |= {"biastype": "affine", "biasprm": format_xml_numbers(bias)}
         if lag > 0:
-            attributes |= {"dyntype": "filterexact", "dynprm": xml_numbers([lag])}
+            attributes |= {"dyntype": "filterexact", "dynprm": format_xml_numbers([lag])}
         if delay > 0:
             if not hasattr(import_mujoco().MjModel, "actuator_delay"):
                 what, allowed = f"the torque of '{joint}' acts late", "MuJoCo with delays of actuators (3.5 or newer)"
                 raise ModelError(what, where="mujoco_xml", allowed=allowed)
             samples = math.ceil(delay / time_step) + 1
-            attributes |= {"delay": xml_numbers([delay]), "nsample": str(samples), "interp": between}
+            attributes |= {"delay": format_xml_numbers([delay]), "nsample": str(samples), "interp": between}
         SubElement(actuator, "general", attributes)
 
 
@@ -475,21 +484,22 @@ def compile_mjcf(text: str) -> Any:
 
 
 def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bool) -> None:
-    able = _NATIVE_ASPECTS | EMULATED_ASPECTS if emulate else _NATIVE_ASPECTS
+    able = _NATIVE_ASPECTS | MUJOCO_APPROXIMATED_ASPECTS if emulate else _NATIVE_ASPECTS
     for effect in system.effects:
-        for aspect in sorted(effect_terms_and_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS):
-            what = f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {MODEL_ASPECTS[aspect]}"
-            allowed = ", ".join(words for name, words in MODEL_ASPECTS.items() if name in able)
+        for aspect in sorted(effect_joint_terms_and_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS):
+            changed = MODEL_ASPECT_DESCRIPTIONS[aspect]
+            what = f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {changed}"
+            allowed = ", ".join(words for name, words in MODEL_ASPECT_DESCRIPTIONS.items() if name in able)
             raise ModelError(what, where="mujoco_xml", allowed=f"effects that change {allowed}")
     for grasp in system.grasps:
-        if not value.is_zero(grasp.compliance) and not (emulate and grasp.kind == "point"):
+        if not value.is_identically_zero(grasp.compliance) and not (emulate and grasp.kind == "point"):
             allowed = "rigid grasps" if not emulate else "rigid grasps, and springs in place of point grasps"
             raise ModelError(f"grasp '{grasp.name}' is compliant", where="mujoco_xml", allowed=allowed)
     for joint, compliance in system.joint_compliances.items():
-        if value.is_zero(compliance):
+        if value.is_identically_zero(compliance):
             allowed, hint = "a compliance above zero", "leave the effect out"
             raise ModelError(f"joint '{joint}' is rigid", where="mujoco_xml", allowed=allowed, hint=hint)
-    if not value.is_zero(system.recorded_time_scale - 1):
+    if not value.is_identically_zero(system.recorded_time_scale - 1):
         raise ModelError("the clock is scaled", where="mujoco_xml", allowed="a clock that tells the true time")
 
 
@@ -525,16 +535,23 @@ def _along(z: float) -> Placement:
 
 def _pose(placement: Placement) -> dict[str, str]:
     x, y, z, w = Rotation.from_matrix(np.array(ca.DM(placement.rotation))).as_quat()
-    return {"pos": xml_numbers(np.array(ca.DM(placement.translation)).ravel()), "quat": xml_numbers([w, x, y, z])}
+    return {
+        "pos": format_xml_numbers(np.array(ca.DM(placement.translation)).ravel()),
+        "quat": format_xml_numbers([w, x, y, z]),
+    }
 
 
 def _inertial(body: Inertia) -> dict[str, str]:
     tensor = np.array(ca.DM(body.inertia_about_com))
     full = [tensor[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
     com = np.array(ca.DM(body.center_of_mass)).ravel()
-    return {"pos": xml_numbers(com), "mass": xml_numbers([float(body.mass)]), "fullinertia": xml_numbers(full)}
+    return {
+        "pos": format_xml_numbers(com),
+        "mass": format_xml_numbers([float(body.mass)]),
+        "fullinertia": format_xml_numbers(full),
+    }
 
 
-def xml_numbers(numbers: Iterable[float]) -> str:
-    """Numbers with all their digits, for an attribute."""
+def format_xml_numbers(numbers: Iterable[float]) -> str:
+    """Numbers as text with all their digits, separated by spaces, for an XML attribute."""
     return " ".join(f"{float(number):.17g}" for number in numbers)

@@ -20,10 +20,10 @@ from yid_ocp.virtual.mujoco_simulation import (
     TrackingController,
     initialize_actuator_history,
     settle_to_equilibrium,
-    settle_under_servos,
+    settle_under_servo_commands,
 )
 
-REPLAY_BANDWIDTH = 5.0
+REPLAY_FEEDBACK_BANDWIDTH = 5.0
 """Bandwidth of the feedback against drift of driven joints [rad/s]; low, so that recorded torque dominates."""
 _SMOOTHED = 2.0  # samples over which recorded angles are smoothed before they are followed
 _START = 5  # samples of which the first posture is the mean
@@ -52,9 +52,9 @@ def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[st
     """Replay a recording with the MJCF text of a system, from `mujoco_xml` with actuators.
 
     Driven joints get the recorded torque as the control of their actuators, and beside it a weak pull to the recorded
-    angles (`REPLAY_BANDWIDTH`), without which any error of a torque lets an arm drift away. Position servos get what
-    they were commanded and nothing else. Prescribed joints follow the recorded angles; the torque that this takes is
-    compared with the recorded one.
+    angles (`REPLAY_FEEDBACK_BANDWIDTH`), without which any error of a torque lets an arm drift away. Position servos
+    get what they were commanded and nothing else. Prescribed joints follow the recorded angles; the torque that this
+    takes is compared with the recorded one.
 
     Returns `joints.position` of driven joints [rad] or `joints.effort` of prescribed ones [N m], all joints together,
     and `GROUP.POINT` of every point of the model [m].
@@ -150,8 +150,8 @@ def _driven(scene: MujocoScene, path: _Path, t: Array, effort: Array | None) -> 
             mujoco.mj_forward(model, data)
             _full_inertia(mujoco, model, data, inertia)
         offset, velocity, _ = path.offset_and_derivatives(now)
-        demand = REPLAY_BANDWIDTH**2 * (start + offset - data.qpos[at])
-        demand += 2 * REPLAY_BANDWIDTH * (velocity - data.qvel[at])
+        demand = REPLAY_FEEDBACK_BANDWIDTH**2 * (start + offset - data.qpos[at])
+        demand += 2 * REPLAY_FEEDBACK_BANDWIDTH * (velocity - data.qvel[at])
         data.ctrl[:] = effort[np.searchsorted(t, now + 1e-9, side="right") - 1]
         data.qfrc_applied[at] = inertia[np.ix_(at, at)] @ demand
 
@@ -159,7 +159,7 @@ def _driven(scene: MujocoScene, path: _Path, t: Array, effort: Array | None) -> 
 
 
 def _commanded(scene: MujocoScene, system: System, t: Array, commands: Array) -> _Played:
-    settle_under_servos(scene, np.array(scene.model.dof_damping), commands[0])
+    settle_under_servo_commands(scene, np.array(scene.model.dof_damping), commands[0])
     times = _step_times(scene, t[-1])
     held = commands[np.searchsorted(t, times + 1e-9, side="right") - 1]
     is_held = [system.servos[name].command_interpolation == "held" for name in system.driven]

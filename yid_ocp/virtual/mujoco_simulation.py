@@ -24,7 +24,7 @@ from yid_ocp.sensors.base import EffortKind
 from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
 from yid_ocp.virtual.mjcf import compile_mjcf, import_mujoco, mujoco_xml
 
-DEFAULT_SIMULATOR_STEP = 1e-4
+DEFAULT_SIMULATOR_TIME_STEP = 1e-4
 """Default time step of the simulator [s]."""
 
 _BANDWIDTH = 25.0  # of the joint controller [rad/s]; a 10 ms hold leaves it well damped
@@ -38,7 +38,7 @@ _LOST = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 """Warnings after which MuJoCo resets its state and goes on; their numbers differ between its versions."""
 
 
-class SimulatorTerms(Protocol):
+class InjectedSimulatorTerms(Protocol):
     """Forces and model changes in the simulator that are not in the system's description."""
 
     def edit_model(self, model: Any) -> None:
@@ -67,7 +67,7 @@ class SimulationOptions:
 
     duration: float = 5.0
     sample_rate: float = 100.0
-    time_step: float = DEFAULT_SIMULATOR_STEP
+    time_step: float = DEFAULT_SIMULATOR_TIME_STEP
     controller_rate: float | None = None
     effort_kind: EffortKind = "command"
 
@@ -137,7 +137,7 @@ def simulate_in_mujoco(
     *,
     initial_joint_angles: Mapping[str, float] | None = None,
     frame_times: ArrayLike = (),
-    injected: SimulatorTerms | None = None,
+    injected: InjectedSimulatorTerms | None = None,
     gear_play: Mapping[str, float] | None = None,
 ) -> SimulationResult:
     """Simulate the controller following a motion in MuJoCo, from static equilibrium at the initial joint angles.
@@ -154,7 +154,7 @@ def simulate_in_mujoco(
         Initial angles [rad or m]; `grasping_joint_angles` where absent.
     frame_times : array_like, shape (M,)
         When a camera looks [s], increasing, in [0, duration].
-    injected : SimulatorTerms, optional
+    injected : InjectedSimulatorTerms, optional
         What is at work beside the system's description. MuJoCo knows one such callback for the whole process: no other
         simulation may run meanwhile in another thread.
     gear_play : mapping of joint to float, optional
@@ -184,7 +184,7 @@ def simulate_in_mujoco(
         controller: TrackingController | _ServoCommander
         if system.servos:
             controller = _ServoCommander(scene, motion)
-            settle_under_servos(scene, nominal_damping, controller.initial_command)
+            settle_under_servo_commands(scene, nominal_damping, controller.initial_command)
         else:
             controller = TrackingController(scene, motion, settle_to_equilibrium(scene, nominal_damping))
         if injected is not None:
@@ -216,12 +216,12 @@ class MujocoScene:
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.point_frames]
         ends = [[model.site(f"grasp_{g.name}_{end}").id for end in ("holder", "held")] for g in system.grasps]
-        moved = order[list(system.driven_indices or system.prescribed_indices)]
+        moved = order[list(system.driven_coordinate_indices or system.prescribed_coordinate_indices)]
         return MujocoScene(mujoco, model, mujoco.MjData(model), order, moved, sites, ends)
 
 
 @contextlib.contextmanager
-def _at_work(mujoco: ModuleType, model: Any, injected: SimulatorTerms | None) -> Iterator[None]:
+def _at_work(mujoco: ModuleType, model: Any, injected: InjectedSimulatorTerms | None) -> Iterator[None]:
     """Let injected terms act inside MuJoCo while the block runs."""
     if injected is None:
         yield
@@ -323,7 +323,7 @@ def initialize_actuator_history(scene: MujocoScene, commands: Array) -> None:
             scene.mujoco.mj_initCtrlHistory(model, data, i, None, before)
 
 
-def settle_under_servos(scene: MujocoScene, damping: Array, commands: Array) -> None:
+def settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: Array) -> None:
     """Bring the scene to rest under constant servo commands, with `damping` increased meanwhile."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
@@ -356,7 +356,7 @@ def _calming(scene: MujocoScene, held: Any) -> Iterator[float]:
         scene.mujoco.mj_resetData(held, data)
         data.qpos[:], data.ctrl[:] = start, commands
         firm = held.eq_solref.copy()
-        held.eq_solref[:, 0] = np.maximum(firm[:, 0], 2 * DEFAULT_SIMULATOR_STEP)
+        held.eq_solref[:, 0] = np.maximum(firm[:, 0], 2 * DEFAULT_SIMULATOR_TIME_STEP)
         step(held, data, nstep=block)
         held.eq_solref[:] = firm
     for _ in range(math.ceil(_SETTLING_LIMIT / (block * held.opt.timestep))):

@@ -20,20 +20,20 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
 from yid_ocp.options import OptionInfo, PositiveFloat, check_option_bounds
 from yid_ocp.vision.camera_registration import (
+    CAMERA_STATE_SIZE,
     CLOCK_DRIFT_INDEX,
     CLOCK_OFFSET_INDEX,
     DEPTH_SCALE_INDEX,
-    MIN_ARM_POINTS,
+    MIN_ARM_POINTS_PER_FRAME,
     ROTATION_SLICE,
-    STATE_SIZE,
     TRANSLATION_SLICE,
     ArmSurface,
     CalibrationFrame,
     CameraState,
-    RobustCost,
+    QuadraticRobustCost,
     SurfaceVisibility,
-    evaluate_robust_cost,
     initial_camera_states,
+    quadratic_robust_cost,
     surface_visibility,
 )
 from yid_ocp.vision.point_cloud import weighted_median
@@ -91,7 +91,7 @@ class _StampDelay:
     mean_square_distance: float
 
 
-def estimate_stamp_delay(
+def estimate_excess_stamp_delay(
     arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
     """Delay of one frame's stamp [s] beyond the common offset, from world points (N, 3), the robot's among them [m].
@@ -99,17 +99,17 @@ def estimate_stamp_delay(
     None where the arm is not in view. Where the misfit is not much larger than the `usual` one of other frames [m^2],
     the offset is looked for nearby only.
     """
-    t, origin = float(state.to_joint_time(stamp)), state.pose[:3, 3]
+    t, origin = float(state.stamps_to_joint_clock(stamp)), state.pose[:3, 3]
     points = points[rng.permutation(len(points))[:_THIN]]
-    chosen = points[arm.is_near_surface(points, t, 2 * _OFF_ARM_DISTANCE)][:_POINTS]
-    if len(chosen) < MIN_ARM_POINTS:
+    chosen = points[arm.is_near_moving_surface(points, t, 2 * _OFF_ARM_DISTANCE)][:_POINTS]
+    if len(chosen) < MIN_ARM_POINTS_PER_FRAME:
         return None
     trial = _nearby(arm, origin, t, chosen, 0.0)
     if trial.mean_square_distance > _UNUSUAL * usual:
         steps = round(_FURTHEST / _COARSE)
         grid = _COARSE * np.arange(-steps, steps + 1)
         few = chosen[:_FEW_POINTS]
-        met = [arm.match_points(few, origin, t - delay, _OFF_ARM_DISTANCE, along=True) for delay in grid]
+        met = [arm.match_points_to_surface(few, origin, t - delay, _OFF_ARM_DISTANCE, along=True) for delay in grid]
         start = float(grid[int(np.argmin([_mean_square(one.normal_distance, len(few)) for one in met]))])
         if abs(start) > _LEAST_LATE:
             other = _nearby(arm, origin, t, chosen, start)
@@ -122,8 +122,8 @@ def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: floa
     x = np.array([start, 0.0, 0.0, 0.0])
     hessian, sigma = np.zeros((4, 4)), _OFF_ARM_DISTANCE
     for share in _NARROWING:
-        met = arm.match_points(points + x[1:], origin, t - x[0], share * _OFF_ARM_DISTANCE, along=True)
-        if len(met.normal_distance) < MIN_ARM_POINTS:
+        met = arm.match_points_to_surface(points + x[1:], origin, t - x[0], share * _OFF_ARM_DISTANCE, along=True)
+        if len(met.normal_distance) < MIN_ARM_POINTS_PER_FRAME:
             break
         sigma = max(_TO_SIGMA * float(np.median(np.abs(met.normal_distance))), _LEAST_SIGMA)
         slope = np.column_stack([met.normal_velocity, met.normal])
@@ -131,10 +131,10 @@ def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: floa
         hessian = slope.T @ slope + np.diag(prior) + 1e-9 * np.eye(4)
         step = -np.linalg.solve(hessian, slope.T @ met.normal_distance + prior * x)
         x += np.clip(step, -_LARGEST_CHANGE, _LARGEST_CHANGE)
-    error = arm.match_points(points + x[1:], origin, t - x[0], _OFF_ARM_DISTANCE, along=True).normal_distance
+    error = arm.match_points_to_surface(points + x[1:], origin, t - x[0], _OFF_ARM_DISTANCE, along=True).normal_distance
     on_arm = np.count_nonzero(np.abs(error) < _NARROWING[-1] * _OFF_ARM_DISTANCE)
     std = math.inf
-    if on_arm >= max(_SHARE * len(points), MIN_ARM_POINTS):
+    if on_arm >= max(_SHARE * len(points), MIN_ARM_POINTS_PER_FRAME):
         std = sigma * math.sqrt(_ALIKE * float(np.linalg.inv(hessian)[0, 0]))
     return _StampDelay(float(x[0]), std, _mean_square(error, len(points)))
 
@@ -156,8 +156,8 @@ def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], 
     return [i for (i, _), good in zip(known, near, strict=True) if good], usual
 
 
-def is_stamped_late(own: _StampDelay, options: CameraClockOptions) -> bool:
-    """Whether a frame's time stamp is significantly late."""
+def is_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) -> bool:
+    """Whether a frame's time stamp is significantly late or early, beyond the offset common to all frames."""
     return abs(own.delay) > max(options.max_stamp_delay, _LATE * own.std)
 
 
@@ -232,13 +232,13 @@ class CameraCalibration:
         """The camera's position, shape (3,) [m]."""
         return self.camera_state.pose[:3, 3]
 
-    def shared_point_std(self, points: Array, velocity: Array, stamps: Array) -> Array:
+    def point_std_from_calibration(self, points: Array, velocity: Array, stamps: Array) -> Array:
         """Standard deviations of points (N, 3) by the uncertain pose, depth and clock of the camera, (N, 3) [m].
 
         The same error for all of them, as far as they stand at one place; `velocity` (N, 3) [m/s], `stamps` (N,) [s].
         """
-        slopes = np.empty((len(points), 3, STATE_SIZE))
-        slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.point_jacobian(points)
+        slopes = np.empty((len(points), 3, CAMERA_STATE_SIZE))
+        slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.world_point_jacobian(points)
         # a point that is dated too early is where it came to be later
         slopes[:, :, CLOCK_OFFSET_INDEX] = velocity
         slopes[:, :, CLOCK_DRIFT_INDEX] = velocity * (stamps - self.camera_state.clock_reference_stamp)[:, None]
@@ -249,11 +249,11 @@ class CameraCalibration:
         return np.asarray(np.sqrt(variance + np.maximum(np.abs(beside), evenly) ** 2))
 
 
-def calibration_as_given(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
-    """Camera calibration taken from the frames and settings without estimation, with the reason."""
+def calibration_without_estimation(pose: Array, options: CameraClockOptions, reason: str = "") -> CameraCalibration:
+    """Camera calibration that takes the given pose and clock offset without estimation, with the reason."""
     text = f"clock offset {1e3 * options.initial_offset:.0f} ms as given" + (f": {reason}" if reason else "")
     state = CameraState(pose, clock_offset=options.initial_offset)
-    zero = np.zeros(STATE_SIZE)
+    zero = np.zeros(CAMERA_STATE_SIZE)
     return CameraCalibration(state, state, None, np.diag(zero), zero, None, 0, text)
 
 
@@ -281,7 +281,7 @@ def calibrate_camera(
         return _Calibrator(arm, told, rng, options, clock).run(glimpses)
     except _UntoldError as reason:
         if options.fix_pose and clock.search_half_width == 0:
-            return calibration_as_given(pose, clock, str(reason))
+            return calibration_without_estimation(pose, clock, str(reason))
         known = "track.options.calibration.fix_pose: true and track.options.clock.search_half_width: 0"
         hint = f"{reason.hint}; with pose and clock known, set {known}"
         raise DataError(f"the camera cannot be calibrated by the arm: {reason}", where=source, hint=hint) from None
@@ -326,7 +326,12 @@ class _Calibrator:
         for _ in range(2):  # once more without the frames that were stamped late
             state = self._rounds(state, chosen, _WIDE[-1], True, _FEW, _ROUNDS)[0]
             state, found, used = self._rounds(state, chosen, _REACH, True, _MANY, _LAST_ROUNDS)
-            own = [estimate_stamp_delay(self.arm, state, g.stamp, state.to_world(g.points), self.rng) for g in used]
+            own = [
+                estimate_excess_stamp_delay(
+                    self.arm, state, g.stamp, state.measured_to_world_points(g.points), self.rng
+                )
+                for g in used
+            ]
             on_time, usual = _find_on_time_frames(own)
             chosen = [used[i] for i in on_time]
             if len(chosen) < _LEAST_FRAMES:
@@ -347,7 +352,7 @@ class _Calibrator:
                 "record a livelier motion, or give the clock's offset with track.options.clock.initial_offset and "
                 "search_half_width: 0",
             )
-        used_state, beside = state, np.zeros(STATE_SIZE)
+        used_state, beside = state, np.zeros(CAMERA_STATE_SIZE)
         if self.options.fix_pose:
             used_state = replace(self.told, clock_offset=state.clock_offset, clock_drift=state.clock_drift)
             beside = state.difference_from(used_state)
@@ -357,13 +362,17 @@ class _Calibrator:
 
     def _about_the_arm(self, glimpse: CalibrationFrame) -> CalibrationFrame | None:
         """The points in the directions where the arm is, as far as told; None where it is out of view."""
-        own = self.told.to_measured(self.arm.visible_points(self.told, glimpse.stamp)[0])
+        own = self.told.world_to_measured_points(self.arm.visible_surface_points(self.told, glimpse.stamp)[0])
         points = glimpse.points[glimpse.points[:, 2] > 0]
-        if len(own) < MIN_ARM_POINTS or not len(points):
+        if len(own) < MIN_ARM_POINTS_PER_FRAME or not len(points):
             return None
         at, towards = points[:, :2] / points[:, 2:], own[:, :2] / own[:, 2:]
         kept = ((at > towards.min(axis=0) - _AROUND) & (at < towards.max(axis=0) + _AROUND)).all(axis=1)
-        return CalibrationFrame(glimpse.stamp, points[kept]) if np.count_nonzero(kept) >= MIN_ARM_POINTS else None
+        return (
+            CalibrationFrame(glimpse.stamp, points[kept])
+            if np.count_nonzero(kept) >= MIN_ARM_POINTS_PER_FRAME
+            else None
+        )
 
     def _thinned(self, glimpse: CalibrationFrame) -> CalibrationFrame:
         count = len(glimpse.points)
@@ -395,30 +404,30 @@ class _Calibrator:
         along: bool,
         most: int,
         rounds: int,
-    ) -> tuple[CameraState, RobustCost, list[CalibrationFrame]]:
+    ) -> tuple[CameraState, QuadraticRobustCost, list[CalibrationFrame]]:
         """The state after some steps on at most so many points of each frame, the sum there, and those points."""
         chosen = []
         for glimpse in glimpses:
-            points = state.to_world(glimpse.points)
-            t = float(state.to_joint_time(glimpse.stamp))
-            near = np.flatnonzero(self.arm.is_near_surface(points, t, 1.5 * reach))
+            points = state.measured_to_world_points(glimpse.points)
+            t = float(state.stamps_to_joint_clock(glimpse.stamp))
+            near = np.flatnonzero(self.arm.is_near_moving_surface(points, t, 1.5 * reach))
             if len(near) > most:
                 near = self.rng.choice(near, most, replace=False)
-            if len(near) >= MIN_ARM_POINTS:
+            if len(near) >= MIN_ARM_POINTS_PER_FRAME:
                 chosen.append(CalibrationFrame(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _LEAST_FRAMES:
             what = "what the camera sees does not lie on it"
             raise _UntoldError(what, "check the told pose and the unit of the clouds")
 
-        def cost(state: CameraState) -> RobustCost:
-            rows = [self.arm.calibration_equations(state, g, reach, along) for g in chosen]
-            return evaluate_robust_cost(rows, reach)
+        def cost(state: CameraState) -> QuadraticRobustCost:
+            rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]
+            return quadratic_robust_cost(rows, reach)
 
         for _ in range(rounds):
             hessian, gradient, _ = cost(state).weighted_normal_equations(self.precision)
             pull = gradient + self.precision @ state.difference_from(self.told)
             step = np.asarray(-np.linalg.solve(hessian + self.precision, pull), float)
-            state = state.with_change(step)
+            state = state.with_state_increment(step)
             if np.abs(step).max() < _SETTLED:
                 break
         return state, cost(state), chosen
@@ -432,11 +441,11 @@ class _Calibrator:
         drift = math.sqrt(covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX])
         if abs(state.clock_drift) > 2 * drift:
             words.append(f"its drift {1e3 * state.clock_drift:.2f} ms in a second ± {1e3 * drift:.2f}")
-        points = self.arm.visible_points(state, stamp)[0].mean(axis=0, keepdims=True)
-        away = np.linalg.norm(state.to_world(self.told.to_measured(points)) - points)
+        points = self.arm.visible_surface_points(state, stamp)[0].mean(axis=0, keepdims=True)
+        away = np.linalg.norm(state.measured_to_world_points(self.told.world_to_measured_points(points)) - points)
         change = state.difference_from(self.told)
         if away > _NOTED and self.options.fix_pose:
-            slopes = state.point_jacobian(points)[0]
+            slopes = state.world_point_jacobian(points)[0]
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
             if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTED**2 * 3:

@@ -41,8 +41,8 @@ from yid_ocp.vision.surface_meshes import ArticulatedSurfaces
 ROTATION_SLICE, TRANSLATION_SLICE = slice(0, 3), slice(3, 6)
 DEPTH_SCALE_INDEX, DEPTH_OFFSET_INDEX, CLOCK_OFFSET_INDEX, CLOCK_DRIFT_INDEX = 6, 7, 8, 9
 """Positions of the parts of a `CameraState` change in its vector."""
-STATE_SIZE = 10
-MIN_ARM_POINTS = 40
+CAMERA_STATE_SIZE = 10
+MIN_ARM_POINTS_PER_FRAME = 40
 """Fewest points of the arm in a usable frame."""
 
 # through which the robot's visible surface is sampled
@@ -74,25 +74,25 @@ class CameraState:
     clock_drift: float = 0.0  # growth of that per second, beta
     clock_reference_stamp: float = 0.0  # s0 [s]
 
-    def to_world(self, points: Array) -> Array:
-        """Measured points in the world, both shape (N, 3) [m]."""
+    def measured_to_world_points(self, points: Array) -> Array:
+        """Measured points of the camera's frame transformed to the world, both shape (N, 3) [m]."""
         placed = np.asarray(points @ self.pose[:3, :3].T)
         if self.depth_scale != 1.0 or self.depth_offset != 0.0:
             placed *= (self.depth_scale + self.depth_offset / points[:, 2])[:, None]
         placed += self.pose[:3, 3]
         return placed
 
-    def to_measured(self, points: Array) -> Array:
+    def world_to_measured_points(self, points: Array) -> Array:
         """World points as the camera would measure them, both shape (N, 3) [m]."""
         own = (points - self.pose[:3, 3]) @ self.pose[:3, :3]
         return np.asarray(own * ((1.0 - self.depth_offset / own[:, 2:3]) / self.depth_scale))
 
-    def to_joint_time(self, stamp: ArrayLike) -> Array:
-        """Time on the joints' clock of stamps [s]."""
+    def stamps_to_joint_clock(self, stamp: ArrayLike) -> Array:
+        """Camera time stamps converted to the clock of the joint recording [s]."""
         at = np.asarray(stamp, float)
         return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
 
-    def point_jacobian(self, points: Array) -> Array:
+    def world_point_jacobian(self, points: Array) -> Array:
         """Jacobian of world points, shape (N, 3), with respect to pose and depth, shape (N, 3, 8)."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
@@ -105,7 +105,7 @@ class CameraState:
         result[:, :, DEPTH_OFFSET_INDEX] = away / ahead[:, None]
         return result
 
-    def with_change(self, change: Array) -> CameraState:
+    def with_state_increment(self, change: Array) -> CameraState:
         """State after a change: rotation (world axes), translation, log depth scale, depth and clock offset, drift."""
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
@@ -164,26 +164,28 @@ class ArmSurface:
         return np.array([joint >= 0 for joint in self.robot_surfaces.part_joints])
 
     def part_poses_at(self, t: float) -> Array:
-        """Poses of the parts, shape (parts, 4, 4)."""
+        """World poses of the robot's surface parts at a time [s], shape (parts, 4, 4)."""
         return self.robot_surfaces.part_poses_at(self.configuration_at(t))
 
-    def visible_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
+    def visible_surface_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
         """Points of moving surfaces that the camera sees if nothing is before the robot, in the world; their parts."""
-        q = self.configuration_at(float(state.to_joint_time(stamp)))
+        q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_image(_LOOK, state.pose, q)
         seen = np.isfinite(depth) & (cosine > _GRAZING) & (part >= 0) & self._moving[part]
         points = _LOOK.pixel_rays[seen] * depth[seen][:, None]
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
 
-    def is_near_surface(self, points: Array, t: float, within: float) -> BoolArray:
+    def is_near_moving_surface(self, points: Array, t: float, within: float) -> BoolArray:
         """Whether world points are near a moving surface and not near a grasp."""
         q = self.configuration_at(t)
-        result = self.robot_surfaces.is_within_distance(points, q, within, moving_only=True)
+        result = self.robot_surfaces.is_within_surface_distance(points, q, within, moving_only=True)
         for held in self.grasp_positions_at(q):
             result &= np.linalg.norm(points - held, axis=1) > self.grasp_exclusion_radius
         return np.asarray(result)
 
-    def match_points(self, points: Array, origin: Array, t: float, reach: float, along: bool) -> _SurfaceMatches:
+    def match_points_to_surface(
+        self, points: Array, origin: Array, t: float, reach: float, along: bool
+    ) -> _SurfaceMatches:
         """Matches of world points to the arm's surface, along camera rays or at the nearest surface."""
         q = self.configuration_at(t)
         if along:
@@ -206,14 +208,16 @@ class ArmSurface:
         rate = np.einsum("ni,ni->n", normal[chosen], velocity)
         return _SurfaceMatches(chosen, error, normal[chosen], rate, part[chosen], local)
 
-    def calibration_equations(
+    def linearized_surface_distances(
         self, state: CameraState, glimpse: CalibrationFrame, reach: float, along: bool
     ) -> _CalibrationEquations:
-        """Linearised equations of a frame's points within reach of the arm."""
-        points = state.to_world(glimpse.points)
-        met = self.match_points(points, state.pose[:3, 3], float(state.to_joint_time(glimpse.stamp)), reach, along)
-        slope = np.empty((len(met.point_indices), STATE_SIZE))
-        by_camera = state.point_jacobian(points[met.point_indices])
+        """Distances of a frame's points from the arm's surface, linearised in the camera state."""
+        points = state.measured_to_world_points(glimpse.points)
+        met = self.match_points_to_surface(
+            points, state.pose[:3, 3], float(state.stamps_to_joint_clock(glimpse.stamp)), reach, along
+        )
+        slope = np.empty((len(met.point_indices), CAMERA_STATE_SIZE))
+        by_camera = state.world_point_jacobian(points[met.point_indices])
         slope[:, :CLOCK_OFFSET_INDEX] = np.einsum("ni,nij->nj", met.normal, by_camera)
         # a later offset takes the surface back along its velocity, away from the point
         slope[:, CLOCK_OFFSET_INDEX] = met.normal_velocity
@@ -235,7 +239,7 @@ class _SurfaceMatches:
 
 
 @dataclass(frozen=True, eq=False)
-class RobustCost:
+class QuadraticRobustCost:
     """Quadratic model of the robust cost at a camera state."""
 
     gradient: Array  # (10,)
@@ -250,7 +254,7 @@ class RobustCost:
         scale = 1.0 / np.sqrt(np.diag(self.hessian) + np.diag(precision))
         whole = (self.hessian + 1e-6 * precision) * np.outer(scale, scale)
         excess = np.linalg.solve(whole, self.score_covariance * np.outer(scale, scale))
-        weight = 1.0 / max(1.0, float(np.trace(excess)) / STATE_SIZE)
+        weight = 1.0 / max(1.0, float(np.trace(excess)) / CAMERA_STATE_SIZE)
         return weight * self.hessian, weight * self.gradient, weight
 
     def state_covariance(self, precision: Array) -> Array:
@@ -260,12 +264,12 @@ class RobustCost:
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 
 
-def evaluate_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCost:
+def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -> QuadraticRobustCost:
     """Robust cost over all points of all frames, scaled by their median error."""
     size = np.abs(np.concatenate([r.residuals for r in rows]))
     sigma = max(_TO_SIGMA * float(np.median(size)) if len(size) else reach, _LEAST_SIGMA)
     scale = min(_CUT * sigma, reach)
-    gradient, (hessian, blocks) = np.zeros(STATE_SIZE), np.zeros((2, STATE_SIZE, STATE_SIZE))
+    gradient, (hessian, blocks) = np.zeros(CAMERA_STATE_SIZE), np.zeros((2, CAMERA_STATE_SIZE, CAMERA_STATE_SIZE))
     scores, bent, straight = [], 0.0, 0.0
     for r in rows:
         square = (r.residuals / scale) ** 2
@@ -282,13 +286,13 @@ def evaluate_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) ->
         patch = np.unique(np.concatenate([r.patch_indices for r in rows]), axis=0, return_inverse=True)[1].ravel()
 
         def summed(group: IntArray) -> Array:
-            totals = np.stack([np.bincount(group, stacked[:, k]) for k in range(STATE_SIZE)], axis=1)
+            totals = np.stack([np.bincount(group, stacked[:, k]) for k in range(CAMERA_STATE_SIZE)], axis=1)
             return np.asarray(totals.T @ totals)
 
         both = summed(frame * (patch.max() + 1) + patch)
         blocks = _at_least(both, summed(frame) + summed(patch) - both)
     curvature = max(bent / max(straight, 1e-12), _LEAST_CURVATURE)
-    return RobustCost(gradient, hessian, curvature, blocks)
+    return QuadraticRobustCost(gradient, hessian, curvature, blocks)
 
 
 def _at_least(least: Array, matrix: Array) -> Array:
@@ -316,11 +320,11 @@ def initial_camera_states(
     result: list[CameraState] = []
     for index in np.argsort(total, axis=None):
         delay, cell = np.unravel_index(index, total.shape)
-        change = np.zeros(STATE_SIZE)
+        change = np.zeros(CAMERA_STATE_SIZE)
         # the cloud has to go where the surface was, and the surface went along the cells
         change[TRANSLATION_SLICE] = -told.pose[:3, :3] @ (_CELL * cells[cell])
         change[CLOCK_OFFSET_INDEX] = delays[delay]
-        trial = told.with_change(change)
+        trial = told.with_state_increment(change)
         between = [trial.difference_from(other) for other in result]
         apart = [np.linalg.norm(d[TRANSLATION_SLICE]) + 0.5 * abs(d[CLOCK_OFFSET_INDEX]) for d in between]
         if min(apart, default=math.inf) >= _APART:
@@ -337,13 +341,13 @@ def _add_costs(
 
     Added to `total` (delays, cells); nothing where the camera would see too little of the arm.
     """
-    points, part = arm.visible_points(told, glimpse.stamp)
-    own = told.to_measured(points)
+    points, part = arm.visible_surface_points(told, glimpse.stamp)
+    own = told.world_to_measured_points(points)
     at = glimpse.points[:, :2] / glimpse.points[:, 2:]
     view = np.array([at.min(axis=0), at.max(axis=0)])
     towards = own[:, :2] / own[:, 2:]
     chosen = np.flatnonzero(((towards >= view[0]) & (towards <= view[1])).all(axis=1))
-    if len(chosen) < MIN_ARM_POINTS:
+    if len(chosen) < MIN_ARM_POINTS_PER_FRAME:
         return
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLES)).astype(np.int64)]
     points, part, own = points[chosen], part[chosen], own[chosen]
@@ -364,13 +368,13 @@ def _add_costs(
     distance = distance_transform_edt(empty, sampling=_CELL)
     cost = np.where(outside, _HIDDEN, (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2)
     flat = cost.astype(np.float32).ravel()
-    t = float(told.to_joint_time(glimpse.stamp))
+    t = float(told.stamps_to_joint_clock(glimpse.stamp))
     before = arm.part_poses_at(t)[part]
     local = np.einsum("nji,nj->ni", before[:, :3, :3], points - before[:, :3, 3])
     edge, strides = np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD]), np.array([shape[1] * shape[2], shape[2], 1])
     for row, delay in zip(total, delays, strict=True):
         then = arm.part_poses_at(t - delay)[part]
-        own = told.to_measured(np.einsum("nij,nj->ni", then[:, :3, :3], local) + then[:, :3, 3])
+        own = told.world_to_measured_points(np.einsum("nij,nj->ni", then[:, :3, :3], local) + then[:, :3, 3])
         index = np.clip(np.floor((own - low) / _CELL).astype(np.int64), edge, shape - 1 - edge)
         row += flat[(index @ strides)[None, :] + (cells @ strides)[:, None]].mean(axis=1)
 
@@ -393,8 +397,8 @@ def surface_visibility(
     """Fractions of the arm's visible surface that have a point of the frames within a distance [m], or have none."""
     counts = np.zeros(4)
     for glimpse in glimpses:
-        points, _ = arm.visible_points(state, glimpse.stamp)
-        own, (places, rays) = state.to_measured(points), glimpse._trees
+        points, _ = arm.visible_surface_points(state, glimpse.stamp)
+        own, (places, rays) = state.world_to_measured_points(points), glimpse._trees
         away, _ = places.query(own, distance_upper_bound=within)
         # as wide as the gaps between points of a cloud that was thinned
         apart, index = rays.query(own[:, :2] / own[:, 2:], distance_upper_bound=0.015)

@@ -26,22 +26,22 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.system import System
-from yid_ocp.options import Fraction, OptionInfo, PositiveFloat, check_option_bounds
-from yid_ocp.vision.initial_shapes import EndAnchor, InitialShapeFinder
+from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
+from yid_ocp.vision.initial_shapes import InitialShapeFinder, ObservedObjectEnd
 from yid_ocp.vision.shape_evidence import (
-    CloudObservation,
-    DimensionEquations,
     FrameShapeFit,
-    ShapeEvidence,
-    ShapeQuality,
+    ProcessedFrameCloud,
+    ShapeFitQuality,
+    ShapePointClassification,
+    TubeDimensionCost,
     TubeLinks,
-    assess_shape,
+    assess_shape_against_cloud,
     line_of_sight_residuals,
-    nearest_on_tubes,
+    nearest_points_on_tubes,
     nearest_surface_residuals,
-    tube_like_nodes_and_points,
+    tube_like_node_point_masks,
 )
-from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_sizes
+from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_link_lengths_and_radii
 
 _Left = tuple[BoolArray, BoolArray]
 """Which of a frame's nodes and points count."""
@@ -93,11 +93,12 @@ class ShapeFitOptions:
     max_iterations: Annotated[int, Ge(1), OptionInfo("at most so many in a pass")] = 25
     max_point_weight: Annotated[PositiveFloat, OptionInfo("a point counts at most for so many of the camera's")] = 6.0
     min_link_coverage: Annotated[
-        Fraction,
+        UnitIntervalFloat,
         OptionInfo("a link with points along a smaller fraction of its length is hidden, or not where the fit has it"),
     ] = 0.5
     min_tube_coverage: Annotated[
-        Fraction, OptionInfo("a tube with points on a smaller share of its visible length is not where the fit has it")
+        UnitIntervalFloat,
+        OptionInfo("a tube with points on a smaller share of its visible length is not where the fit has it"),
     ] = 0.75
 
     def __post_init__(self) -> None:
@@ -109,8 +110,8 @@ class ShapeFitOptions:
 class ShapeFitter:
     """Fitter of the shape of a system's object to a camera's points, at parameter values; nominal where absent.
 
-    Beside the bends, `loose` joints are sought with next to no prior: see `initial_shapes.with_free_root`. `DataError`
-    for a system without an object.
+    Beside the bends, `loose` joints are sought with next to no prior: see `initial_shapes.system_with_free_root`.
+    `DataError` for a system without an object.
     """
 
     def __init__(
@@ -145,7 +146,7 @@ class ShapeFitter:
         sought = {*(entry.joint_name for entry in system.elastic_joints), *loose}
         self.recorded_joint_names = tuple(name for name in tree.joint_names if name not in sought)
 
-        sizes = tube_sizes(system, values)
+        sizes = tube_link_lengths_and_radii(system, values)
         self.link_radii = np.concatenate([np.full(len(lengths), radius) for lengths, radius in sizes.values()])
         self.link_segments = tuple(name for name, (lengths, _) in sizes.items() for _ in lengths)
         q, numbers = ca.SX.sym("q", system.n_coordinates), ca.SX(ca.DM(theta))
@@ -182,7 +183,7 @@ class ShapeFitter:
         """Start and end of every link, shape (K, 2, 3) [m]."""
         return np.array(self._corners(q)[0]).reshape(-1, 2, 3)
 
-    def fit_frame(self, sight: CloudObservation, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
+    def fit_frame(self, sight: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
         """Fit the shape in one frame, with the robot's part of a configuration (n,) and from starts of the object's.
 
         The passes on the nodes, which cost little, run from all starts (rest where absent), the others from the best
@@ -198,7 +199,7 @@ class ShapeFitter:
         for trial, start in zip(begun, starts or (self.rest_configuration,), strict=True):
             trial[free] = start[free]
         everything = np.ones(len(sight.skeleton_nodes), bool), np.ones(len(sight.points), bool)
-        thin = tube_like_nodes_and_points(sight, float(self.link_radii.max()))
+        thin = tube_like_node_point_masks(sight, float(self.link_radii.max()))
         best, evidence = self._attempt(sight, begun, thin if thin[0].any() and thin[1].any() else everything)
         for left in (self._without(best, evidence, sight, self._links_of(self._failed(evidence))), everything):
             failed = self._failed(evidence)
@@ -207,7 +208,9 @@ class ShapeFitter:
             # a part of the object is not where this has it: something like it stood nearer to where the search began
             if left[0].any() and left[1].any():
                 other = self._attempt(sight, [self._rested(best.q, failed), *begun], left)
-                best, evidence = max((best, evidence), other, key=lambda found: found[1].coverage(self._lengths))
+                best, evidence = max(
+                    (best, evidence), other, key=lambda found: found[1].length_weighted_coverage(self._lengths)
+                )
         return self._judged(best, evidence, self._rivals(best, evidence, sight), sight)
 
     def _rested(self, q: Array, tubes: Collection[str]) -> Array:
@@ -220,12 +223,12 @@ class ShapeFitter:
     def _links_of(self, tubes: Collection[str]) -> BoolArray:
         return np.array([owner in tubes for owner in self.link_segments])
 
-    def _rivals(self, best: _Minimum, evidence: ShapeEvidence, sight: CloudObservation) -> list[Array]:
+    def _rivals(self, best: _Minimum, evidence: ShapePointClassification, sight: ProcessedFrameCloud) -> list[Array]:
         """Other shapes that the cloud speaks for as much, where a thing touches a tube."""
         if not evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
-        tubes = self.tubes_at(best.q)
-        touched = nearest_on_tubes(tubes.link_ends, tubes.radius, sight.points[evidence.is_contested])[0]
+        tubes = self.tube_links_at(best.q)
+        touched = nearest_points_on_tubes(tubes.link_ends, tubes.radius, sight.points[evidence.is_contested])[0]
         found = []
         for name in dict.fromkeys(self.link_segments[k] for k in sorted(set(touched.tolist()))):
             mine = self._links_of({name})
@@ -237,25 +240,29 @@ class ShapeFitter:
                     found.append(rival.q)
         return found
 
-    def _failed(self, evidence: ShapeEvidence) -> set[str]:
+    def _failed(self, evidence: ShapePointClassification) -> set[str]:
         """Tubes of which too much is seen to be empty."""
         failed = set()
         for name in dict.fromkeys(self.link_segments):
             mine = self._lengths * self._links_of({name})
             empty = float(mine @ evidence.visibly_empty_fraction) > 0
-            if empty and evidence.coverage(mine) < self.options.min_tube_coverage:
+            if empty and evidence.length_weighted_coverage(mine) < self.options.min_tube_coverage:
                 failed.add(name)
         return failed
 
-    def _without(self, best: _Minimum, evidence: ShapeEvidence, sight: CloudObservation, links: BoolArray) -> _Left:
+    def _without(
+        self, best: _Minimum, evidence: ShapePointClassification, sight: ProcessedFrameCloud, links: BoolArray
+    ) -> _Left:
         """All nodes and points but those on which some links lie."""
-        tubes, nodes = self.tubes_at(best.q), sight.skeleton_nodes
-        link = nearest_on_tubes(tubes.link_ends, tubes.radius, sight.points)[0]
+        tubes, nodes = self.tube_links_at(best.q), sight.skeleton_nodes
+        link = nearest_points_on_tubes(tubes.link_ends, tubes.radius, sight.points)[0]
         wrong = links[link] & (evidence.is_own | evidence.is_contested)
-        node_link, _, _, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
+        node_link, _, _, distance = nearest_points_on_tubes(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
         return ~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong
 
-    def _attempt(self, sight: CloudObservation, starts: Sequence[Array], left: _Left) -> tuple[_Minimum, ShapeEvidence]:
+    def _attempt(
+        self, sight: ProcessedFrameCloud, starts: Sequence[Array], left: _Left
+    ) -> tuple[_Minimum, ShapePointClassification]:
         """The best shape through some of the nodes and points, then through those that are surely its own."""
         on_nodes, on_points = self._tasks(sight, *left)
         unit = np.eye(len(self.free_joints))
@@ -263,20 +270,22 @@ class ShapeFitter:
         best = min(tried, key=lambda minimum: minimum.cost)
         last = self._minimise(best, on_points)
         iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
-        evidence = assess_shape(self.tubes_at(last.q), sight, self.max_informative_distance)
+        evidence = assess_shape_against_cloud(self.tube_links_at(last.q), sight, self.max_informative_surface_distance)
         keep = ~(evidence.is_contested | evidence.is_foreign)
         if on_points and keep.any():
             last = self._minimise(last, self._tasks(sight, left[0], keep)[1])
-            evidence = assess_shape(self.tubes_at(last.q), sight, self.max_informative_distance)
+            evidence = assess_shape_against_cloud(
+                self.tube_links_at(last.q), sight, self.max_informative_surface_distance
+            )
         return replace(last, iterations=iterations + last.iterations), evidence
 
     @property
-    def max_informative_distance(self) -> float:
+    def max_informative_surface_distance(self) -> float:
         """Distance from the surface beyond which a point says nothing of the shape [m]."""
         return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _NEAR
 
     def _tasks(
-        self, sight: CloudObservation, at_nodes: BoolArray, at_points: BoolArray
+        self, sight: ProcessedFrameCloud, at_nodes: BoolArray, at_points: BoolArray
     ) -> tuple[list[_Task], list[_Task]]:
         """The passes on the nodes and those on the points."""
         options, camera = self.options, sight.camera_position
@@ -315,7 +324,7 @@ class ShapeFitter:
         return end
 
     def _judged(
-        self, best: _Minimum, evidence: ShapeEvidence, rivals: Sequence[Array], sight: CloudObservation
+        self, best: _Minimum, evidence: ShapePointClassification, rivals: Sequence[Array], sight: ProcessedFrameCloud
     ) -> FrameShapeFit:
         """The shape with its standard deviations, and what speaks for and against it."""
         q, on_shape = best.q, evidence.is_own | evidence.is_contested
@@ -350,7 +359,7 @@ class ShapeFitter:
         held = {grasp.held_frame for grasp in self.system.grasps}
         seen = (touching & sure[:, None]).any(axis=0) | np.array([name in held for name in self.system.point_frames])
         return FrameShapeFit(
-            **{entry.name: getattr(evidence, entry.name) for entry in fields(ShapeQuality)},
+            **{entry.name: getattr(evidence, entry.name) for entry in fields(ShapeFitQuality)},
             q=q,
             point_positions=places,
             point_std=np.sqrt(np.maximum(spread, 0.0) + moved**2 + swath**2 + off_end**2),
@@ -399,11 +408,11 @@ class ShapeFitter:
         return LocalQuadraticModel(cost, gradient, hessian)
 
     def initial_shape_finder(self) -> InitialShapeFinder:
-        """Finder of initial shapes for a system with a free root (`initial_shapes.with_free_root`)."""
+        """Finder of initial shapes for a system with a free root (`initial_shapes.system_with_free_root`)."""
         lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
         return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
 
-    def _size_rows(self, q: Array, task: _Task | None, evidence: ShapeEvidence) -> DimensionEquations:
+    def _size_rows(self, q: Array, task: _Task | None, evidence: ShapePointClassification) -> TubeDimensionCost:
         """What a frame's points say of lengths and radii at its shape."""
         names = [segment.name for segment in self.system.segment_layouts]
         free, many = len(self.free_joints), len(names)
@@ -447,9 +456,9 @@ class ShapeFitter:
         curvature = hessian[free:, free:] - hessian[free:, :free] @ follow[:, 1:]
         moved = np.hstack([seen_by_length, np.zeros((len(seen_by_length), many))])
         moved = moved - np.array(self._seen(q)[1]) @ follow[:, 1:]
-        return DimensionEquations(pull, curvature, moved.reshape(-1, 3, 2 * many))
+        return TubeDimensionCost(pull, curvature, moved.reshape(-1, 3, 2 * many))
 
-    def tubes_at(self, q: Array) -> TubeLinks:
+    def tube_links_at(self, q: Array) -> TubeLinks:
         """Tube links in the world at a configuration."""
         return TubeLinks(self._links_at(q), self.link_radii, self.free_end_links, self._tube_lengths)
 
@@ -481,7 +490,7 @@ class _Task:
     share: float
     scale: float
     camera: Array
-    anchors: Sequence[EndAnchor]
+    anchors: Sequence[ObservedObjectEnd]
 
 
 def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOptions) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
@@ -494,7 +503,7 @@ def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOption
             corners += [start, kinematics.frame_position(f"{segment.name}_{i}_tip")]
     rows, gaps = [ca.SX(0, 1)], [ca.SX(0, 1)]
     for grasp in system.grasps:
-        residual, alignment = grasp.constraint_residual(kinematics), grasp.axis_misalignment(kinematics)
+        residual, alignment = grasp.constraint_residual(kinematics), grasp.aligned_axis_differences(kinematics)
         gaps.append(residual[:3])
         rows.append(residual[:3] / options.grasp_position_std)
         if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, OutputError, unknown_name_details
 from yid_ocp.files import atomic_write, is_file, write_text
-from yid_ocp.vision.frames import CameraIntrinsics, Colours, FrameSequence, import_open3d, validated_pose
+from yid_ocp.vision.frames import CameraIntrinsics, ColourArray, FrameSequence, import_open3d, validated_camera_pose
 
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
 _DEPTH_IMAGE_SUFFIX = ".png"
@@ -36,7 +36,7 @@ _LARGEST_DEPTH = 65.535  # [m]; what sixteen bits of millimetres hold
 _AGAIN = "copy or record it again"
 
 
-def _read_cloud(path: Path, coloured: bool = False) -> tuple[Array, Colours | None]:
+def _read_cloud(path: Path, coloured: bool = False) -> tuple[Array, ColourArray | None]:
     """Points of a cloud in the file's unit, and their red, green and blue where asked for and there, both (N, 3)."""
     if not is_file(path):
         raise DataError("the file of the cloud is missing", where=str(path))
@@ -49,7 +49,7 @@ def _read_cloud(path: Path, coloured: bool = False) -> tuple[Array, Colours | No
     return points, colours
 
 
-def _read_npz(path: Path) -> tuple[Array, Colours | None]:
+def _read_npz(path: Path) -> tuple[Array, ColourArray | None]:
     allowed = f"the array `{_POINTS_ARRAY}` of numbers, shape (N, 3), and `{_COLOURS_ARRAY}` of whole numbers"
     allowed += " from 0 to 255 if wanted"
     try:
@@ -65,7 +65,7 @@ def _read_npz(path: Path) -> tuple[Array, Colours | None]:
     return points.astype(np.float64), colours
 
 
-def _read_xyz(path: Path) -> tuple[Array, Colours | None]:
+def _read_xyz(path: Path) -> tuple[Array, ColourArray | None]:
     try:
         with warnings.catch_warnings():  # of an empty file, which is said below
             warnings.simplefilter("ignore", UserWarning)
@@ -79,7 +79,7 @@ def _read_xyz(path: Path) -> tuple[Array, Colours | None]:
     return rows[:, :3].copy(), seen.astype(np.uint8) if coloured else None
 
 
-def _read_pcd(path: Path) -> tuple[Array, Colours | None]:
+def _read_pcd(path: Path) -> tuple[Array, ColourArray | None]:
     o3d = import_open3d()
     with path.open("rb") as file:
         declared = _COUNT.search(file.read(_PCD_HEADER_BYTES))
@@ -125,7 +125,7 @@ _Element = tuple[str, int, list[tuple[str, str]]]
 """A table of a PLY file: its name, its number of rows, its columns with NumPy's names of their types, "" for lists."""
 
 
-def _read_ply(path: Path, coloured: bool) -> tuple[Array, Colours | None]:
+def _read_ply(path: Path, coloured: bool) -> tuple[Array, ColourArray | None]:
     """Positions and colours of the vertices; other properties and later elements are left out."""
     try:
         data = path.read_bytes()
@@ -177,7 +177,7 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
 
 def _vertices(
     path: Path, count: int, columns: Sequence[tuple[str, str]], order: str, body: bytes, coloured: bool
-) -> tuple[Array, Colours | None]:
+) -> tuple[Array, ColourArray | None]:
     names, kinds = [name for name, _ in columns], [kind for _, kind in columns]
     if len(set(names)) < len(names) or not set(_AXIS_PROPERTIES) <= set(names) or "" in kinds:
         raise _damaged(path, "its vertices have no x, y and z, or lists")
@@ -204,7 +204,7 @@ def _vertices(
 
 _FRAMES_FORMAT = "yid-frames/1"
 _CAMERA_FILE, STAMP_FILE = "camera.json", "timestamps.csv"
-METRES_PER_UNIT: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
+METRES_PER_LENGTH_UNIT: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
 """Allowed units of clouds and their size in metres."""
 
 _KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_unit", "description")
@@ -230,10 +230,10 @@ def read_frame_folder(
         raise DataError("there is no such folder of frames", where=str(path), hint="check the path")
     head = _read_camera(path / _CAMERA_FILE)
     where = str(path / _CAMERA_FILE)
-    camera = validated_pose(head.get("pose") if pose is None else pose, where)
+    camera = validated_camera_pose(head.get("pose") if pose is None else pose, where)
     given = str(unit or head.get("unit", "m"))
-    if given not in METRES_PER_UNIT:
-        raise DataError(f"the unit is '{given}'", where=where, **unknown_name_details(given, METRES_PER_UNIT))
+    if given not in METRES_PER_LENGTH_UNIT:
+        raise DataError(f"the unit is '{given}'", where=where, **unknown_name_details(given, METRES_PER_LENGTH_UNIT))
     frame = head.get("frame", "camera")
     if frame not in ("camera", "world"):
         raise DataError(f"the frame of the clouds is '{frame}'", where=where, allowed="camera, world")
@@ -247,10 +247,10 @@ def read_frame_folder(
         if file.suffix.lower() == _DEPTH_IMAGE_SUFFIX:
             assert intrinsics is not None
             return intrinsics.points_from_depth(_read_depth_image(file) * depth_unit)
-        points = _read_cloud(file)[0] * METRES_PER_UNIT[given]
+        points = _read_cloud(file)[0] * METRES_PER_LENGTH_UNIT[given]
         return (points - camera[:3, 3]) @ camera[:3, :3] if frame == "world" else points
 
-    def colours(index: int) -> Colours | None:
+    def colours(index: int) -> ColourArray | None:
         return None if names[index].lower().endswith(_DEPTH_IMAGE_SUFFIX) else _read_cloud(path / names[index], True)[1]
 
     return FrameSequence(times, names, camera, load, intrinsics, str(path), colours)

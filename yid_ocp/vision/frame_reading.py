@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.readers.bags import JOINT_STATE, BagMessage, OpenBag, bag_clock
+from yid_ocp.data.readers.bags import JOINT_STATE_MESSAGE_TYPE, BagMessage, OpenBag, relative_message_time_function
 from yid_ocp.errors import DataError, unknown_name_details
-from yid_ocp.vision.frame_folder import METRES_PER_UNIT, STAMP_FILE, read_frame_folder
-from yid_ocp.vision.frames import CameraIntrinsics, Colours, FrameSequence, import_open3d, validated_pose
+from yid_ocp.vision.frame_folder import METRES_PER_LENGTH_UNIT, STAMP_FILE, read_frame_folder
+from yid_ocp.vision.frames import CameraIntrinsics, ColourArray, FrameSequence, import_open3d, validated_camera_pose
 
 _CLOUD_MESSAGE, _IMAGE_MESSAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
 _CAMERA_INFO_MESSAGE = "sensor_msgs/msg/CameraInfo"
@@ -33,25 +33,25 @@ _PER_METRE = "/option/Depth_Units/value"  # topic of RealSense's files with the 
 
 def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str | None) -> FrameSequence:
     """Open the frames in a bag."""
-    camera = validated_pose(pose, f"{path}: give track.camera_pose")
+    camera = validated_camera_pose(pose, f"{path}: give track.camera_pose")
     bag = OpenBag(path)
-    if unit not in METRES_PER_UNIT:
-        raise DataError(f"the unit is '{unit}'", where=str(path), **unknown_name_details(unit, METRES_PER_UNIT))
+    if unit not in METRES_PER_LENGTH_UNIT:
+        raise DataError(f"the unit is '{unit}'", where=str(path), **unknown_name_details(unit, METRES_PER_LENGTH_UNIT))
     name = _topic(bag, topic)
     messages, stamps = _frames(bag, name)
     if not messages:
         raise DataError(f"there is no message on the topic '{name}'", where=str(path))
-    is_cloud = name in bag.topics_of(_CLOUD_MESSAGE)
+    is_cloud = name in bag.topic_names_of_types(_CLOUD_MESSAGE)
     lens, per_metre = (None, 1.0) if is_cloud else (_lens(bag, name), _depth_unit(bag, name))
     where = f"{path}: {name}"
 
     def load(index: int) -> Array:
         content = _decoded(bag, messages[index])
         if lens is None:
-            return _points(content, where) * METRES_PER_UNIT[unit]
+            return _points(content, where) * METRES_PER_LENGTH_UNIT[unit]
         return lens.points_from_depth(_depth(content, per_metre, where))
 
-    def colours(index: int) -> Colours | None:
+    def colours(index: int) -> ColourArray | None:
         return None if lens is not None else _colours(_decoded(bag, messages[index]), where)
 
     names = tuple(f"{name} {i}" for i in range(len(messages)))
@@ -61,17 +61,17 @@ def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str |
 def _frames(bag: OpenBag, topic: str) -> tuple[list[BagMessage], Array]:
     """Messages of a topic, each with its connection and how many of its time stand before it, and their times [s]."""
     frames: list[BagMessage] = []
-    with bag.reading():
+    with bag.read_errors_as_data_errors():
         for connection, logged, data in bag.reader.messages([c for c in bag.reader.connections if c.topic == topic]):
             before = sum(1 for frame in reversed(frames[-8:]) if frame.logged == logged)
             frames.append(BagMessage(topic, logged, _stamp(bag, data), (connection, before)))
         joints = [
             BagMessage(connection.topic, logged, _stamp(bag, data), None)
             for connection in bag.reader.connections
-            if connection.msgtype == JOINT_STATE
+            if connection.msgtype == JOINT_STATE_MESSAGE_TYPE
             for _, (_, logged, data) in zip(range(1), bag.reader.messages([connection]), strict=False)
         ]
-    return frames, np.array(list(map(bag_clock(frames, joints), frames)))
+    return frames, np.array(list(map(relative_message_time_function(frames, joints), frames)))
 
 
 def _stamp(bag: OpenBag, data: bytes) -> int:
@@ -84,7 +84,7 @@ def _stamp(bag: OpenBag, data: bytes) -> int:
 def _decoded(bag: OpenBag, message: BagMessage) -> Any:
     """Contents of a message."""
     connection, before = message.content
-    with bag.reading():
+    with bag.read_errors_as_data_errors():
         found = bag.reader.messages([connection], start=message.logged, stop=message.logged + 1)
         for number, (_, _, data) in enumerate(found):
             if number == before:
@@ -94,7 +94,7 @@ def _decoded(bag: OpenBag, message: BagMessage) -> Any:
 
 def _first(bag: OpenBag, topic: str) -> Any:
     """Contents of the first message of a topic."""
-    with bag.reading():
+    with bag.read_errors_as_data_errors():
         for connection, _, data in bag.reader.messages([c for c in bag.reader.connections if c.topic == topic]):
             return bag.reader.deserialize(data, connection.msgtype)
     raise DataError(f"there is no message on the topic '{topic}'", where=str(bag.path))
@@ -109,10 +109,10 @@ def _depth_unit(bag: OpenBag, topic: str) -> float:
 
 
 def _topic(bag: OpenBag, wanted: str | None) -> str:
-    clouds = bag.topics_of(_CLOUD_MESSAGE)
-    usable = bag.topics_of(_CLOUD_MESSAGE, _IMAGE_MESSAGE)
+    clouds = bag.topic_names_of_types(_CLOUD_MESSAGE)
+    usable = bag.topic_names_of_types(_CLOUD_MESSAGE, _IMAGE_MESSAGE)
     if wanted is not None:
-        bag.check_topic(wanted, usable, "clouds or depth images")
+        bag.check_topic_is_known(wanted, usable, "clouds or depth images")
         return wanted
     deep = [name for name in usable if name in clouds or _is_depth(bag, name)]
     if len(deep) == 1:
@@ -123,7 +123,7 @@ def _topic(bag: OpenBag, wanted: str | None) -> str:
         raise DataError(what, where=str(bag.path), allowed=", ".join(deep), hint=hint)
     encoded = f"with the encoding {' or '.join(_DEPTH_ENCODINGS)}, not compressed"
     allowed = f"{_CLOUD_MESSAGE}, or {_IMAGE_MESSAGE} {encoded}"
-    raise bag.nothing_usable("the bag has no clouds and no depth images", allowed)
+    raise bag.no_usable_topics_error("the bag has no clouds and no depth images", allowed)
 
 
 def _is_depth(bag: OpenBag, topic: str) -> bool:
@@ -135,7 +135,7 @@ def _is_depth(bag: OpenBag, topic: str) -> bool:
 
 def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     """Intrinsics from the camera's messages that stand nearest to an image's topic."""
-    infos = bag.topics_of(_CAMERA_INFO_MESSAGE)
+    infos = bag.topic_names_of_types(_CAMERA_INFO_MESSAGE)
     beside = {name: len(posixpath.commonpath(["/" + name, "/" + topic])) for name in infos}
     nearest = [name for name in infos if beside[name] == max(beside.values())]
     if len(nearest) != 1:
@@ -200,7 +200,7 @@ def _points(content: Any, where: str) -> Array:
     return np.stack([axis.astype(np.float64) for axis in axes], axis=1)
 
 
-def _colours(content: Any, where: str) -> Colours | None:
+def _colours(content: Any, where: str) -> ColourArray | None:
     for name in ("rgb", "rgba"):
         found = _cloud_columns(content, (name,), where)
         if found is not None and found[0].itemsize == 4:
@@ -300,7 +300,7 @@ class _Film:
 
 def _read_film(path: Path, pose: ArrayLike | None) -> FrameSequence:
     """Depth registered to the colour camera, as Open3D gives it."""
-    camera, film = validated_pose(pose, f"{path}: give track.camera_pose"), _Film(path)
+    camera, film = validated_camera_pose(pose, f"{path}: give track.camera_pose"), _Film(path)
     metadata = film.reader.get_metadata()
     inner = metadata.intrinsics
     matrix = np.asarray(inner.intrinsic_matrix, float)
@@ -313,9 +313,9 @@ def _read_film(path: Path, pose: ArrayLike | None) -> FrameSequence:
     def depth(index: int) -> Array:
         return _MILLIMETRE * np.asarray(film.frame(index).depth, float)
 
-    def colours(index: int) -> Colours | None:
+    def colours(index: int) -> ColourArray | None:
         image = np.asarray(film.frame(index).color)
-        seen = lens.is_measured(depth(index))
+        seen = lens.is_depth_measured(depth(index))
         return None if image.shape[:2] != seen.shape else np.asarray(image[seen][:, :3], np.uint8)
 
     names = tuple(f"frame {i}" for i in range(count))

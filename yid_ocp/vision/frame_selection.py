@@ -14,7 +14,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.options import TrackOptions
-from yid_ocp.vision.sequence_calibration import DimensionCheck, ForeignObject, SequenceCalibration
+from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionCheck
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.track_result import FrameReport
 
@@ -24,8 +24,8 @@ _MOST_NOTES = 4  # in a hint
 _MEAN_ABS = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviations
 
 
-def rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str:
-    """Reason why a frame's fit is rejected on its own; empty for a good one."""
+def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str:
+    """Reason to reject a frame by its own fit, without comparison with other frames; empty for a good one."""
     if not np.isfinite(fit.q).all():
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
@@ -39,12 +39,12 @@ def rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptio
     bend = float(np.abs((fit.q - shape.rest_configuration)[list(shape.bend_joints)]).max())
     if bend > options.max_bend_angle:
         return f"the shape is folded: a joint is bent by {math.degrees(bend):.0f} degrees"
-    if fit.visible_coverage < options.min_visible_coverage:
-        return f"{_NO_FIT}: only {100 * fit.visible_coverage:.0f} % of its visible length has points of its own"
+    if fit.visible_length_coverage < options.min_visible_coverage:
+        return f"{_NO_FIT}: only {100 * fit.visible_length_coverage:.0f} % of its visible length has points of its own"
     return ""
 
 
-def reject_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
+def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
     """Frames, with those that deviate from the other good frames marked as dropped."""
     fits = [frame.shape_fit for frame in frames if frame.is_good and frame.shape_fit is not None]
     if not fits:
@@ -66,7 +66,7 @@ def reject_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions)
     return made
 
 
-def tracked_points(
+def tracked_states_and_points(
     frames: Sequence[FrameReport],
     columns: Sequence[int],
     common: SequenceCalibration,
@@ -96,7 +96,9 @@ def tracked_points(
     std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure_time / math.sqrt(12.0)))
     stamps = np.repeat([frame.stamp for frame in good], len(columns))
     calibration = common.camera_calibration
-    shared = calibration.shared_point_std(position.reshape(-1, 3), velocity.reshape(-1, 3), stamps).reshape(std.shape)
+    shared = calibration.point_std_from_calibration(position.reshape(-1, 3), velocity.reshape(-1, 3), stamps).reshape(
+        std.shape
+    )
     std = np.hypot(std, shared)
     unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.max_point_std
     unseen |= ~np.array([fit.is_point_seen[list(columns)] for fit in fits])
@@ -114,7 +116,7 @@ def tracked_points(
 
 
 def _none_good(
-    frames: Sequence[FrameReport], sizes: DimensionCheck, things: Sequence[ForeignObject], source: str
+    frames: Sequence[FrameReport], sizes: TubeDimensionCheck, things: Sequence[ForeignObject], source: str
 ) -> DataError:
     kinds: dict[str, list[str]] = {}
     for frame in frames:
@@ -130,12 +132,12 @@ def _none_good(
     return DataError(f"{cause}not one frame could be used: {listed}", where=source, hint=hint)
 
 
-def _because(sizes: DimensionCheck, matters: bool) -> str:
+def _because(sizes: TubeDimensionCheck, matters: bool) -> str:
     """What begins a refusal where the sizes of the object are the likely cause."""
     return f"{sizes.contradiction_message}: " if matters and sizes.contradiction_message else ""
 
 
-def _hint(sizes: DimensionCheck, things: Sequence[ForeignObject], otherwise: str) -> str:
+def _hint(sizes: TubeDimensionCheck, things: Sequence[ForeignObject], otherwise: str) -> str:
     """What is known to be wrong with the object or stands about it comes before general advice."""
     notes = [*sizes.messages, *(thing.text for thing in things)]
     return "; ".join([*notes[:_MOST_NOTES], otherwise])
@@ -149,7 +151,7 @@ _SAME = 0.1  # of the length between the ends, within which roots are the same
 _HANGING = 0.2  # of the length between the ends, by which one is higher
 
 
-def choose_root_ends(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
+def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
     """Frames with the same end as root in all of them, and the criterion in words.
 
     Where a shape fits as well with its root at another end, the ends are followed from frame to frame first. Then the
@@ -218,7 +220,7 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
     return made
 
 
-def is_self_touching(centre_line: Array, radius: Array) -> bool:
+def is_shape_self_touching(centre_line: Array, radius: Array) -> bool:
     """Whether a shape of links (K, 2, 3) and radii (K,) [m] touches itself at parts that are far apart along it."""
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)

@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import DataError, unknown_name_details
 
-Colours = NDArray[np.uint8]
+ColourArray = NDArray[np.uint8]
 
 _DISTORTION_COEFFICIENT_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """Models of distortion, and how many coefficients each may have: k1, k2, p1, p2, k3 (k4, k5, k6), or k1 to k4."""
@@ -79,7 +79,7 @@ class CameraIntrinsics:
         """Direction of every pixel with z = 1, shape (height, width, 3); NaN where the lens shows none."""
         return _rays(self)
 
-    def project_to_pixels(self, points: ArrayLike) -> Array:
+    def _project_to_pixels(self, points: ArrayLike) -> Array:
         """Pixels (u, v) at which points of the camera's frame with z > 0, shape (N, 3) [m], appear; shape (N, 2)."""
         seen = np.asarray(points, float)
         x, y = self._distort(seen[:, 0] / seen[:, 2], seen[:, 1] / seen[:, 2])
@@ -88,16 +88,16 @@ class CameraIntrinsics:
     def points_from_depth(self, depth: ArrayLike) -> Array:
         """Points (N, 3) in the camera's frame, row by row, of a depth image (height, width) along the optical axis [m].
 
-        Zero or NaN is where nothing was measured; errors as `is_measured`.
+        Zero or NaN is where nothing was measured; errors as `is_depth_measured`.
         """
         image = np.asarray(depth, float)
-        seen = np.flatnonzero(self.is_measured(image))
+        seen = np.flatnonzero(self.is_depth_measured(image))
         # a third of the time that a mask over rows takes
         points = self.pixel_rays.reshape(-1, 3).take(seen, axis=0)
         points *= image.ravel().take(seen)[:, None]
         return points
 
-    def is_measured(self, depth: Array) -> BoolArray:
+    def is_depth_measured(self, depth: Array) -> BoolArray:
         """Whether each pixel of a depth image is measured, shape (height, width); `DataError` for another size."""
         if depth.shape != (self.height, self.width):
             raise DataError(f"the depth image has shape {depth.shape}", allowed=f"({self.height}, {self.width})")
@@ -189,7 +189,7 @@ class FrameSequence:
     intrinsics: CameraIntrinsics | None = None
     source: str = "sequence"  # Where the frames come from, for messages
     # from a frame's index to the red, green and blue of each of its points, shape (N, 3), None where it has none
-    load_colours: Callable[[int], Colours | None] | None = None
+    load_colours: Callable[[int], ColourArray | None] | None = None
 
     def __len__(self) -> int:
         return len(self.frame_names)
@@ -198,7 +198,7 @@ class FrameSequence:
         """Cloud of a frame in the world, shape (N, 3) [m]; `DataError` where it cannot be read."""
         return self.load_cloud(index) @ self.camera_pose[:3, :3].T + self.camera_pose[:3, 3]
 
-    def select_frames(self, indices: Sequence[int]) -> FrameSequence:
+    def _select_frames(self, indices: Sequence[int]) -> FrameSequence:
         """The frame sequence with only these frames, in this order."""
         kept = [int(i) for i in indices]
         names, colours = tuple(self.frame_names[i] for i in kept), self.load_colours
@@ -217,7 +217,7 @@ class FrameSequence:
         """A frame sequence of clouds in memory, each (N, 3) in the camera's frame [m], at stamps `t` (M,) [s]."""
         arrays = [np.asarray(cloud, float).reshape(-1, 3) for cloud in clouds]
         names = tuple(f"frame {i}" for i in range(len(arrays)))
-        camera = validated_pose(pose, source)
+        camera = validated_camera_pose(pose, source)
         return FrameSequence(np.asarray(t, float), names, camera, arrays.__getitem__, None, source)
 
 
@@ -234,7 +234,7 @@ def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
     return pose
 
 
-def validated_pose(pose: ArrayLike | None, where: str) -> Array:
+def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
     """A camera's pose as an array; `DataError` where it is missing or not a rigid transform."""
     hint = "give the camera in the world as a 4x4 matrix, x right, y down, z ahead, translation in metres"
     if pose is None:

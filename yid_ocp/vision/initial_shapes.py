@@ -194,14 +194,14 @@ def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[f
 
 
 _FREE_ROOT_PREFIX = "found_root"
-"""Prefix of the joints that `with_free_root` adds."""
+"""Prefix of the joints that `system_with_free_root` adds."""
 _MOST_ENDS = 7  # of a course; more are clutter, and there are too many ways
 _ALIKE = 1.3  # a way whose distances are off by so many times the best one's is tried as well
 _WHOLE = 0.08  # of the object, by which a course may be off that shows all of it
 
 
 @dataclass(frozen=True, eq=False)
-class EndAnchor:
+class ObservedObjectEnd:
     """Observed position of one end of an object along its own direction."""
 
     link_end_index: int  # among the links' starts and ends, in this order link by link
@@ -216,10 +216,10 @@ class _InitialShape:
 
     q: Array
     root_position: Array
-    end_anchors: tuple[EndAnchor, ...]
+    end_anchors: tuple[ObservedObjectEnd, ...]
 
 
-def with_free_root(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
+def system_with_free_root(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
     """System with its object on six additional free joints, without grasps, and the names of these joints.
 
     They are the root's place [m], then its turns about x, y and z [rad].
@@ -231,7 +231,7 @@ def with_free_root(system: System, values: Mapping[str, float] | None = None) ->
     under = np.eye(4)
     under[:3, 3] = -np.array(place).ravel()
     carrier = floating_clamp(_FREE_ROOT_PREFIX)
-    carried = carrier.with_mechanism(system.mechanism, _FREE_ROOT_PREFIX, under)
+    carried = carrier.with_attached_mechanism(system.mechanism, _FREE_ROOT_PREFIX, under)
     return replace(system, mechanism=carried, grasps=()), carrier.joint_names
 
 
@@ -334,7 +334,7 @@ class InitialShapeFinder:
         for corner, end in zip(self._corners, ends, strict=True):
             ahead = trace.outward_direction(end)
             middle = trace.nodes[end] + 0.5 * trace.slice_width * ahead
-            anchors.append(EndAnchor(corner, ahead, middle, trace.slice_width / np.sqrt(12.0)))
+            anchors.append(ObservedObjectEnd(corner, ahead, middle, trace.slice_width / np.sqrt(12.0)))
         return _InitialShape(q, place, tuple(anchors))
 
     def _rotations(self, q: Array) -> list[Array]:

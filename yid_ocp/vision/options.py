@@ -7,12 +7,12 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge
 
-from yid_ocp.options import Fraction, OptionInfo, PositiveFloat, check_option_bounds
+from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
 from yid_ocp.vision.calibration import CameraCalibrationOptions, CameraClockOptions
 from yid_ocp.vision.fit import ShapeFitOptions
-from yid_ocp.vision.point_cloud import CloudFilterOptions, Coordinates, SkeletonOptions
-from yid_ocp.vision.sequence_calibration import DimensionKind
-from yid_ocp.vision.surface_meshes import MeshKind
+from yid_ocp.vision.point_cloud import CloudFilterOptions, SkeletonOptions, XyzCoordinates
+from yid_ocp.vision.sequence_calibration import TubeDimensionKind
+from yid_ocp.vision.surface_meshes import UrdfMeshKind
 
 _RootPlacement = Literal["model", "fixed", "free"]
 
@@ -41,7 +41,7 @@ class TrackOptions:
         ),
     ] = "none"
     estimated_dimensions: Annotated[
-        tuple[DimensionKind, ...],
+        tuple[TubeDimensionKind, ...],
         OptionInfo(
             "sizes of the tubes that are estimated from the clouds, where these tell them; all are checked anyway"
         ),
@@ -68,7 +68,8 @@ class TrackOptions:
         ),
     ] = 0.008
     min_visible_coverage: Annotated[
-        Fraction, OptionInfo("a frame with points on a smaller share of the object's visible length is dropped")
+        UnitIntervalFloat,
+        OptionInfo("a frame with points on a smaller share of the object's visible length is dropped"),
     ] = 0.6
     max_point_std: Annotated[
         PositiveFloat, OptionInfo("a point that is known less well in a frame counts as not seen there", "m")
@@ -97,10 +98,10 @@ class TrackOptions:
         ),
     ] = "model"
     approximate_root_position: Annotated[
-        Coordinates | None,
+        XyzCoordinates | None,
         OptionInfo("place in the world to which the root is nearer than other ends, where root is not model", "m"),
     ] = None
-    robot_mesh_kind: Annotated[MeshKind, OptionInfo("meshes of the robot's self-filter")] = "visual"
+    robot_mesh_kind: Annotated[UrdfMeshKind, OptionInfo("meshes of the robot's self-filter")] = "visual"
     seed: Annotated[int, Ge(0), OptionInfo("of the walk's random points and of all subsampling")] = 0
 
     def __post_init__(self) -> None:

@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
-from yid_ocp.options import Fraction, OptionInfo, PositiveFloat, check_option_bounds
-from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_sizes
+from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
+from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_link_lengths_and_radii
 
-Coordinates = tuple[float, float, float]
+XyzCoordinates = tuple[float, float, float]
 _ColourComponent = Annotated[float, Ge(0), Le(255)]
 _RgbColour = tuple[_ColourComponent, _ColourComponent, _ColourComponent]
 
@@ -56,9 +56,9 @@ class CloudFilterOptions:
         ),
     ] = 0.03
     box_lower: Annotated[
-        Coordinates | None, OptionInfo("corner of a box in the world outside of which points are left out", "m")
+        XyzCoordinates | None, OptionInfo("corner of a box in the world outside of which points are left out", "m")
     ] = None
-    box_upper: Annotated[Coordinates | None, OptionInfo("the opposite corner", "m")] = None
+    box_upper: Annotated[XyzCoordinates | None, OptionInfo("the opposite corner", "m")] = None
     floor_height: Annotated[
         float | None,
         OptionInfo(
@@ -115,7 +115,7 @@ class CloudFilterOptions:
         check_option_bounds(self, "filter options")
 
 
-class ObjectRegion:
+class ReachableObjectRegion:
     """Region that the object can reach, from the length of its branches and the floor.
 
     Where its root may be `anywhere`, only the box and the floor of the options bound it.
@@ -129,7 +129,7 @@ class ObjectRegion:
         *,
         anywhere: bool = False,
     ) -> None:
-        tree, sizes = numeric_mechanism(system, values), tube_sizes(system, values)
+        tree, sizes = numeric_mechanism(system, values), tube_link_lengths_and_radii(system, values)
         reach: dict[str, float] = {}
         for segment in system.segment_layouts:
             before = reach[segment.parent_segment] if segment.parent_segment else 0.0
@@ -158,7 +158,7 @@ class ObjectRegion:
         bases = [np.array(ca.DM(joint.placement.translation)).ravel() for joint in roots]
         self._base = np.mean(bases, axis=0) if bases else None
 
-    def membership_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
+    def membership_test_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
         """Test whether points (N, 3) lie inside, the robot at a configuration (n,), seen from a camera at (3,) [m]."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
@@ -194,7 +194,9 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
     return WeightedCloud(total / count[:, None], count.astype(np.float64))
 
 
-def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: BoolArray | None = None) -> BoolArray:
+def is_statistical_inlier(
+    cloud: WeightedCloud, neighbours: int, ratio: float, asked: BoolArray | None = None
+) -> BoolArray:
     """Whether points are inliers of statistical outlier removal, shape (N,); False for those that are not asked.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
@@ -218,7 +220,7 @@ def is_not_outlier(cloud: WeightedCloud, neighbours: int, ratio: float, asked: B
     return stays
 
 
-def has_any_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> BoolArray:
+def has_wanted_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> BoolArray:
     """Whether points have one of the wanted colours, shape (N,).
 
     Colours are red, green and blue, 0 to 255 (sRGB), shapes (N, 3) and (C, 3). `angle` is the largest between two of
@@ -256,7 +258,7 @@ class SkeletonOptions:
     node_neighbours: Annotated[int, Ge(1), OptionInfo("neighbours of a node in the graph")] = 4
     max_edge_length: Annotated[PositiveFloat, OptionInfo("nodes further apart are not joined", "m")] = 0.15
     min_component_fraction: Annotated[
-        Fraction,
+        UnitIntervalFloat,
         OptionInfo("a connected part of the graph that holds a smaller fraction of the points is not the object"),
     ] = 0.04
 
@@ -275,7 +277,7 @@ class CloudSkeleton:
     component_of_node: IntArray  # (K,), connected part of each node, the one with most points first
 
     @property
-    def has_node(self) -> BoolArray:
+    def has_skeleton_node(self) -> BoolArray:
         """Whether each point of the cloud belongs to a node, shape (N,)."""
         return self.node_of_point >= 0
 

@@ -1,7 +1,7 @@
 """Calibration shared by all frames of a sequence: the camera, background, foreign objects and the object's dimensions.
 
 Of every frame the least cost about the sizes x (logarithms of lengths and radii over the model's), the bends following,
-is g_f'x + x'S_f x/2 (`DimensionEquations`). Together, with a wide prior P, the frames fitted anew at every x,
+is g_f'x + x'S_f x/2 (`TubeDimensionCost`). Together, with a wide prior P, the frames fitted anew at every x,
 
     x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
 
@@ -24,8 +24,8 @@ from scipy.spatial import cKDTree
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
-from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, nearest_on_tubes
-from yid_ocp.vision.surface_meshes import tube_sizes
+from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, nearest_points_on_tubes
+from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 _NOISE_STDS = 3.0  # of a point, within which it is the background's
 _MOST = 0.5  # of the frames, in which what stands still must be seen: arm and object hide it from time to time
@@ -47,15 +47,15 @@ class BackgroundPoints:
     def _tree(self) -> cKDTree:
         return cKDTree(self.points)
 
-    def contains(self, points: Array, beyond: float = 0.0) -> BoolArray:
+    def is_near_background(self, points: Array, beyond: float = 0.0) -> BoolArray:
         """Whether points, shape (N, 3), lie within `match_distance + beyond` [m] of the background, shape (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
         reach = self.match_distance + beyond
         return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=reach)[0]))
 
-    def joined(self, other: BackgroundPoints) -> BackgroundPoints:
-        """This background and another one."""
+    def merged_with(self, other: BackgroundPoints) -> BackgroundPoints:
+        """Union of this background and another one."""
         points = np.concatenate([self.points, other.points])
         return BackgroundPoints(points, max(self.match_distance, other.match_distance))
 
@@ -76,7 +76,7 @@ class BackgroundPoints:
         points: Array = np.asarray((place[count >= often] + 0.5) * voxel)
         for tubes in shapes or ():
             if len(points):
-                link, _, _, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, points)
+                link, _, _, distance = nearest_points_on_tubes(tubes.link_ends, tubes.radius, points)
                 points = points[distance > tubes.radius[link] + near]
         return BackgroundPoints(points, _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
 
@@ -93,7 +93,7 @@ class ForeignObject:
     text: str  # where it is and what helps
 
 
-def group_foreign_objects(
+def group_foreign_clusters(
     things: Sequence[tuple[float, Sequence[ForeignCluster]]],
     noise: float,
     box: tuple[Array, Array],
@@ -169,8 +169,8 @@ def _carrying_link(places: Array, poses: Sequence[Mapping[str, Array]]) -> str:
     return best if best and inside[best] < _FOLLOWS * wandering(places) else ""
 
 
-DimensionKind = Literal["length", "radius"]
-_DIMENSION_KINDS: tuple[DimensionKind, ...] = ("length", "radius")
+TubeDimensionKind = Literal["length", "radius"]
+_DIMENSION_KINDS: tuple[TubeDimensionKind, ...] = ("length", "radius")
 
 _PRIOR = (0.2, 0.4)  # standard deviations of the logarithms of lengths and radii
 _SIGMAS = 3.0  # from the model's value, beyond which that is doubted
@@ -182,7 +182,7 @@ _APART = 3.0  # robust standard deviations from the other frames' ends, at which
 
 
 @dataclass(frozen=True, eq=False)
-class DimensionCheck:
+class TubeDimensionCheck:
     """Tube lengths and radii estimated from the frames, compared with the model."""
 
     names: tuple[str, ...]  # `T1.length` and so on: lengths of all segments, then their radii
@@ -193,19 +193,21 @@ class DimensionCheck:
     n_frames: int  # that were asked; 0 where nothing could be said
 
     @property
-    def log_ratio_std(self) -> Array:
-        """Standard deviation of `log_ratio`, shape (2 s,)."""
+    def dimension_log_ratio_std(self) -> Array:
+        """Standard deviation of the logarithm of estimated over model dimension, shape (2 s,)."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
-    def is_determined(self) -> BoolArray:
+    def is_dimension_determined(self) -> BoolArray:
         """Which dimensions the frames determine, shape (2 s,)."""
-        return np.asarray((self.log_ratio_std < _KNOWN) & (self.n_frames > 0))
+        return np.asarray((self.dimension_log_ratio_std < _KNOWN) & (self.n_frames > 0))
 
     @property
-    def is_contradicted(self) -> BoolArray:
+    def is_model_value_contradicted(self) -> BoolArray:
         """Which of the model's values contradict the frames, shape (2 s,)."""
-        return np.asarray(self.is_determined & (np.abs(self.log_ratio) > _SIGMAS * self.log_ratio_std))
+        return np.asarray(
+            self.is_dimension_determined & (np.abs(self.log_ratio) > _SIGMAS * self.dimension_log_ratio_std)
+        )
 
     @property
     def contradiction_message(self) -> str:
@@ -213,22 +215,22 @@ class DimensionCheck:
         values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
         wrong = [
             f"{self.names[i]} {values[i]:.4g} mm where {fitting[i]:.4g} mm fits"
-            for i in np.flatnonzero(self.is_contradicted & ~np.array(self.is_estimated))
+            for i in np.flatnonzero(self.is_model_value_contradicted & ~np.array(self.is_estimated))
         ]
         return f"the object seems to be other than the model says ({', '.join(wrong)})" if wrong else ""
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Of every size that is doubted or estimated: the value that fits, with its interval."""
+        """One message for every dimension that is doubted or estimated: the value that fits, with its interval."""
         lines = []
         for i, name in enumerate(self.names):
             value = self.model_values[i] * math.exp(self.log_ratio[i])
-            two = 2 * value * self.log_ratio_std[i]
+            two = 2 * value * self.dimension_log_ratio_std[i]
             found = f"{1e3 * value:.4g} mm ± {1e3 * two:.2g} mm (two standard deviations) fits {self.n_frames} frames"
             said = f"the model says {1e3 * self.model_values[i]:.4g} mm"
             if self.is_estimated[i]:
                 lines.append(f"{name} is estimated: {found}; {said}")
-            elif self.is_contradicted[i]:
+            elif self.is_model_value_contradicted[i]:
                 remedy = f"estimate it: track.options.estimated_dimensions: [{name.rpartition('.')[2]}]"
                 lines.append(f"{name} seems to be wrong: {found}, {said}. Measure it again, or {remedy}")
         return tuple(lines)
@@ -239,7 +241,7 @@ class DimensionCheck:
         The whole displacement of what is doubted and yet used, and what remains uncertain of what is estimated.
         """
         used = np.array(self.is_estimated)
-        wrong = np.where(self.is_contradicted & ~used, self.log_ratio, 0.0)
+        wrong = np.where(self.is_model_value_contradicted & ~used, self.log_ratio, 0.0)
         chosen = points[..., used]
         spread = np.einsum("ijk,kl,ijl->ij", chosen, self.covariance[np.ix_(used, used)], chosen)
         return np.asarray(np.sqrt((points @ wrong) ** 2 + np.maximum(spread, 0.0)))
@@ -249,25 +251,25 @@ class DimensionCheck:
         return _changed(system, given, np.where(self.is_estimated, self.log_ratio, 0.0))
 
 
-def check_dimensions(
+def estimate_and_check_dimensions(
     system: System,
     given: Mapping[str, float] | None,
-    estimate: Sequence[DimensionKind],
+    estimate: Sequence[TubeDimensionKind],
     std: tuple[float, float],
     fitted: Callable[[Mapping[str, float], Sequence[Array]], list[FrameShapeFit]],
-) -> DimensionCheck:
+) -> TubeDimensionCheck:
     """Estimate the tubes' dimensions from some frames and compare them with the model.
 
     `std` are the standard deviations of a point's distance from the surface, and of the places' error that all frames
     share [m]; `fitted` makes the fits of the frames from parameter values and the configurations of the round before.
     """
-    sizes = tube_sizes(system, given).values()
+    sizes = tube_link_lengths_and_radii(system, given).values()
     told = np.array([*(lengths.sum() for lengths, _ in sizes), *(radius for _, radius in sizes)])
     count, many = len(told), len(told) // 2
     names = tuple(f"{s.name}.{kind}" for kind in _DIMENSION_KINDS for s in system.segment_layouts)
     prior = np.diag(np.repeat(1.0 / np.square(_PRIOR), many))
     change, starts = np.zeros(count), list[Array]()
-    nothing = DimensionCheck(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
+    nothing = TubeDimensionCheck(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
     wanted = np.array([kind in estimate for kind in _DIMENSION_KINDS for _ in range(many)])
     shared = np.concatenate([math.hypot(*std) / told[:many], std[0] ** 2 / (2 * told[many:] ** 2)])
     covariance, frames = nothing.covariance, 0
@@ -290,7 +292,7 @@ def check_dimensions(
         if np.abs(step).max() < _SETTLED:
             break
     known = np.sqrt(np.diag(covariance)) < _KNOWN
-    return DimensionCheck(names, told, change, covariance, tuple(bool(x) for x in wanted & known), frames)
+    return TubeDimensionCheck(names, told, change, covariance, tuple(bool(x) for x in wanted & known), frames)
 
 
 def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
@@ -325,5 +327,5 @@ class SequenceCalibration:
     """Camera calibration, object dimensions and background of a sequence."""
 
     camera_calibration: CameraCalibration  # where the camera stands, how it scales depth, and its clock
-    dimensions: DimensionCheck  # what the frames say of the object's lengths and radii
+    dimensions: TubeDimensionCheck  # what the frames say of the object's lengths and radii
     background: BackgroundPoints  # what stands there in all frames

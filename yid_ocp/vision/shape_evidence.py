@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.vision.frames import OcclusionMap
-from yid_ocp.vision.initial_shapes import EndAnchor
+from yid_ocp.vision.initial_shapes import ObservedObjectEnd
 from yid_ocp.vision.point_cloud import weighted_median
 
 _FilteredOutTest = Callable[[Array], BoolArray]
@@ -47,7 +47,7 @@ class TubeLinks:
     tube_lengths: Array  # (K,), length of the whole tube that a link belongs to [m]
 
 
-def nearest_on_tubes(
+def nearest_points_on_tubes(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
     """Nearest place on tubes of links (K, 2, 3) and radii (K,) for points (N, 3) that lie at a share of the radius [m].
@@ -84,7 +84,7 @@ class ForeignCluster:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ShapeQuality:
+class ShapeFitQuality:
     """How well a shape suits a frame's points, and how much of the shape they cover."""
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
@@ -98,14 +98,14 @@ class ShapeQuality:
     end_offsets: Array
     foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
 
-    def coverage(self, lengths: Array) -> float:
+    def length_weighted_coverage(self, lengths: Array) -> float:
         """Share of the visible length of links, of lengths (K,) [m], that has own points; 0 where none is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ShapeEvidence(ShapeQuality):
+class ShapePointClassification(ShapeFitQuality):
     """Classification of a frame's points by a shape, and how much of the shape they cover."""
 
     # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
@@ -116,7 +116,7 @@ class ShapeEvidence(ShapeQuality):
 
 
 @dataclass(frozen=True, eq=False)
-class CloudObservation:
+class ProcessedFrameCloud:
     """Processed points of one frame with the camera and occlusion that they were seen with."""
 
     points: Array  # (N, 3), surface points in the world [m]
@@ -125,7 +125,7 @@ class CloudObservation:
     camera_position: Array  # (3,) [m]
     occlusion_map: OcclusionMap | None = None  # everything that the camera saw; without it no place counts as hidden
     is_filtered_out: _FilteredOutTest | None = None  # which places, shape (S, 3), lie where filters leave no points
-    end_anchors: Sequence[EndAnchor] = ()  # ends of the object that were seen
+    end_anchors: Sequence[ObservedObjectEnd] = ()  # ends of the object that were seen
 
     @cached_property
     def _point_tree(self) -> cKDTree:
@@ -139,7 +139,7 @@ class CloudObservation:
             return math.inf
         return max(float(np.median(self._point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)
 
-    def is_hidden(self, places: Array, radius: Array, margin: float) -> BoolArray:
+    def is_hidden_or_filtered(self, places: Array, radius: Array, margin: float) -> BoolArray:
         """Whether places are hidden from the camera or removed by filters, shape (S,)."""
         hidden = np.zeros(len(places), bool)
         if self.occlusion_map is not None:
@@ -149,9 +149,9 @@ class CloudObservation:
         return hidden
 
 
-def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> ShapeEvidence:
-    """Assess a shape by a frame's points, of which those further than `near` [m] from the surface say nothing."""
-    link, along, normal, distance = nearest_on_tubes(tubes.link_ends, tubes.radius, seen.points)
+def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near: float) -> ShapePointClassification:
+    """Classify a frame's points by a fitted shape and assess its coverage; points beyond `near` [m] say nothing."""
+    link, along, normal, distance = nearest_points_on_tubes(tubes.link_ends, tubes.radius, seen.points)
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
     size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
     close = size < near
@@ -185,7 +185,7 @@ def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> Shape
     counted = close & ~foreign
     mean = float(np.average(size[counted], weights=seen.point_weights[counted])) if counted.any() else math.inf
     clusters = [seen.points[part == number] for number in range(min(_MOST_THINGS, int(part.max(initial=-1)) + 1))]
-    return ShapeEvidence(
+    return ShapePointClassification(
         is_own=own,
         is_contested=contested,
         is_foreign=foreign,
@@ -199,7 +199,7 @@ def assess_shape(tubes: TubeLinks, seen: CloudObservation, near: float) -> Shape
     )
 
 
-def tube_like_nodes_and_points(sight: CloudObservation, radius: float) -> tuple[BoolArray, BoolArray]:
+def tube_like_node_point_masks(sight: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
     """Which nodes (K,), and points (N,) nearest to them, lie where the surface is as narrow as a tube of a radius [m].
 
     About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
@@ -233,7 +233,9 @@ def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> In
     return part
 
 
-def _contacts(tree: cKDTree, seen: CloudObservation, shape: BoolArray, foreign: BoolArray, within: float) -> BoolArray:
+def _contacts(
+    tree: cKDTree, seen: ProcessedFrameCloud, shape: BoolArray, foreign: BoolArray, within: float
+) -> BoolArray:
     """Points of the shape from which a thing's surface goes on, nearly as dense as the shape's."""
     contact = np.zeros(len(shape), bool)
     if not foreign.any():
@@ -247,7 +249,7 @@ def _contacts(tree: cKDTree, seen: CloudObservation, shape: BoolArray, foreign: 
 
 
 def _coverage(
-    tubes: TubeLinks, seen: CloudObservation, own: BoolArray, link: IntArray, along: Array, gate: float
+    tubes: TubeLinks, seen: ProcessedFrameCloud, own: BoolArray, link: IntArray, along: Array, gate: float
 ) -> tuple[Array, Array]:
     """Shares of each link that have own points, and that visibly have none."""
     lengths = np.linalg.norm(tubes.link_ends[:, 1] - tubes.link_ends[:, 0], axis=1)
@@ -262,11 +264,11 @@ def _coverage(
         tubes.link_ends[owner[bare], 1] - tubes.link_ends[owner[bare], 0]
     )
     empty = np.zeros(len(filled), bool)
-    empty[bare] = ~seen.is_hidden(places, tubes.radius[owner[bare]], gate)
+    empty[bare] = ~seen.is_hidden_or_filtered(places, tubes.radius[owner[bare]], gate)
     return np.bincount(owner, filled) / count, np.bincount(owner, empty) / count
 
 
-def _swath(tubes: TubeLinks, seen: CloudObservation, counted: BoolArray, link: IntArray, offset: Array) -> Array:
+def _swath(tubes: TubeLinks, seen: ProcessedFrameCloud, counted: BoolArray, link: IntArray, offset: Array) -> Array:
     """Variance of points across each link, seen from the camera, beyond that of a tube of its radius."""
     edge = tubes.link_ends[:, 1] - tubes.link_ends[:, 0]
     across = np.cross(edge, tubes.link_ends.mean(axis=1) - seen.camera_position)
@@ -278,7 +280,7 @@ def _swath(tubes: TubeLinks, seen: CloudObservation, counted: BoolArray, link: I
     return np.maximum(total / np.maximum(weight, 1e-12) - tubes.radius**2 / 3, 0.0)
 
 
-def _end_offset(tubes: TubeLinks, link: int, seen: CloudObservation, gate: float) -> tuple[float, BoolArray]:
+def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: float) -> tuple[float, BoolArray]:
     """Where points end along the axis of a tube's last link, from its tip [m], NaN where that cannot be seen.
 
     And which points lie about the axis between the tip and there.
@@ -297,7 +299,7 @@ def _end_offset(tubes: TubeLinks, link: int, seen: CloudObservation, gate: float
         return nothing
     filled = count > _FILLED * float(np.median(count[count > 0]))
     middles = tip + 0.5 * (edges[1:] + edges[:-1])[:, None] * axis
-    hidden = seen.is_hidden(middles, np.full(len(middles), radius), gate) & ~filled
+    hidden = seen.is_hidden_or_filtered(middles, np.full(len(middles), radius), gate) & ~filled
     score = np.concatenate([[0.0], np.cumsum(np.where(hidden, 0.0, np.where(filled, 0.5, -0.5)))])
     last = int(np.argmax(score))
     if last == 0 or last == len(count) or hidden[last]:
@@ -329,7 +331,7 @@ def nearest_surface_residuals(
     Links are (K, 2, 3), radii (K,), the camera (3,) [m]. A point that only the far side of a tube is near to counts
     from the near side.
     """
-    link, along, normal, distance = nearest_on_tubes(corners, radius, points, share)
+    link, along, normal, distance = nearest_points_on_tubes(corners, radius, points, share)
     sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
     error = sign * distance - share * radius[link]
     # e falls as the centre line moves along the normal: de = -n'((1 - t) da + t db)
@@ -345,7 +347,7 @@ def line_of_sight_residuals(corners: Array, radius: Array, points: Array, camera
     sqrt(r^2 - u^2). The nearest way turns with the noise, which does little to where a tube is found, but makes it
     appear thinner by several times noise^2/r. Points near the rim, where depth says little, are not compared.
     """
-    link, along, normal, distance = nearest_on_tubes(corners, radius, points)
+    link, along, normal, distance = nearest_points_on_tubes(corners, radius, points)
     edge = corners[:, 1] - corners[:, 0]
     axis = (edge / np.linalg.norm(edge, axis=1)[:, None])[link]
     sight = camera - points
@@ -364,8 +366,8 @@ def line_of_sight_residuals(corners: Array, radius: Array, points: Array, camera
 
 
 @dataclass(frozen=True, eq=False)
-class DimensionEquations:
-    """Quadratic cost of the tubes' dimensions in one frame, minimised over the bends.
+class TubeDimensionCost:
+    """Quadratic cost of the tubes' lengths and radii in one frame, minimised over the joint bends.
 
     The sizes are the logarithms of all lengths and then of all radii, segment by segment, relative to the values of the
     fit. About these the least cost is  g'x + x'Sx/2.
@@ -377,7 +379,7 @@ class DimensionEquations:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FrameShapeFit(ShapeQuality):
+class FrameShapeFit(ShapeFitQuality):
     """Fitted shape of one frame with its uncertainty and quality."""
 
     q: Array  # (n,), configuration, twists at rest
@@ -388,11 +390,11 @@ class FrameShapeFit(ShapeQuality):
     grasp_gaps: Array  # (grasps, 3), from what each gripper holds to the gripper [m]
     # share of the points on the shape that may belong to a thing which touches it; they are left out
     contested_fraction: float
-    dimension_equations: DimensionEquations  # what the frame says of lengths and radii
+    dimension_equations: TubeDimensionCost  # what the frame says of lengths and radii
     n_iterations: int
     link_ends: Array  # (K, 2, 3), start and end of every link [m]
 
     @property
-    def visible_coverage(self) -> float:
+    def visible_length_coverage(self) -> float:
         """Fraction of the shape's visible length that has points."""
-        return self.coverage(np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1))
+        return self.length_weighted_coverage(np.linalg.norm(self.link_ends[:, 1] - self.link_ends[:, 0], axis=1))

@@ -26,7 +26,7 @@ from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.options import OptionInfo, PositiveFloat
 from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 
-MeshKind = Literal["visual", "collision"]
+UrdfMeshKind = Literal["visual", "collision"]
 _Triple = tuple[float, float, float]
 
 _FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
@@ -186,7 +186,9 @@ class ArticulatedSurfaces:
         near = np.flatnonzero(inside)
         return near, local[near]
 
-    def is_within_distance(self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False) -> BoolArray:
+    def is_within_surface_distance(
+        self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False
+    ) -> BoolArray:
         """Whether world points (N, 3) lie within `reach` [m] of a surface at a configuration (n,), shape (N,).
 
         No distance differs from that of a place by more than the way there: the cell in which a point lies, whose
@@ -292,7 +294,7 @@ def _tensor(values: NDArray[Any]) -> Any:
     return import_open3d().core.Tensor(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: MeshKind = "visual") -> dict[int, TriangleMesh]:
+def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind = "visual") -> dict[int, TriangleMesh]:
     """Meshes of a robot's links by the joint that carries them, -1 for what does not move, in the joint's frame.
 
     Parameters
@@ -410,7 +412,9 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
     return found
 
 
-def tube_sizes(system: System, values: Mapping[str, float] | None = None) -> dict[str, tuple[Array, float]]:
+def tube_link_lengths_and_radii(
+    system: System, values: Mapping[str, float] | None = None
+) -> dict[str, tuple[Array, float]]:
     """Lengths of the links and radius of every tube, by segment [m]."""
     symbols, theta = system.parameters.symbols, system.parameters.vector(values)
     sizes = [ca.densify(ca.vertcat(*s.link_lengths, s.radius)) for s in system.segment_layouts]
@@ -430,7 +434,9 @@ def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = No
     if not system.segment_layouts:
         raise DataError("the model has no object to see", hint="give it segments")
     meshes: dict[int, TriangleMesh] = {}
-    for segment, (lengths, radius) in zip(system.segment_layouts, tube_sizes(system, values).values(), strict=True):
+    for segment, (lengths, radius) in zip(
+        system.segment_layouts, tube_link_lengths_and_radii(system, values).values(), strict=True
+    ):
         for i, (names, length) in enumerate(zip(segment.link_joints, lengths, strict=True)):
             parts = [TriangleMesh.cylinder(radius, 0.0, float(length))]
             if i or segment.parent_segment is not None:

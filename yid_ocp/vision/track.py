@@ -22,40 +22,40 @@ from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import (
     CameraCalibration,
     calibrate_camera,
-    calibration_as_given,
-    estimate_stamp_delay,
-    is_stamped_late,
+    calibration_without_estimation,
+    estimate_excess_stamp_delay,
+    is_stamp_delay_significant,
 )
 from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import (
-    choose_root_ends,
-    is_self_touching,
-    reject_outlying_frames,
-    rejection_reason,
-    tracked_points,
+    frame_rejection_reason,
+    is_shape_self_touching,
+    mark_outlying_frames,
+    tracked_states_and_points,
+    with_consistent_root_end,
 )
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
-from yid_ocp.vision.initial_shapes import InitialShapeFinder, trace_centerline, with_free_root
+from yid_ocp.vision.initial_shapes import InitialShapeFinder, system_with_free_root, trace_centerline
 from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.point_cloud import (
     CloudSkeleton,
-    ObjectRegion,
+    ReachableObjectRegion,
     WeightedCloud,
     extract_skeleton,
-    has_any_colour,
-    is_not_outlier,
+    has_wanted_colour,
+    is_statistical_inlier,
     voxel_averages,
 )
 from yid_ocp.vision.sequence_calibration import (
     BackgroundPoints,
-    DimensionCheck,
     ForeignObject,
     SequenceCalibration,
-    check_dimensions,
-    group_foreign_objects,
+    TubeDimensionCheck,
+    estimate_and_check_dimensions,
+    group_foreign_clusters,
 )
-from yid_ocp.vision.shape_evidence import CloudObservation, FrameShapeFit
+from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
 from yid_ocp.vision.surface_meshes import (
     ArticulatedSurfaces,
     CameraScene,
@@ -64,7 +64,7 @@ from yid_ocp.vision.surface_meshes import (
     load_robot_meshes,
     numeric_mechanism,
 )
-from yid_ocp.vision.track_result import FrameReport, FrameStages, TrackResult
+from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, TrackResult
 
 _ProgressCallback = Callable[[int, int, str], None]
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
@@ -116,7 +116,7 @@ def track_object(
         told(done, total, f"fitting {sequence.frame_names[i]}")
         frames.append(tracker.track_frame(i, common))
     told(total, total, "done")
-    return tracker.to_track_result(*tracker.reject_outlying_frames(frames), common)
+    return tracker.to_track_result(*tracker.assign_root_and_mark_outliers(frames), common)
 
 
 @dataclass(eq=False)
@@ -136,7 +136,7 @@ class _Work:
 class _Look:
     """What a frame shows, once for every way in which it may, the robot's configuration, and where searches begin."""
 
-    sights: Sequence[CloudObservation]
+    sights: Sequence[ProcessedFrameCloud]
     q: Array
     starts: Sequence[Sequence[Array]]
 
@@ -163,13 +163,13 @@ class FrameTracker:
                 hint = "set track.options.root_placement to model, or model.robot to null"
                 what = "a robot holds the object: its root is where the model has it"
                 raise ConfigError(what, where="root", hint=hint)
-            system, self._loose = with_free_root(system, values)
+            system, self._loose = system_with_free_root(system, values)
         self.system, self.parameter_values = system, values
         self.sequence, self.options, self.empty_scene = sequence, options, empty
         self.shape_fitter = self._shape_of(values)
         self.initial_shape_finder = self.shape_fitter.initial_shape_finder() if anywhere else None
         self.point_names = _chosen_points(system, options.tracked_points)
-        self.object_region = ObjectRegion(system, options.filters, values, anywhere=anywhere)
+        self.object_region = ReachableObjectRegion(system, options.filters, values, anywhere=anywhere)
         # of a root that is sought nothing that was recorded is needed
         known = () if anywhere else self.shape_fitter.recorded_joint_names
         self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
@@ -215,7 +215,7 @@ class FrameTracker:
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
         if self.empty_scene is not None:
             seen = (self._finite(self.empty_scene, i)[0] for i in range(len(self.empty_scene)))
-            clouds = [calibration.camera_state.to_world(points) for points in seen]
+            clouds = [calibration.camera_state.measured_to_world_points(points) for points in seen]
             background = BackgroundPoints.from_static_points(clouds, filters.voxel_size, noise)
         looks = [look for i in self._asked if (look := self._look(i, calibration, background)[1]) is not None]
         last: list[tuple[ShapeFitter, FrameShapeFit]] = []
@@ -232,21 +232,25 @@ class FrameTracker:
         shared = 0.0
         if looks:
             places = self.shape_fitter.points_at(looks[0].q)
-            shared = float(calibration.shared_point_std(places, 0 * places, np.zeros(len(places))).max())
+            shared = float(calibration.point_std_from_calibration(places, 0 * places, np.zeros(len(places))).max())
         asked = self.options.estimated_dimensions
-        sizes = check_dimensions(self.system, self.parameter_values, asked, (noise, shared), fitted)
+        sizes = estimate_and_check_dimensions(self.system, self.parameter_values, asked, (noise, shared), fitted)
         if self.options.background_estimation == "frames":
-            shapes = [shape.tubes_at(fit.q) for shape, fit in last if not rejection_reason(fit, shape, self.options)]
+            shapes = [
+                shape.tube_links_at(fit.q)
+                for shape, fit in last
+                if not frame_rejection_reason(fit, shape, self.options)
+            ]
             clouds = [look.sights[0].points for look in looks]
-            near = self.shape_fitter.max_informative_distance
+            near = self.shape_fitter.max_informative_surface_distance
             found = BackgroundPoints.from_static_points(clouds, 2 * filters.voxel_size, noise, shapes, near)
-            background = found.joined(background)
+            background = found.merged_with(background)
         return SequenceCalibration(calibration, sizes, background)
 
     def _calibration(self, progress: Callable[[int, str], None]) -> CameraCalibration:
         options = self.options
         if self.arm_surface is None:
-            return calibration_as_given(self.sequence.camera_pose, options.clock, "no robot to compare")
+            return calibration_without_estimation(self.sequence.camera_pose, options.clock, "no robot to compare")
         glimpses = []
         for done, i in enumerate(self.calibration_frames):
             progress(done, f"reading {self.sequence.frame_names[i]}")
@@ -273,7 +277,7 @@ class FrameTracker:
             where = self.sequence.source
             raise DataError(f"{spans}: their clocks are not the same", where=where, hint=f"{hint} together")
 
-    def _shape(self, sizes: DimensionCheck) -> ShapeFitter:
+    def _shape(self, sizes: TubeDimensionCheck) -> ShapeFitter:
         """The object with the sizes that were estimated."""
         key = tuple(np.where(sizes.is_estimated, sizes.log_ratio, 0.0).tolist()) if any(sizes.is_estimated) else ()
         if key not in self._shapes:
@@ -287,13 +291,13 @@ class FrameTracker:
         self, q: Array, calibration: CameraCalibration, background: BackgroundPoints
     ) -> Callable[[Array], BoolArray]:
         """Which places the filters leave no points of, the robot at a configuration."""
-        is_inside = self.object_region.membership_at(q, calibration.camera_position)
+        is_inside = self.object_region.membership_test_at(q, calibration.camera_position)
         within = self.options.filters.robot_padding + self._widest
 
         def removed(places: Array) -> BoolArray:
-            gone = ~is_inside(places) | background.contains(places, self._widest)
+            gone = ~is_inside(places) | background.is_near_background(places, self._widest)
             if self.robot_surfaces is not None:
-                gone |= self.robot_surfaces.is_within_distance(places, q, within)
+                gone |= self.robot_surfaces.is_within_surface_distance(places, q, within)
             return gone
 
         return removed
@@ -314,17 +318,21 @@ class FrameTracker:
     def _read(self, index: int, calibration: CameraCalibration) -> tuple[WeightedCloud, Array]:
         """A frame's cloud in the world where the object can be, the robot's points among them, and all its points."""
         found, finite = self._finite(self.sequence, index)
-        points = calibration.camera_state.to_world(found)
+        points = calibration.camera_state.measured_to_world_points(found)
         filters = self.options.filters
-        q = self._configuration_at_rest(float(calibration.camera_state.to_joint_time(self.sequence.stamps[index])))
-        inside = self.object_region.membership_at(q, calibration.camera_position)(points)
+        q = self._configuration_at_rest(
+            float(calibration.camera_state.stamps_to_joint_clock(self.sequence.stamps[index]))
+        )
+        inside = self.object_region.membership_test_at(q, calibration.camera_position)(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
         if filters.object_colours and self.sequence.load_colours is not None:
             colours = self.sequence.load_colours(index)
             if colours is None:
                 raise DataError("the cloud has no colours")
-            inside[inside] = has_any_colour(colours[finite][inside], filters.object_colours, filters.max_colour_angle)
+            inside[inside] = has_wanted_colour(
+                colours[finite][inside], filters.object_colours, filters.max_colour_angle
+            )
             if not inside.any():
                 raise DataError("no point has one of the object's colours: check filters.object_colours")
         return voxel_averages(points[inside], filters.voxel_size), points
@@ -338,41 +346,43 @@ class FrameTracker:
         shape = self._shape(common.dimensions)
         fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
         fits.sort(key=lambda fit: fit.mean_distance)
-        reason = rejection_reason(fits[0], shape, self.options)
+        reason = frame_rejection_reason(fits[0], shape, self.options)
         anywhere = self.initial_shape_finder is not None
-        if anywhere and not reason and is_self_touching(fits[0].link_ends, shape.link_radii):
+        if anywhere and not reason and is_shape_self_touching(fits[0].link_ends, shape.link_radii):
             reason = "the object crosses or touches itself"
         other = fits[1] if len(fits) > 1 and fits[1].mean_distance < _AS_GOOD * fits[0].mean_distance else None
         spent = work.report.cpu_seconds + time.process_time() - begun
         work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason)
         return work.report
 
-    def frame_stages(self, frame: FrameReport, common: SequenceCalibration) -> FrameStages | None:
+    def frame_processing_stages(self, frame: FrameReport, common: SequenceCalibration) -> FrameProcessingStages | None:
         """Processing stages of a frame, for figures; None if its cloud cannot be read."""
         try:
-            cloud = common.camera_calibration.camera_state.to_world(self.sequence.load_cloud(frame.index))
+            cloud = common.camera_calibration.camera_state.measured_to_world_points(
+                self.sequence.load_cloud(frame.index)
+            )
         except DataError:
             return None
         work, _ = self._look(frame.index, common.camera_calibration, common.background)
         filtered = None if work.filtered is None else work.filtered.points
-        return FrameStages(frame, common.camera_calibration.camera_position, cloud, filtered, work.skeleton)
+        return FrameProcessingStages(frame, common.camera_calibration.camera_position, cloud, filtered, work.skeleton)
 
-    def unprocessed_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
+    def unprocessed_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Report of a frame before processing, with the reason if it is dropped."""
         stamp = float(self.sequence.stamps[index])
-        t = float(calibration.camera_state.to_joint_time(stamp))
+        t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def reject_outlying_frames(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+    def assign_root_and_mark_outliers(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Frames with outlying ones dropped, and how the root end was chosen."""
-        rooted, note = choose_root_ends(frames, self.options)
-        return reject_outlying_frames(rooted, self.options), note
+        rooted, note = with_consistent_root_end(frames, self.options)
+        return mark_outlying_frames(rooted, self.options), note
 
     def to_track_result(self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration) -> TrackResult:
         """Tracking result of the frames; `DataError` if none is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.foreign_objects(frames)
-        measured = tracked_points(frames, columns, common, things, self.options, self.sequence.source)
+        measured = tracked_states_and_points(frames, columns, common, things, self.options, self.sequence.source)
         place = self._shape(common.dimensions).points_at
         return TrackResult(
             self.point_names,
@@ -394,7 +404,7 @@ class FrameTracker:
         box = corners.min(axis=0) - self._widest, corners.max(axis=0) + self._widest
         seen, noise = [(t, fit.foreign_clusters) for t, fit in fitted], self.options.shape_fit.surface_noise_std
         coloured, still = self.sequence.load_colours is not None, self.options.background_estimation == "frames"
-        return group_foreign_objects(seen, noise, box, self._links, coloured, still)
+        return group_foreign_clusters(seen, noise, box, self._links, coloured, still)
 
     def _links(self, t: float) -> dict[str, Array]:
         """Poses of what moves with the robot at a time, by the names of the links."""
@@ -412,7 +422,7 @@ class FrameTracker:
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
     ) -> tuple[_Work, _Look | None]:
         """What a frame shows of the object, None with the reason in its report."""
-        work = _Work(self.unprocessed_report(index, calibration, self._reasons.get(index, "")))
+        work = _Work(self.unprocessed_frame_report(index, calibration, self._reasons.get(index, "")))
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
         except DataError as error:
@@ -430,18 +440,18 @@ class FrameTracker:
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
             state = calibration.camera_state
-            own = estimate_stamp_delay(self.arm_surface, state, stamp, cloud.points, rng, typical)
+            own = estimate_excess_stamp_delay(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
-                if is_stamped_late(own, options.clock):
+                if is_stamp_delay_significant(own, options.clock):
                     raise DataError(f"its stamp is late: by {1e3 * own.delay:.0f} ms")
         q = self._configuration_at_rest(t)
         filters, kept = options.filters, np.ones(len(cloud), bool)
         if self.robot_surfaces is not None:
-            kept = ~self.robot_surfaces.is_within_distance(cloud.points, q, filters.robot_padding)
-        kept[kept] = ~background.contains(cloud.points[kept])
+            kept = ~self.robot_surfaces.is_within_surface_distance(cloud.points, q, filters.robot_padding)
+        kept[kept] = ~background.is_near_background(cloud.points[kept])
         # beside the robot's points: among all surfaces, wrong points are few
-        cloud = cloud.select(is_not_outlier(cloud, filters.outlier_neighbours, filters.outlier_z_max, kept))
+        cloud = cloud.select(is_statistical_inlier(cloud, filters.outlier_neighbours, filters.outlier_z_max, kept))
         work.filtered = cloud
         work.say(n_filtered_points=len(cloud))
         if len(cloud) < filters.min_points:
@@ -466,8 +476,8 @@ class FrameTracker:
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
             raise DataError("no part of the cloud is dense enough for a skeleton")
-        work.filtered = rest = cloud.select(found.has_node)
-        return _Look((CloudObservation(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
+        work.filtered = rest = cloud.select(found.has_skeleton_node)
+        return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
     def _anywhere(
         self, starts: InitialShapeFinder, work: _Work, cloud: WeightedCloud, rng: np.random.Generator, given: _Given
@@ -487,7 +497,7 @@ class FrameTracker:
         own = cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter
         work.filtered = rest = cloud.select(own)
         seen = rest.points, rest.point_weights, course.nodes, *given
-        sights = [CloudObservation(*seen, start.end_anchors) for start in found]
+        sights = [ProcessedFrameCloud(*seen, start.end_anchors) for start in found]
         return _Look(sights, self.shape_fitter.rest_configuration, [(start.q,) for start in found])
 
 

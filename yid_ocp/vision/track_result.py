@@ -20,7 +20,7 @@ from yid_ocp.errors import OutputError
 from yid_ocp.files import atomic_write
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.point_cloud import CloudSkeleton
-from yid_ocp.vision.sequence_calibration import DimensionCheck, ForeignObject
+from yid_ocp.vision.sequence_calibration import ForeignObject, TubeDimensionCheck
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 
 _CAMERA_POINT_GROUP = "points_camera"
@@ -57,7 +57,7 @@ def count_drop_reasons(frames: Iterable[FrameReport]) -> dict[str, int]:
 
 
 @dataclass(frozen=True, eq=False)
-class FrameStages:
+class FrameProcessingStages:
     """Processing stages of one frame, for figures; stages that a dropped frame did not reach are None."""
 
     report: FrameReport
@@ -81,7 +81,7 @@ class TrackResult:
     shared_std: Array
     frame_reports: tuple[FrameReport, ...]  # all of them, by time stamp
     camera_calibration: CameraCalibration
-    dimensions: DimensionCheck  # what the frames say of the object's lengths and radii
+    dimensions: TubeDimensionCheck  # what the frames say of the object's lengths and radii
     foreign_objects: tuple[ForeignObject, ...]  # what stood about the object
     root_note: str  # how the root was told from other ends; empty where the model says where it is
     _place: Callable[[Array], Array]  # from a configuration to the points
@@ -101,7 +101,7 @@ class TrackResult:
         return self._place(self.configuration_at(t))
 
     @property
-    def drop_reason_counts(self) -> dict[str, int]:
+    def frame_drop_reason_counts(self) -> dict[str, int]:
         """Number of frames dropped for each reason."""
         return count_drop_reasons(self.frame_reports)
 
@@ -117,7 +117,7 @@ class TrackResult:
             words += f"; of std, {1e3 * np.nanmedian(self.shared_std):.1f} mm (median) are one error of all frames"
         return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, pose=pose)
 
-    def to_recording(self, recording: Recording | None) -> Recording:
+    def recording_with_points(self, recording: Recording | None) -> Recording:
         """A recording with these points as its `points_camera`; `DataError` as `validate_recording`.
 
         Without a recording, as of an object that no robot holds, one of these points alone.
@@ -139,7 +139,7 @@ _Picture = tuple[str, str, Sequence[tuple[Array, str, float]], Sequence[Array], 
 """Name and title of a picture, points with colour and size, lines (2, 3) and their colour."""
 
 
-def draw_frame_stages(stages: FrameStages, folder: str | os.PathLike[str]) -> list[Path]:
+def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os.PathLike[str]) -> list[Path]:
     """Write one picture for every stage that a frame came to: cloud, filtered, skeleton, graph, fit.
 
     They are `NAME_1_cloud.png` to `NAME_5_fit.png` in the folder, which is made; the title of the last one says why the
@@ -170,7 +170,7 @@ def draw_frame_stages(stages: FrameStages, folder: str | os.PathLike[str]) -> li
     return written
 
 
-def _pictures(stages: FrameStages) -> list[_Picture]:
+def _pictures(stages: FrameProcessingStages) -> list[_Picture]:
     """The pictures of every stage that the frame came to, in order."""
     raw, near, skeleton, fit = stages.raw_points, stages.filtered_points, stages.skeleton, stages.report.shape_fit
     made: list[_Picture] = [("cloud", f"{len(raw)} points of the camera", [(raw, _GREY, 0.4)], [], "")]
@@ -214,7 +214,7 @@ def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Pictur
         figure.savefig(temporary, format="png", dpi=110)
 
 
-def draw_track(track: TrackResult, file: str | os.PathLike[str]) -> None:
+def draw_tracked_points(track: TrackResult, file: str | os.PathLike[str]) -> None:
     """Write a picture of the points over time: the good frames with two standard deviations, and the spline between.
 
     `OutputError` where the file cannot be written.

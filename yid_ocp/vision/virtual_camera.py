@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.rotations import homogeneous_transform
-from yid_ocp.vision.frames import XTION_INTRINSICS, CameraIntrinsics, FrameSequence, validated_pose
+from yid_ocp.vision.frames import XTION_INTRINSICS, CameraIntrinsics, FrameSequence, validated_camera_pose
 from yid_ocp.vision.surface_meshes import (
     ArticulatedSurfaces,
     CameraScene,
@@ -56,7 +56,7 @@ class DepthCamera:
     outlier_probability: float = 0.0
     outlier_depth_range: float = 0.4  # [m], to either side of the true depth
 
-    def simulate_depth_image(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
+    def _simulate_depth_image(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
         """Measured depth image [m], NaN where nothing was measured.
 
         From the true one [m], infinite where there is nothing, and the cosine of ray and normal, all (height, width).
@@ -114,7 +114,7 @@ class FrameTiming:
     late_fraction: float = 0.0  # share of frames that are stamped `late_stamp_delay` [s] too late
     late_stamp_delay: float = 0.15
 
-    def sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
         """Times of the pictures that arrive and their stamps, both shape (M,) [s]."""
         if not (self.mean_rate > 0 and 0 <= self.period_jitter < 1):
             raise ConfigError(
@@ -173,7 +173,7 @@ class _Images(Sequence[Array]):
         if self._kept[0] != index:
             depth, cosine, _ = self.surfaces.render_depth_image(self.camera.intrinsics, self.pose, self.q[index])
             rng = np.random.default_rng([self.seed, index])
-            self._kept = index, self.camera.simulate_depth_image(depth, cosine, rng)
+            self._kept = index, self.camera._simulate_depth_image(depth, cosine, rng)
         return self._kept[1]
 
 
@@ -199,9 +199,9 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     DataError, ModelError
         No Open3D, no object, a mesh that cannot be read, or a pose that is none.
     """
-    lens, pose = camera.depth_camera.intrinsics, validated_pose(camera.pose, "sequence")
+    lens, pose = camera.depth_camera.intrinsics, validated_camera_pose(camera.pose, "sequence")
     times, path, rng = np.asarray(t, float), np.asarray(q, float), np.random.default_rng(camera.seed)
-    taken, stamps = camera.timing.sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
+    taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
     course = CubicSpline(times, path, axis=0)
     configuration = np.asarray(course(taken))
     of = scene.system, scene.parameter_values

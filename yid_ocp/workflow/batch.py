@@ -20,16 +20,16 @@ from yid_ocp.analysis.estimate_history import assess_drift
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_hint
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_json
-from yid_ocp.parallel import LOCAL_WORKERS, Task, TaskResult, WorkerConfig, run_tasks
+from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import ReportData
 from yid_ocp.report.summaries import batch_summary
 from yid_ocp.version import installed_versions
-from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print, workers_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_folder import local_time_text
-from yid_ocp.workflow.run_history import history_result, read_estimates, require_same_model
+from yid_ocp.workflow.run_history import estimate_history_result, read_estimates, require_same_model
 from yid_ocp.workflow.run_inputs import input_files
 from yid_ocp.workflow.solve import run_solve
 
@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class BatchRun:
+class _BatchRun:
     """Configuration and overrides of one run of a batch.
 
     Attributes
@@ -59,19 +59,19 @@ class BatchRun:
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     members = list_batch_runs(arguments.configs, arguments.recordings, arguments.overrides)
-    workers = workers_from_arguments(arguments) or LOCAL_WORKERS
+    workers = workers_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
     words = ["yid-ocp", "batch", *map(str, arguments.configs)]
     words += ["--recordings", arguments.recordings] if arguments.recordings else []
     words += ["--command", arguments.each, *(word for said in arguments.overrides for word in ("--set", said))]
     again = shlex.join([*words, "--out", str(out)])
     asked = (members, out, arguments.each, workers)
-    return run_and_print(arguments, lambda shown: run_batch(*asked, shown, again), batch_summary)
+    return run_command_and_print(arguments, lambda shown: run_batch(*asked, shown, again), batch_summary)
 
 
 def list_batch_runs(
     configs: Sequence[str | Path], recordings: str | None = None, overrides: Sequence[str] = ()
-) -> list[BatchRun]:
+) -> list[_BatchRun]:
     """Runs of a batch: one per configuration, or one per configuration and matching recording.
 
     Parameters
@@ -111,19 +111,19 @@ def list_batch_runs(
             for path in paths
             for file in files
         ]
-    members: dict[str, BatchRun] = {}
+    members: dict[str, _BatchRun] = {}
     for stem, path, settings in entries:
         names = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
         name = next(name for name in names if name not in members)
-        members[name] = BatchRun(name, path.resolve(), settings)
+        members[name] = _BatchRun(name, path.resolve(), settings)
     return list(members.values())
 
 
 def run_batch(
-    members: Sequence[BatchRun],
+    members: Sequence[_BatchRun],
     out: str | Path,
     command: str = "solve",
-    workers: WorkerConfig | Executor = LOCAL_WORKERS,
+    workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
     progress: Progress = NULL_PROGRESS,
     command_line: str = "",
 ) -> CommandResult[None]:
@@ -133,7 +133,7 @@ def run_batch(
 
     Parameters
     ----------
-    members : sequence of BatchRun
+    members : sequence of _BatchRun
         See `list_batch_runs`.
     out : str or Path
         Folder: `runs/NAME/` (a run folder each), `tasks/` (results of tasks, see `yid_ocp.parallel`), then `batch.json`
@@ -167,7 +167,7 @@ def run_batch(
         more = {"inputs": inputs, "command": command, "folder": str(folder / _RUNS_FOLDER)}
         tasks.append(Task(member.name, own | more))
     progress.begin_stage(f"{command} of {len(tasks)} runs")
-    done = run_tasks(run_batch_task, tasks, folder / _TASKS_FOLDER, workers, progress.report_parts_done)
+    done = run_tasks(_run_batch_task, tasks, folder / _TASKS_FOLDER, workers, progress.report_parts_done)
     results |= {entry.name: entry for entry in done}
     entries = [_entry(results[member.name], folder) for member in members]
     result = {
@@ -187,10 +187,10 @@ def run_batch(
     return CommandResult(folder, written, None, all(entry["ok"] for entry in entries))
 
 
-def run_batch_task(
+def _run_batch_task(
     name: str, config: Path, settings: Sequence[str], inputs: Sequence[Path], command: str, folder: str
 ) -> dict[str, Any]:
-    """Task: run one member in its own folder, replacing an earlier attempt; returns its entry for batch.json."""
+    """Task: do one run of the batch in its own folder, replacing an earlier attempt; its entry for batch.json."""
     del inputs  # they are part of what the result is kept by
     target = Path(folder) / name
     if target.exists():
@@ -231,7 +231,7 @@ def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
         return None
     try:
         require_same_model(folders)
-        return history_result(assess_drift([read_estimates(folder) for folder in folders]))
+        return estimate_history_result(assess_drift([read_estimates(folder) for folder in folders]))
     except YidError:
         return None
 

@@ -25,22 +25,22 @@ from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind
 from yid_ocp.diagnosis.blind.ensemble import MAX_CASE_DRAWS
-from yid_ocp.diagnosis.diagnosis_result import threshold_statistics
+from yid_ocp.diagnosis.diagnosis_result import statistics_compared_with_thresholds
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import to_json_types, write_json, write_text
-from yid_ocp.parallel import LOCAL_WORKERS, Task, WorkerConfig, require_task_values, run_tasks
+from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.diagnosis_summaries import blind_markdown
+from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
 from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
 from yid_ocp.report.summaries import blind_summary
 from yid_ocp.version import installed_versions, package_source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise
-from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_STEP, SimulationOptions
+from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, run_and_print, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print, workers_from_arguments
 from yid_ocp.workflow.run_folder import local_time_text
 from yid_ocp.workflow.run_inputs import read_recordings
 
@@ -57,11 +57,11 @@ def run(arguments: argparse.Namespace) -> int:
     runs = [load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG) for path in given]
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
         runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG))
-    workers = workers_from_arguments(arguments) or LOCAL_WORKERS
+    workers = workers_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     purpose = blind.ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
     asked = (runs, out, arguments.cases, arguments.seed)
-    return run_and_print(arguments, lambda shown: run_blind(*asked, shown, workers, purpose), blind_summary)
+    return run_command_and_print(arguments, lambda shown: run_blind(*asked, shown, workers, purpose), blind_summary)
 
 
 def run_blind(
@@ -70,7 +70,7 @@ def run_blind(
     count: int = 20,
     seed: int = 1,
     progress: Progress = NULL_PROGRESS,
-    workers: WorkerConfig | Executor = LOCAL_WORKERS,
+    workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
     purpose: str = blind.ENSEMBLE_PURPOSES[0],
 ) -> CommandResult[None]:
     """Run a blind validation of the diagnosis in several processes; finished parts in the folder are reused.
@@ -121,11 +121,11 @@ def run_blind(
         log.warning("finished cases are in %s; the same command goes on with the others", proof.folder)
         raise
     marks = [
-        blind.score_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
+        blind.score_blind_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
         for label, found in zip(labels, answers, strict=True)
     ]
     flags = ["--cases", count, "--seed", seed, *(["--calibration"] if purpose == blind.ENSEMBLE_PURPOSES[1] else [])]
-    result = blind.score_ensemble(marks) | {
+    result = blind.ensemble_success_rates(marks) | {
         "seed": seed,
         "purpose": purpose,
         "code": package_source_hash(),
@@ -148,7 +148,7 @@ def _write_outcome(
     folder: Path, written: dict[str, Any], runs: Sequence[RunSettings], progress: Progress
 ) -> CommandResult[None]:
     write_json(folder / "result.json", written)
-    write_text(folder / "table.md", "\n".join(blind_markdown(written)) + "\n")
+    write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")
     draw_blind_results(folder, written)
     if all(entry.output.write_report for entry in runs):
         progress.begin_stage("writing the report")
@@ -215,7 +215,7 @@ class _Proof:
         files = {name: self.config_file(name) for name in configs}
         experiments, chains = list_experiments(files, self.seed, self.purpose)
         weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
-        plan = blind.plan_cases(self.count, self.seed, weights, chains, self.purpose)
+        plan = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
         self.progress.begin_stage(f"preparing {len(used)} {'experiment' if len(used) == 1 else 'experiments'}")
         told = {name: {"experiment": vars(experiments[name])} for name in used}
@@ -229,14 +229,14 @@ class _Proof:
             wanted = {"planned": asdict(entry), "folder": str(cases)}
             tasks.append(Task(f"case {entry.number}", {**told[name], **known, **wanted}))
         made = self.done(_draw_case, tasks, "sealed/drawn")
-        text, digest = blind.seal_labels([blind.CaseLabel.from_dict(entry["label"]) for entry in made])
+        text, digest = blind.seal_labels_with_hash([blind.CaseGroundTruth.from_dict(entry["label"]) for entry in made])
         write_text(self.folder / "sealed/labels.json", text)
         write_json(cases / "cases.json", [entry["case"] for entry in made])
         said = {"sha256": digest, "cases": self.count, "seed": self.seed, "purpose": self.purpose}
         write_json(commitment, said | {"configs": dict(configs), "code": package_source_hash()})
 
     def best_closures(
-        self, cases: Sequence[Task], labels: Sequence[blind.CaseLabel], answers: Sequence[Mapping[str, Any]]
+        self, cases: Sequence[Task], labels: Sequence[blind.CaseGroundTruth], answers: Sequence[Mapping[str, Any]]
     ) -> dict[str, float]:
         """By case, what its true effects close, where one of them or two were withheld and a gap was seen."""
         tasks = []
@@ -265,7 +265,7 @@ def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -
     first = Path(folder) / f"{name}.h5"
     BlindExperiment(**experiment)._write_first_recording(first)
     _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
-    detectable = ensemble.detectable_effects_to_json()
+    detectable = ensemble.detectable_effect_sizes_to_json()
     write_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 
@@ -275,8 +275,8 @@ def _draw_case(
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
     _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
-    ensemble.load_detectable_effects(json.loads(detectable.read_text("utf-8")))
-    case, label = ensemble.draw_case(blind.PlannedCase(**planned))
+    ensemble.load_detectable_effect_sizes(json.loads(detectable.read_text("utf-8")))
+    case, label = ensemble.draw_planned_case(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")
     told = {
@@ -301,14 +301,14 @@ def diagnose_case_task(
     case, candidates = _case(name, recordings, without), run.diagnosis.candidates
     begun = time.perf_counter()
     try:
-        result = blind.diagnose_case(ensemble, case, candidates, run.diagnosis).to_dict()
+        result = blind.diagnose_blind_case(ensemble, case, candidates, run.diagnosis).to_dict()
     except YidError as error:
         result = {"verdict": "insufficient_data", "message": str(error), **_NO_ANSWER}
     found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})
     if experiment["purpose"] == blind.ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
         try:
-            anything = blind.diagnose_case(ensemble, case, candidates, blind.permissive_thresholds(run.diagnosis))
-            found["open"] = to_json_types(threshold_statistics(anything))
+            anything = blind.diagnose_blind_case(ensemble, case, candidates, blind.permissive_thresholds(run.diagnosis))
+            found["open"] = to_json_types(statistics_compared_with_thresholds(anything))
         except YidError as error:
             found["open"] = {"message": str(error)}
     return found
@@ -321,7 +321,9 @@ def _true_effect_closure(
     run, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
     case = _case(name, recordings, ())
     try:
-        best = blind.best_possible_closure(ensemble, case, blind.CaseLabel.from_dict(label), run.diagnosis.candidates)
+        best = blind.true_effects_gap_closure(
+            ensemble, case, blind.CaseGroundTruth.from_dict(label), run.diagnosis.candidates
+        )
     except YidError:
         return None
     return best if math.isfinite(best) else None
@@ -389,14 +391,14 @@ class BlindExperiment:
         """Settings of the model that simulates the recordings."""
         return load_config(self.config_file, EXPERIMENT_VARIATIONS[self.variation].simulation_overrides())
 
-    def _recording_conditions(self) -> blind.RecordingConditions:
+    def _recording_conditions(self) -> blind.SyntheticRecordingConditions:
         """Conditions under which the recordings are simulated, without the camera."""
         varied = EXPERIMENT_VARIATIONS[self.variation]
         noise = ArmSensorNoise()
         if varied.has_torque_noise:
             noise = ArmSensorNoise(effort_std=_TORQUE_NOISE_STD, effort_bias_std=_TORQUE_OFFSET_STD)
-        simulation = SimulationOptions(time_step=DEFAULT_SIMULATOR_STEP * varied.time_step_factor)
-        return blind.RecordingConditions(varied.n_recordings, noise, simulation, purpose=self.purpose)
+        simulation = SimulationOptions(time_step=DEFAULT_SIMULATOR_TIME_STEP * varied.time_step_factor)
+        return blind.SyntheticRecordingConditions(varied.n_recordings, noise, simulation, purpose=self.purpose)
 
     def _write_first_recording(self, file: Path) -> None:
         """Write the first recording, which fixes initial configuration and sensors."""
@@ -409,7 +411,7 @@ class BlindExperiment:
         vision = not varied.is_without_object and any(group.pose is not None for group in first[0].points)
         values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
         conditions = replace(self._recording_conditions(), has_camera=vision)
-        posture = blind.initial_joint_positions(system, first[0])
+        posture = blind.initial_driven_joint_positions(system, first[0])
         for attempt in range(MAX_CASE_DRAWS):
             rng = np.random.default_rng([self.seed, blind.ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
             try:
@@ -422,20 +424,20 @@ class BlindExperiment:
         what = f"none of {MAX_CASE_DRAWS} motions can be simulated"
         raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", hint=hint)
 
-    def _build_ensemble(self, first: Path) -> tuple[RunSettings, blind.CaseGenerator]:
+    def _build_ensemble(self, first: Path) -> tuple[RunSettings, blind.BlindCaseGenerator]:
         """Settings of the diagnosed model and the ensemble, built from the first recording."""
         return _ensemble(self, first, first.stat().st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=1)
-def _ensemble(experiment: BlindExperiment, first: Path, written: int) -> tuple[RunSettings, blind.CaseGenerator]:
+def _ensemble(experiment: BlindExperiment, first: Path, written: int) -> tuple[RunSettings, blind.BlindCaseGenerator]:
     """See `BlindExperiment._build_ensemble`; kept with its compiled step for the next task of the same experiment."""
     del written
     varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
     simulated = build_system(simulated_run)
     begun = (f"recordings.estimate=[{json.dumps(str(first))}]", "recordings.held_out=[]")
     run = load_config(experiment.config_file, (*varied.diagnosis_overrides(simulated.driven), *begun))
-    ensemble = blind.CaseGenerator(
+    ensemble = blind.BlindCaseGenerator(
         build_problem(run),
         experiment.seed,
         (lambda times: build_system(simulated_run, times)) if simulated.segment_layouts else None,
@@ -461,7 +463,7 @@ def _require_compatible(run: RunSettings) -> None:
 def list_experiments(
     configs: Mapping[str, Path], seed: int, purpose: str
 ) -> tuple[dict[str, BlindExperiment], frozenset[str]]:
-    """All experiments by name, and the names of those whose object has divisible links.
+    """Virtual experiments by name, and the names of those whose object's links can be divided further.
 
     Variations that a configuration does not allow, as one whose frames sit on the object that is taken away, are left
     out.

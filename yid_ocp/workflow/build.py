@@ -13,7 +13,7 @@ import numpy as np
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import GraspSettings, ParameterSettings, RunSettings
-from yid_ocp.data.channel_checks import median_edge_lengths
+from yid_ocp.data.channel_checks import median_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import DataError, YidError, nearest_name_hint
@@ -26,7 +26,13 @@ from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.servos_and_springs import PositionServoOptions, RobotJointSpring
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.workflow.run_inputs import input_files, load_plugins, locate_errors, read_recordings, unknown_name_error
+from yid_ocp.workflow.run_inputs import (
+    add_setting_location_to_errors,
+    input_files,
+    load_plugins,
+    read_recordings,
+    unknown_name_error,
+)
 
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping beside those of the joints
 _DEFAULT_JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
@@ -35,7 +41,7 @@ _OTHER_SIDE = {"left": "right", "right": "left"}
 
 
 def build_system(run: RunSettings, link_division: int = 1) -> System:
-    """The system of a run, its parameters at the values and bounds of the settings.
+    """The mechanical model of a run, its parameters at the values and bounds of the settings.
 
     Parameters
     ----------
@@ -55,13 +61,13 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         return _completed(run, _clamped_system(run, model.object, model.object.kind))
     robot = None
     if model.robot is not None:
-        with locate_errors(run, "model", "arms", "joints"):
-            robot = read_urdf(model.robot, **urdf_options(run))
+        with add_setting_location_to_errors(run, "model", "arms", "joints"):
+            robot = read_urdf(model.robot, **urdf_reader_options(run))
     joints = () if robot is None else robot.joint_names
     clamps = _clamp_mechanism(run)
     damping, of_object = _dampings(run, joints)
     item = model.object
-    with locate_errors(run, "model", "object"):
+    with add_setting_location_to_errors(run, "model", "object"):
         objects = [] if item is None else [(item.build(of_object, link_division), *item.placement)]
     mode = "driven" if arms_are_estimated_states(run) else arms.mode
     for i, name in enumerate(arms.passive_joints):
@@ -71,9 +77,9 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     if robot is None and not objects:
         hint = "set model.robot or model.object"
         raise run.config_error("the model has neither a robot nor an object", "model", hint=hint)
-    with locate_errors(run, "model", "frames"):
+    with add_setting_location_to_errors(run, "model", "frames"):
         carrier, items = _with_extra_frames(run, robot if clamps is None else clamps, [item for item, *_ in objects])
-    with locate_errors(run, "model"):
+    with add_setting_location_to_errors(run, "model"):
         system = System.build(
             carrier,
             objects=[(item, frame, place) for item, (_, frame, place) in zip(items, objects, strict=True)],
@@ -91,19 +97,19 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         )
     if any(said.marker_reference_pose for said in model.frames.values()) and run.recordings.estimate:
         # where markers sit when nobody says which recording is meant
-        [places] = marker_parameter_values(run, system, read_recordings(run, count=1)).values()
-        system = replace(system, parameters=system.parameters.with_values(places))
+        [places] = marker_positions_from_reference_pose(run, system, read_recordings(run, count=1)).values()
+        system = replace(system, parameters=system.parameters.with_nominal_values(places))
     return _completed(run, system, link_division)
 
 
-def urdf_options(run: RunSettings) -> dict[str, Any]:
+def urdf_reader_options(run: RunSettings) -> dict[str, Any]:
     """Which joints and links of its robot a run takes, as options of `read_urdf`."""
     arms = run.model.arms
     return {"joints": arms.joints, "locked": arms.locked_joints, "exclude_links": arms.exclude_links}
 
 
 def build_step(run: RunSettings, system: System | None = None) -> Step:
-    """The compiled step of a run."""
+    """The compiled discrete Euler-Lagrange step of a run's system."""
     said = run.problem
     system = build_system(run) if system is None else system
     return compile_step(system, said.time_step, said.force_split, said.constraint_force, use_compiler=said.use_compiler)
@@ -114,9 +120,9 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
     return build_system(load_config(path, overrides))
 
 
-def build_cable(run: RunSettings) -> CableTopology | None:
-    """Measured vertices and clamps of a run's object that brings its clamps, None for another object."""
-    with locate_errors(run, "model", "object"):
+def clamped_cable_topology(run: RunSettings) -> CableTopology | None:
+    """Measured vertices and clamps of a run's cable held by clamps; None for an object without clamps of its own."""
+    with add_setting_location_to_errors(run, "model", "object"):
         return run.model.object.topology() if isinstance(run.model.object, ClampedObject) else None
 
 
@@ -155,7 +161,7 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
 
 def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
     """The system of an object that brings its clamps."""
-    cable = build_cable(run)
+    cable = clamped_cable_topology(run)
     assert cable is not None
     for key in ("robot", "grasp", "springs", "clamps", "frames"):
         if getattr(run.model, key):
@@ -165,19 +171,19 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
     if not recordings:
         what = f"a {kind}'s lengths come from recordings"
         raise run.config_error(what, "recordings", "estimate", hint="list at least one")
-    with locate_errors(run, "model", "object"):
-        return item.clamped_system(median_edge_lengths(cable.edges, recordings), run.model.gravity)
+    with add_setting_location_to_errors(run, "model", "object"):
+        return item.clamped_system(median_point_pair_distances(cable.edges, recordings), run.model.gravity)
 
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
     """The system with the effects and the parameters' values of the settings."""
     for i, said in enumerate(run.model.effects):
-        with locate_errors(run, "model", "effects", i):
+        with add_setting_location_to_errors(run, "model", "effects", i):
             system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])
-    chosen, entries = parameter_settings(run, system.parameters), []
+    chosen, entries = settings_by_parameter_name(run, system.parameters), []
     for entry in system.parameters:
         if entry.name in chosen:
-            given, factor = chosen[entry.name], link_division_factor(run, entry.name, link_division)
+            given, factor = chosen[entry.name], divided_link_parameter_scale(run, entry.name, link_division)
             lower, upper = (entry.lower, entry.upper) if given.bounds is None else (factor * b for b in given.bounds)
             value = entry.value if given.initial is None else factor * given.initial
             key = [key for key in run.parameters if _matches(entry.name, key)][-1]
@@ -185,7 +191,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
                 what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are not possible"
                 allowed = f"within {entry.lower:g} to {entry.upper:g} {entry.unit}, lower first"
                 raise run.config_error(what, "parameters", key, "bounds", allowed=allowed)
-            with locate_errors(run, "parameters", key, "initial"):
+            with add_setting_location_to_errors(run, "parameters", key, "initial"):
                 entry = replace(entry, value=value, lower=lower, upper=upper)
         entries.append(entry)
     return replace(system, parameters=Parameters(entries))
@@ -195,8 +201,8 @@ def _matches(name: str, key: str) -> bool:
     return name == key or fnmatch.fnmatchcase(name, key)
 
 
-def parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
-    """Settings of every parameter that a name or pattern of the run matches; later keys override earlier ones.
+def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
+    """Settings by parameter name, for every name or pattern that matches; later keys override earlier ones.
 
     Raises
     ------
@@ -214,15 +220,15 @@ def parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, Pa
     return result
 
 
-def free_parameters(run: RunSettings, parameters: Parameters) -> list[str]:
-    """Names of the parameters that the settings free."""
-    return [name for name, said in parameter_settings(run, parameters).items() if said.free]
+def free_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
+    """Names of the parameters that the settings declare to be estimated."""
+    return [name for name, said in settings_by_parameter_name(run, parameters).items() if said.free]
 
 
-def link_division_factor(run: RunSettings, name: str, link_division: int) -> int:
-    """Factor on a per-joint parameter that keeps the tube's stiffness when each link is divided."""
+def divided_link_parameter_scale(run: RunSettings, name: str, link_division: int) -> int:
+    """Factor on an elastic joint's parameter that keeps the object's stiffness when each link is divided."""
     item = run.model.object
-    return 1 if item is None else item.link_division_factor(name, link_division)
+    return 1 if item is None else item.link_division_parameter_factor(name, link_division)
 
 
 def system_with_second_arm(run: RunSettings, system: System) -> System | None:
@@ -270,7 +276,7 @@ def _clamp_mechanism(run: RunSettings) -> Mechanism | None:
         if clamp.origin_point == clamp.z_axis_point:
             what = f"clamp '{name}' has one point for both ends"
             raise run.config_error(what, "model", "clamps", name, allowed="two different points")
-        found = floating_clamp(name) if found is None else found.with_mechanism(floating_clamp(name))
+        found = floating_clamp(name) if found is None else found.with_attached_mechanism(floating_clamp(name))
     return found
 
 
@@ -279,7 +285,7 @@ def _with_extra_frames(
 ) -> tuple[Mechanism | None, list[FlexibleObject]]:
     """Robot (or clamps) and objects with the additional frames of the settings.
 
-    A frame whose place the recordings tell has the parameters NAME.x, .y, .z; see `marker_parameter_values`.
+    A frame that the recordings place has parameters NAME.x, .y, .z; see `marker_positions_from_reference_pose`.
     """
     made = list(items)
     for name, said in run.model.frames.items():
@@ -299,7 +305,7 @@ def _with_extra_frames(
         if said.marker_reference_pose:
             tree = _with_marker(tree, name, str(parent))
         else:
-            tree = tree.with_frame(name, parent, transform_from_xyz_rpy(said.xyz, said.rpy))
+            tree = tree.with_added_frame(name, parent, transform_from_xyz_rpy(said.xyz, said.rpy))
         if owner is None:
             carrier = tree
         else:
@@ -309,14 +315,14 @@ def _with_extra_frames(
 
 def _with_marker(tree: Mechanism, name: str, frame: str) -> Mechanism:
     """The mechanism with a frame at a parameter's place in another one, turned like it."""
-    carrier = tree.with_frame(name, frame, np.eye(4)).frames[name]
+    carrier = tree.with_added_frame(name, frame, np.eye(4)).frames[name]
     entries = [Parameter(f"{name}.{axis}", 0.0, "m", description=f"{axis} of {name} in {frame}") for axis in _AXES]
     offset = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(*(entry.symbol for entry in entries)))
     frames = {**tree.frames, name: Frame(carrier.joint_index, carrier.placement @ offset)}
     return replace(tree, frames=frames, parameters=tree.parameters.with_added(entries))
 
 
-def marker_parameter_values(
+def marker_positions_from_reference_pose(
     run: RunSettings, system: System, recordings: Iterable[Recording]
 ) -> dict[str, dict[str, float]]:
     """Marker positions on the object per recording, as parameter values, from its straight reference pose [m].
@@ -333,7 +339,7 @@ def marker_parameter_values(
     names = [name for name, said in run.model.frames.items() if said.marker_reference_pose]
     if not names:
         return {}
-    if run.model.object is not None and not run.model.object.stands_in_world:
+    if run.model.object is not None and not run.model.object.is_root_fixed_in_world:
         what = "the object moves with what carries it, so `marker_reference_pose` does not say where it was"
         where = ("model", "frames", names[0], "marker_reference_pose")
         hint, allowed = f"give model.frames.{names[0]}.xyz instead", "an object whose mount stands in the world"

@@ -14,42 +14,42 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from yid_ocp.analysis.discretisation import min_grasp_gaps
+from yid_ocp.analysis.discretisation import min_grasp_closure_errors
 from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
-    check_dynamic_excitation,
-    check_efforts,
+    check_efforts_by_inverse_dynamics,
+    check_inertial_effort_excitation,
     check_joint_excitation,
     check_joint_limits,
 )
 from yid_ocp.analysis.point_checks import (
-    check_cable_points,
-    check_held_points,
-    check_object_points,
+    check_cable_point_geometry,
+    check_object_points_by_rollout,
     check_point_distances,
+    check_robot_held_points,
 )
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.channel_checks import median_edge_lengths
-from yid_ocp.data.checks import check_recording, duplicate_data_issue, split_at_gaps
-from yid_ocp.data.issues import ISSUE_CAUSES, Issue
+from yid_ocp.data.channel_checks import median_point_pair_distances
+from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_at_gaps
+from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.integrator.step import Step
 from yid_ocp.model import System
-from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPath
+from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDefinition
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.sensors.base import declared_channels
-from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP, is_measured_by_arm
+from yid_ocp.sensors.base import declared_channel_kinds
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_measured_by_arm
 from yid_ocp.workflow.build import (
     arms_are_estimated_states,
-    build_cable,
     build_step,
     build_system,
-    free_parameters,
-    marker_parameter_values,
-    parameter_settings,
+    clamped_cable_topology,
+    free_parameter_names,
+    marker_positions_from_reference_pose,
+    settings_by_parameter_name,
 )
 from yid_ocp.workflow.run_inputs import read_recordings, unknown_name_error
 
@@ -75,7 +75,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     Values that differ from recording to recording (a cable's edges, places of markers) are those of `recordings`.
     """
     parameters = system.parameters
-    chosen = parameter_settings(run, parameters)
+    chosen = settings_by_parameter_name(run, parameters)
     for name in run.problem.start_fit_parameters:
         if name not in parameters:
             raise unknown_name_error(run, "parameter", name, parameters.names, "problem", "start_fit_parameters")
@@ -83,22 +83,23 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     groups = [group for recording in recordings for group in recording.points]
     if arms_are_estimated_states(run):
         # what the encoders say is what counts of the arms, as it does where they are prescribed
-        sensors[POSITION_GROUP] = replace(sensors.get(POSITION_GROUP, SensorOptions()), use=True)
+        sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
         for name in {group.name for group in groups if is_measured_by_arm(group)}:
             sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
-    cable = build_cable(run)
-    own = marker_parameter_values(run, system, recordings)
+    cable = clamped_cable_topology(run)
+    own = marker_positions_from_reference_pose(run, system, recordings)
     clamps = tuple(
-        ClampPath(name, s.origin_point, s.z_axis_point, s.roll_convention) for name, s in run.model.clamps.items()
+        ClampPoseDefinition(name, s.origin_point, s.z_axis_point, s.roll_convention)
+        for name, s in run.model.clamps.items()
     )
     if cable is not None and isinstance(run.model.object, ClampedObject):
         clamps = cable.clamp_paths
         for name in {group.name for group in groups}:
             said = sensors.get(name, SensorOptions())
-            sensors[name] = said if said.points is not None else replace(said, points=cable.free_vertices)
+            sensors[name] = said if said.points is not None else replace(said, points=cable.free_vertex_names)
         for recording in recordings:
-            lengths = median_edge_lengths(cable.edges, [recording], _START_FRAMES)
-            if values := run.model.object.recording_parameters(lengths):
+            lengths = median_point_pair_distances(cable.edges, [recording], _START_FRAMES)
+            if values := run.model.object.recording_parameter_values(lengths):
                 own[recording.name] = values
     return replace(
         run.problem,
@@ -129,7 +130,7 @@ def build_problem(
         done with; with `recordings.strict` any doubt about one.
     """
     system = build_system(run) if step is None else step.system
-    free = free_parameters(run, system.parameters)
+    free = free_parameter_names(run, system.parameters)
     if not free:
         hint = "set parameters.NAME.free: true for what is sought"
         raise run.config_error("no parameter is free", "parameters", hint=hint)
@@ -142,7 +143,7 @@ def build_problem(
         hint = "list at least one recording"
         raise run.config_error("there is no recording to estimate on", "recordings", "estimate", hint=hint)
     _check_sensors(run, [*estimate, *held_out])
-    estimate, held_out, issues = _check_recordings(run, system, build_cable(run), free, estimate, held_out)
+    estimate, held_out, issues = _check_recordings(run, system, clamped_cable_topology(run), free, estimate, held_out)
     options = problem_options(run, system, [*estimate, *held_out, *reference_recordings])
     step = build_step(run, system) if step is None else step
     said = replace(options, data_issues=issues)
@@ -156,8 +157,8 @@ def build_problem(
     return problem
 
 
-def initial_grasp_gaps(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
-    """Remaining gap of every grasp at the first configuration of a recording, by grasp name [m]."""
+def initial_grasp_closure_errors(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
+    """Least distance between the two frames of every grasp at a recording's first arm angles, by grasp name [m]."""
     system = problem.system
     if not system.grasps:
         return {}
@@ -166,13 +167,13 @@ def initial_grasp_gaps(problem: EstimationProblem, episode: Episode) -> dict[str
     theta = problem.theta.copy()
     for name, value in problem.options.parameters_by_recording.get(episode.name, {}).items():
         theta[system.parameters.index(name)] = value
-    return min_grasp_gaps(system, posture, theta)
+    return min_grasp_closure_errors(system, posture, theta)
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     """Raise an error for recordings at whose first configuration a grasp cannot be closed."""
     for episode in (*problem.episodes, *problem.held_out):
-        for name, gap in initial_grasp_gaps(problem, episode).items():
+        for name, gap in initial_grasp_closure_errors(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
                 raise DataError(
                     f"grasp '{name}' cannot be closed at the first posture of '{episode.name}': "
@@ -184,16 +185,16 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
 
 
 def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
-    known = {key for recording in recordings for key in recording.sensor_keys}
+    known = {key for recording in recordings for key in recording.sensor_setting_keys}
     for name, said in run.sensors.items():
         if name not in known:
             what, details = f"no recording has a group '{name}'", unknown_name_details(name, sorted(known))
             raise run.config_error(what, "sensors", name, **details)
-        if said.effort_kind is not None and name != EFFORT_GROUP:
-            hint = f"say it of {EFFORT_GROUP}, or leave it out"
+        if said.effort_kind is not None and name != JOINT_EFFORT_GROUP_NAME:
+            hint = f"say it of {JOINT_EFFORT_GROUP_NAME}, or leave it out"
             raise run.config_error(f"'{name}' holds no efforts", "sensors", name, "effort_kind", hint=hint)
         group, _, quantity = name.rpartition(".")
-        constants = next((c.constants for c in declared_channels(group) if c.quantity == quantity), {})
+        constants = next((c.constants for c in declared_channel_kinds(group) if c.quantity == quantity), {})
         for constant in said.constants:
             if constant not in constants:
                 details = unknown_name_details(constant, constants)
@@ -224,11 +225,11 @@ def _check_recordings(
     doubts: list[Issue] = []
     kept: tuple[list[Recording], list[Recording]] = [], []
     arm = None if cable is not None else _joints_model(system)
-    anywhere = run.problem.initial_state != "equilibrium" or not system.free_indices
-    clamped = () if cable is None else cable.clamped_vertices
+    anywhere = run.problem.initial_state != "equilibrium" or not system.unprescribed_coordinate_indices
+    clamped = () if cable is None else cable.clamped_vertex_names
     for role, recordings in zip(kept, _once(run, estimate, held_out, doubts), strict=True):
         for recording in recordings:
-            found = check_recording(recording, _choice(run))
+            found = recording_quality_issues(recording, _choice(run))
             doubts += found
             if any(doubt.weight == "refused" for doubt in found):
                 continue
@@ -249,7 +250,7 @@ def _check_recordings(
 
 def single_recording_issues(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
     """All issues of one recording, which is not cut; errors as `build_problem`."""
-    found = check_recording(recording, _choice(run))
+    found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
     found += _beside_the_model(run, system, _joints_model(system), None, recording)
     _raise_for_issues(run, found)
@@ -297,15 +298,18 @@ def _beside_the_model(
     run: RunSettings, system: System, arm: RecordedJointsModel | None, cable: CableTopology | None, recording: Recording
 ) -> list[Issue]:
     gravity = np.array(run.model.gravity, float)
-    recording = recording.with_effort_kind(_choice(run)(EFFORT_GROUP).effort_kind)
+    recording = recording.with_effort_kind(_choice(run)(JOINT_EFFORT_GROUP_NAME).effort_kind)
     if cable is not None:
-        return list(check_cable_points(cable, recording, gravity))
+        return list(check_cable_point_geometry(cable, recording, gravity))
     found: list[Issue] = []
-    if arm is not None and arm.is_recorded_in(recording):
+    if arm is not None and arm.has_all_angles_recorded(recording):
         found += check_joint_limits(arm, recording)
         if any(doubt.weight == "refused" for doubt in found):
             return found
-        told = [*check_efforts(arm, recording), *check_held_points(arm, recording, _choice(run))]
+        told = [
+            *check_efforts_by_inverse_dynamics(arm, recording),
+            *check_robot_held_points(arm, recording, _choice(run)),
+        ]
         found += [doubt for doubt in told if not _is_modelled(system, doubt)]
     return found + list(check_point_distances(arm, system, system.parameters.vector(), recording, _choice(run)))
 
@@ -319,10 +323,14 @@ def _excitation(
         joint, _, quantity = name.rpartition(".")
         if joint in arm.joint_names and quantity in ("damping", "stiffness"):
             asked.setdefault(joint, []).append(name)
-    found = list(check_joint_excitation(recordings, asked, _choice(run)(POSITION_GROUP)))
+    found = list(check_joint_excitation(recordings, asked, _choice(run)(JOINT_POSITION_GROUP_NAME)))
     if any(word in name for name in free for word in _MOTION_PARAMETER_WORDS):
-        options = _choice(run)(EFFORT_GROUP)
-        weak = [list(check_dynamic_excitation(arm, one, options)) for one in recordings if arm.is_recorded_in(one)]
+        options = _choice(run)(JOINT_EFFORT_GROUP_NAME)
+        weak = [
+            list(check_inertial_effort_excitation(arm, one, options))
+            for one in recordings
+            if arm.has_all_angles_recorded(one)
+        ]
         if all(weak):  # one recording that tells is enough
             found += [doubt for doubts in weak for doubt in doubts]
     return found
@@ -350,7 +358,7 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
     for i, episode in enumerate(problem.episodes):
         result = problem.predictor.predict_episode(episode, *problem.split(problem.initial_unknowns, i), False, None)
         if isinstance(result, EpisodePrediction):
-            found += check_object_points(episode, result, size)
+            found += check_object_points_by_rollout(episode, result, size)
     return found
 
 
@@ -361,7 +369,7 @@ def _raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
         return
     first, *others = grave
     more = [f"{doubt.where}: {doubt.what}" for doubt in others]
-    what = "; ".join([f"{ISSUE_CAUSES[first.cause]}: {first.what}", *more])
+    what = "; ".join([f"{ISSUE_CAUSE_DESCRIPTIONS[first.cause]}: {first.what}", *more])
     raise DataError(what, where=first.where, hint=first.advice + (f" ({first.setting})" if first.setting else ""))
 
 
@@ -382,6 +390,6 @@ def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
     return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence))
 
 
-def issues_result(doubts: Sequence[Issue]) -> list[dict[str, Any]]:
-    """Issues as plain data for the key `doubts` of a result."""
+def issues_to_plain_data(doubts: Sequence[Issue]) -> list[dict[str, Any]]:
+    """Data quality issues as JSON-ready dicts, gravest first, for the key `doubts` of a result."""
     return [asdict(doubt) | {"sure": doubt.certainty_word, "where": doubt.where} for doubt in _gravest_first(doubts)]

@@ -11,8 +11,8 @@ import numpy as np
 
 from yid_ocp.analysis.discretisation import (
     NaturalFrequencies,
-    largest_error_growth,
-    natural_frequencies,
+    largest_alternating_error_growth,
+    step_map_natural_frequencies,
 )
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
 from yid_ocp.config.settings import RunSettings
@@ -26,22 +26,22 @@ from yid_ocp.problem.options import SensorOptions
 from yid_ocp.progress import Progress
 from yid_ocp.report.animation import Animation, make_animation, recording_animation
 from yid_ocp.report.summaries import check_summary
-from yid_ocp.sensors import CHANNELS
+from yid_ocp.sensors import CHANNEL_KINDS
 from yid_ocp.sensors.joints import (
-    EFFORT_GROUP,
-    POSITION_GROUP,
+    JOINT_EFFORT_GROUP_NAME,
+    JOINT_POSITION_GROUP_NAME,
     is_noise_std_stated,
     joint_angle_noise_std,
     joint_torque_noise_std,
 )
-from yid_ocp.solvers.base import covariance_and_chi2, parameter_estimates
-from yid_ocp.workflow.build import build_step, build_system, link_division_factor, urdf_options
-from yid_ocp.workflow.build_problem import build_problem, initial_grasp_gaps, issues_result
-from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, run_configured
+from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
+from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
+from yid_ocp.workflow.build_problem import build_problem, initial_grasp_closure_errors, issues_to_plain_data
+from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, run_command_with_settings
 from yid_ocp.workflow.prediction_outputs import predicted_trajectory
-from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files
-from yid_ocp.workflow.solve import measure_discretisation_shifts, shift_results
+from yid_ocp.workflow.solve import discretisation_shift_results, measure_discretisation_shifts
 
 _RESULT_FORMAT = "yid-check/1"
 _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
@@ -50,14 +50,14 @@ _N_MODES = 3
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    code = run_configured(arguments, _run_check, check_summary)
+    code = run_command_with_settings(arguments, _run_check, check_summary)
     return EXIT_WRONG_INPUT if code == EXIT_FAILED else code
 
 
 def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResult[None]:
     """Validate a run without solving it; warnings say what will work but should be looked at."""
-    with new_run_folder(run, out, "check") as folder:
-        folder.begin_run(run, "check")
+    with atomic_run_folder(run, out, "check") as folder:
+        folder.record_run_start(run, "check")
         warnings: list[str] = []
         progress.begin_stage("building the model")
         # the equations are the same compiled or not, and a check needs only a few steps
@@ -87,7 +87,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "recordings": recordings,
             "convergence": convergence,
             "discretisation": moved,
-            "doubts": [] if problem is None else issues_result(problem.options.data_issues),
+            "doubts": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
             "warnings": warnings,
         }
         written = folder.write_result(result)
@@ -101,19 +101,24 @@ def _mechanics(
     system = step.system
     theta, posture = system.parameters.vector(), np.zeros(system.n_coordinates)
     if problem is not None:
-        theta = problem.predictor.episode_theta(problem.episodes[0], theta)
-        posture[[*system.driven_indices, *system.prescribed_indices]] = problem.episodes[0].initial_known_coordinates
+        theta = problem.predictor.theta_with_episode_values(problem.episodes[0], theta)
+        posture[[*system.driven_coordinate_indices, *system.prescribed_coordinate_indices]] = problem.episodes[
+            0
+        ].initial_known_coordinates
     found = {"built": compare_system_with_pinocchio(system, theta, posture)}
     if run.model.robot is not None:
         # the file's own numbers, not those that settings or effects put in their place
-        read = urdf_options(run)
+        read = urdf_reader_options(run)
         path, gravity = input_files(run)[run.model.robot], np.array(run.model.gravity, float)
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:
             warnings.append(f"{path.name} cannot be compared, Pinocchio does not read it: {error}")
-    warnings += [entry.words for entry in found.values() if not entry.agrees]
-    return {name: {**asdict(entry), "agrees": entry.agrees, "words": entry.words} for name, entry in found.items()}
+    warnings += [entry.words for entry in found.values() if not entry.agrees_within_rounding]
+    return {
+        name: {**asdict(entry), "agrees": entry.agrees_within_rounding, "words": entry.words}
+        for name, entry in found.items()
+    }
 
 
 def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings: list[str]) -> dict[str, Any]:
@@ -148,13 +153,13 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None
-        theta = problem.predictor.episode_theta(episode, problem.theta)
+        theta = problem.predictor.theta_with_episode_values(episode, problem.theta)
         solver = problem.model_functions.equilibrium_solver
         rest = solver.solve(episode.initial_known_coordinates, theta, torque)
         entry["equilibrium"] = {"found": rest.is_converged, "imbalance": rest.max_imbalance, "message": rest.message}
         if not rest.is_converged:
             warnings.append(f"{episode.name}: {rest.message} with the initial parameters")
-    entry["grasp_gaps"] = initial_grasp_gaps(problem, episode)
+    entry["grasp_gaps"] = initial_grasp_closure_errors(problem, episode)
     return entry
 
 
@@ -169,15 +174,18 @@ def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]
     joints, errors, noise = episode.recording.joints, episode.input_errors, {}
     if joints is None or errors is None:
         return {}
-    for group, noise_std in ((EFFORT_GROUP, joint_torque_noise_std), (POSITION_GROUP, joint_angle_noise_std)):
+    for group, noise_std in (
+        (JOINT_EFFORT_GROUP_NAME, joint_torque_noise_std),
+        (JOINT_POSITION_GROUP_NAME, joint_angle_noise_std),
+    ):
         choice = problem.options.sensors.get(group, SensorOptions())
         noise[group] = {
             "samples": len(joints.t),
             "std": float(np.median(noise_std(joints, problem.system.driven, choice, episode.name))),
-            "unit": CHANNELS[group].unit,
+            "unit": CHANNEL_KINDS[group].unit,
             "estimated": not is_noise_std_stated(joints, group, choice),
         }
-    noise[EFFORT_GROUP]["bias_std"] = float(np.median(errors.torque_bias_std))
+    noise[JOINT_EFFORT_GROUP_NAME]["bias_std"] = float(np.median(errors.torque_bias_std))
     return noise
 
 
@@ -191,7 +199,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
             told = predicted_trajectory("with the initial values", problem, episode, prediction, shared)
             scenes.append(make_animation(episode.name, [told], episode.recording))
         else:
-            theta = problem.predictor.episode_theta(episode, shared)
+            theta = problem.predictor.theta_with_episode_values(episode, shared)
             alone = recording_animation(episode.name, problem.system, theta, episode.recording)
             scenes += [] if alone is None else [alone]
     return scenes
@@ -201,7 +209,7 @@ def _moves(
     run: RunSettings, problem: EstimationProblem, at_x: Evaluation, warnings: list[str], progress: Progress
 ) -> dict[str, Any]:
     x = problem.initial_unknowns
-    growth = largest_error_growth(problem, x)
+    growth = largest_alternating_error_growth(problem, x)
     if growth is not None and not growth.is_stable:
         warnings.append(f"with the initial parameters {growth.description}")
     if not at_x.ok:
@@ -212,9 +220,9 @@ def _moves(
     )
     warnings += notes
     # how poorly initial values fit says nothing of how sure the data will be of what fits
-    covariance, _ = covariance_and_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
+    covariance, _ = unknowns_covariance_and_reduced_chi2(problem, replace(at_x, residual=np.zeros_like(at_x.residual)))
     std = parameter_estimates(problem, x, at_x, covariance, None)
-    return shift_results(shifts, {name: std[name].std for name in shifts})
+    return discretisation_shift_results(shifts, {name: std[name].std for name in shifts})
 
 
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
@@ -234,9 +242,9 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
     if problem is not None:
         first = problem.episodes[0]
         posture = dict(zip(names, map(float, first.initial_known_coordinates), strict=True)) if names else {}
-        theta = problem.predictor.episode_theta(first, theta)
+        theta = problem.predictor.theta_with_episode_values(first, theta)
         guess = None if first.fixed_initial_state is None else first.fixed_initial_state.state[: system.n_coordinates]
-    own = natural_frequencies(system, posture, theta, h, *rule, guess)
+    own = step_map_natural_frequencies(system, posture, theta, h, *rule, guess)
     if own.message:
         return {"links": [], "time_step": [], "message": own.message}
     if own.n_unstable_modes:
@@ -246,18 +254,18 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
             f"problem.time_step, {remedy}or more damping"
         )
     steps = [_row(h, own)]
-    steps += [_row(h / k, natural_frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
+    steps += [_row(h / k, step_map_natural_frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", " s", steps)
     rows: list[dict[str, Any]] = []
-    count = None if run.model.object is None else run.model.object.link_count
+    count = None if run.model.object is None else run.model.object.links_per_segment_or_total
     if count is not None:
         other = build_system(run, link_division=2)
         values = {
-            name: value * link_division_factor(run, name, 2)
+            name: value * divided_link_parameter_scale(run, name, 2)
             for name, value in zip(system.parameters.names, theta, strict=True)
             if name in other.parameters
         }
-        finer = natural_frequencies(other, posture, other.parameters.vector(values), h, *rule)
+        finer = step_map_natural_frequencies(other, posture, other.parameters.vector(values), h, *rule)
         rows = [_row(count, own), _row(2 * count, finer)]
         _warn(warnings, "the links go", "", rows)
     return {"links": rows, "time_step": steps, "message": ""}

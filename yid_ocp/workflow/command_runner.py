@@ -17,7 +17,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
 from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
-from yid_ocp.report.terminal import SummaryBlock, terminal_lines
+from yid_ocp.report.terminal import SummaryBlock, summary_terminal_lines
 
 if TYPE_CHECKING:
     import rich.progress
@@ -49,28 +49,30 @@ class CommandResult(Generic[Output]):
     is_successful: bool = True
 
 
-def run_configured(
+def run_command_with_settings(
     arguments: argparse.Namespace,
     work: Callable[..., CommandResult[Any]],
     summary: Callable[[Mapping[str, Any]], Sequence[SummaryBlock]],
     *options: Any,
 ) -> int:
-    """`run_and_print` of `work(settings, out, progress, *options)` with the settings of `config` and `overrides`."""
+    """`run_command_and_print` of `work(settings, out, progress, *options)` with settings and overrides."""
     settings = load_config(arguments.config, arguments.overrides)
-    return run_and_print(arguments, lambda shown: work(settings, arguments.out, shown, *options), summary)
+    return run_command_and_print(arguments, lambda shown: work(settings, arguments.out, shown, *options), summary)
 
 
-def run_and_print(
+def run_command_and_print(
     arguments: argparse.Namespace,
     work: Callable[[Progress], CommandResult[Any]],
     summary: Callable[[Mapping[str, Any]], Sequence[SummaryBlock]],
 ) -> int:
-    """Do the work of a command, print the summary of its result and its run folder, and return its exit code."""
-    with show_progress(arguments) as progress:
+    """Run a command's function, print the summary of its result and its run folder, and return its exit code."""
+    with stderr_progress_display(arguments) as progress:
         outcome = work(progress)
     near = os.path.relpath(outcome.folder)
     place = str(outcome.folder) if near.startswith("..") else f"run folder: {near}"
-    print_result(arguments, outcome.result, lambda: terminal_lines(summary(outcome.result)), place, str(outcome.folder))
+    print_result(
+        arguments, outcome.result, lambda: summary_terminal_lines(summary(outcome.result)), place, str(outcome.folder)
+    )
     return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 
@@ -136,7 +138,7 @@ def _format_iterate(entry: AcceptedIterate) -> str:
     return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
 
 
-class LineProgress:
+class StderrLineProgress:
     """Progress as lines on standard error, for logs and pipes.
 
     One for every stage and iterate, for every tenth of a stage, and for what is done some seconds after the last line.
@@ -195,13 +197,13 @@ class _BarProgress:
 
 
 @contextlib.contextmanager
-def show_progress(arguments: argparse.Namespace) -> Iterator[Progress]:
-    """Progress display on standard error: bars on a terminal, else lines; nothing if quiet or read by a program."""
+def stderr_progress_display(arguments: argparse.Namespace) -> Iterator[Progress]:
+    """Context manager for progress on standard error: bars on a terminal, else lines; nothing if `--quiet`."""
     terminal = sys.stderr.isatty()
     if arguments.quiet or (arguments.json and not terminal):
         yield NULL_PROGRESS
     elif not terminal:
-        yield LineProgress()
+        yield StderrLineProgress()
     else:
         from rich.console import Console
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn

@@ -11,20 +11,20 @@ from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
-from yid_ocp.report.png_figures import draw_convergence
+from yid_ocp.report.png_figures import draw_method_convergence
 from yid_ocp.report.summaries import compare_summary
 from yid_ocp.solvers import SOLVERS, Iterate, Status
-from yid_ocp.workflow.build_problem import build_problem, issues_result
-from yid_ocp.workflow.command_runner import CommandResult, run_configured
-from yid_ocp.workflow.run_folder import new_run_folder
-from yid_ocp.workflow.solve import solve_result, with_fit_issues
+from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
+from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings
+from yid_ocp.workflow.run_folder import atomic_run_folder
+from yid_ocp.workflow.solve import solution_and_fit_issues, solve_result
 
 _RESULT_FORMAT = "yid-compare/1"
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_configured(arguments, _run_compare, compare_summary)
+    return run_command_with_settings(arguments, _run_compare, compare_summary)
 
 
 def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResult[None]:
@@ -35,8 +35,8 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
     if experiment is not None and experiment not in PAPER_ESTIMATES:
         what = f"the paper has no experiment '{experiment}'"
         raise run.config_error(what, "compare", "paper_experiment", allowed=", ".join(PAPER_ESTIMATES))
-    with new_run_folder(run, out, "compare") as folder:
-        folder.begin_run(run, "compare")
+    with atomic_run_folder(run, out, "compare") as folder:
+        folder.record_run_start(run, "compare")
         progress.begin_stage("building the model and its compiled step")
         problem = build_problem(run)
         true = {name: value for e in problem.episodes for name, value in e.recording.true_parameters.items()}
@@ -51,15 +51,15 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             folder.log_event("iterate", method=name, iteration=entry.iteration, cost=entry.cost, seconds=entry.seconds)
             progress.report_iterate(entry)
 
-        comparison = compare_methods(problem, solvers, truth, iterate, run.diagnosis.fit_gap_limits)
-        draw_convergence(folder.path / "convergence.png", comparison)
+        comparison = compare_methods(problem, solvers, truth, iterate, run.diagnosis.null_test_residual_limits)
+        draw_method_convergence(folder.path / "convergence.png", comparison)
         own = comparison.verdict_solution.problem or problem
         held_out = tuple(comparison.verdict_held_out_predictions)
-        judged, doubts = with_fit_issues(own, comparison.verdict_solution, held_out)
+        judged, doubts = solution_and_fit_issues(own, comparison.verdict_solution, held_out)
         comparison = replace(comparison, verdict_solution=judged)
         explained = explain_paper_estimates(experiment, judged.parameters, truth) if experiment else ()
         about = {
-            "doubts": issues_result(doubts),
+            "doubts": issues_to_plain_data(doubts),
             "published": PAPER_ESTIMATES[experiment] if experiment else {},
             "published_explained": list(explained),
             "truth": truth,

@@ -109,8 +109,8 @@ class ConfigProposal:
         return dict(_with_result_keys(asdict(self)))
 
     @property
-    def is_seen_by_effort_alone(self) -> bool:
-        """Whether efforts of arms that move as measured are all that shows the object."""
+    def is_object_measured_only_by_effort(self) -> bool:
+        """Whether joint efforts of arms with prescribed motion are the only measurements that depend on the object."""
         return self.arm_mode == "prescribed" and not self.point_placements
 
 
@@ -173,7 +173,7 @@ def propose_config(
     elif not held and branches:
         held = {arm.tool_frames[0]: f"w_{branches[-1].name}" for arm in [arm for arm in arms if arm is not own][:1]}
     carrying = [tree.frame(name).joint_index for name in (*held, *(() if standing else (holder,)))]
-    needed = {j for end in carrying for j in tree.ancestor_joints(end)}
+    needed = {j for end in carrying for j in tree.ancestor_joint_indices(end)}
     joints = tuple(tree.joint_names[j] for j in sorted(needed))
     mode, why = _mode(first, recorded, bool(held))
     moving = next(filter(None, (_moving_start(recording, joints) for recording in recordings)), "")
@@ -205,7 +205,7 @@ def _arms(tree: Mechanism) -> Iterator[_ArmChain]:
     for j in range(len(tree.joints)):
         if j not in tree.parent_indices:
             own = [name for name, frame in tree.frames.items() if frame.joint_index == j]
-            joints = tuple(tree.joint_names[i] for i in tree.ancestor_joints(j))
+            joints = tuple(tree.joint_names[i] for i in tree.ancestor_joint_indices(j))
             yield _ArmChain(joints, tuple(sorted(own, key=_tool_rank)))
 
 
@@ -295,8 +295,8 @@ def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array,
     return np.nan_to_num(np.abs(slope)), np.nan_to_num(left.std(axis=0) / math.sqrt(centred @ centred))
 
 
-def rest_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
-    """Time in the later part of a recording at which everything is at rest; None if there is none [s].
+def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
+    """Time at rest in a recording's later part, from which it is held out; None if there is none [s].
 
     What comes after it can be predicted from rest, so that it shows, held out, whether a model is right.
     """

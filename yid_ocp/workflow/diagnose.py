@@ -20,31 +20,31 @@ from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
-from yid_ocp.diagnosis.refit import KnownFits
+from yid_ocp.diagnosis.refit import PrecomputedFits
 from yid_ocp.errors import OutputError
-from yid_ocp.files import from_plain_data, json_sha256, to_plain_data, write_json
-from yid_ocp.inference.whitening import whitened_by_sensor_noise
+from yid_ocp.files import dataclass_from_plain_data, json_sha256, to_lossless_plain_data, write_json
+from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
 from yid_ocp.report.animation import Animation, make_animation
 from yid_ocp.report.summaries import diagnose_summary
-from yid_ocp.sensors.joints import EFFORT_GROUP, POSITION_GROUP
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
-from yid_ocp.workflow.build_problem import build_problem, issues_result
-from yid_ocp.workflow.command_runner import CommandResult, run_and_print
-from yid_ocp.workflow.plan import next_plan_settings
+from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
+from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print
+from yid_ocp.workflow.plan import discrimination_plan_settings
 from yid_ocp.workflow.prediction_outputs import (
-    HeldOutPrediction,
+    HeldOutPredictionPair,
     estimated_torque_offsets,
     predicted_trajectory,
     write_diagnosis_trajectories,
 )
-from yid_ocp.workflow.run_folder import RunFolder, new_run_folder, software_versions
+from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder, software_and_plugin_versions
 from yid_ocp.workflow.run_history import (
     baseline_estimates,
     load_reference_recordings,
     require_distinct_recordings,
-    with_baseline_effects,
+    settings_with_baseline_effects,
 )
 
 log = logging.getLogger(__name__)
@@ -59,23 +59,25 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
-    return run_and_print(arguments, lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary)
+    return run_command_and_print(
+        arguments, lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary
+    )
 
 
 def run_diagnose(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
 ) -> CommandResult[DiagnosisResult]:
     """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused."""
-    with new_run_folder(run, out, "diagnose") as folder:
-        folder.begin_run(run, "diagnose", _flags(run))
-        refits = JsonRefitStore(folder, folder.input_hashes, dump_config(run), software_versions())
+    with atomic_run_folder(run, out, "diagnose") as folder:
+        folder.record_run_start(run, "diagnose", _flags(run))
+        refits = JsonRefitStore(folder, folder.input_hashes, dump_config(run), software_and_plugin_versions())
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step")
         runs = baseline_estimates(run)
         without, said = load_reference_recordings(run)
         if said:
             folder.log_event("message", level="WARNING", source="baseline", text=said)
-        run = with_baseline_effects(run, runs)
+        run = settings_with_baseline_effects(run, runs)
         problem = build_problem(run, reference_recordings=without)
         require_distinct_recordings(run, problem, runs, without)
         if runs:
@@ -91,7 +93,7 @@ def run_diagnose(
                 run.diagnosis.candidates,
                 thresholds=run.diagnosis,
                 progress=logged,
-                known_fits=KnownFits(nominal, refits),
+                known_fits=PrecomputedFits(nominal, refits),
                 baseline=BaselineData.from_runs(runs, without),
                 exclude=run.diagnosis.exclude,
             )
@@ -107,9 +109,9 @@ def run_diagnose(
         moving = not last.problem.options.clamp_paths and bool(system.driven or system.prescribed)
         own = {
             "model": final_model_to_dict(finding),
-            "doubts": issues_result(problem.options.data_issues),
+            "doubts": issues_to_plain_data(problem.options.data_issues),
             "torque_offsets": estimated_torque_offsets(last.problem, last.problem.vector(last.values)),
-            "next_plan": next_plan_settings(told["confusable"] if moving else (), folder.final_path),
+            "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
         written = folder.write_result(told | own)
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
@@ -178,25 +180,25 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
     """Groups and fields of `SensorOptions` whose standard deviations count in the problem."""
     levels = {(samples.sensor.group_name, "std") for episode in problem.episodes for samples in episode.measurements}
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
-    encoders = problem.options.sensors.get(POSITION_GROUP)
+    encoders = problem.options.sensors.get(JOINT_POSITION_GROUP_NAME)
     noisy = any(std is not None and np.any(std) for std in recorded)
     compared = any(samples.sensor.effort_joints for episode in problem.episodes for samples in episode.measurements)
     if (compared and noisy) or (encoders is not None and encoders.std is not None):
-        levels.add((POSITION_GROUP, "std"))  # the encoders' noise is part of that of efforts
+        levels.add((JOINT_POSITION_GROUP_NAME, "std"))  # the encoders' noise is part of that of efforts
     for errors in (episode.input_errors for episode in problem.episodes):
         if errors is not None:
             given = {
-                (EFFORT_GROUP, "std"): errors.torque_std,
-                (EFFORT_GROUP, "bias_std"): errors.torque_bias_std,
-                (POSITION_GROUP, "std"): errors.angle_std,
+                (JOINT_EFFORT_GROUP_NAME, "std"): errors.torque_std,
+                (JOINT_EFFORT_GROUP_NAME, "bias_std"): errors.torque_bias_std,
+                (JOINT_POSITION_GROUP_NAME, "std"): errors.angle_std,
             }
             levels |= {level for level, std in given.items() if np.any(std > 0)}
     return levels
 
 
-def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPrediction]:
+def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPredictionPair]:
     before, after = (
-        whitened_by_sensor_noise(fit.problem).predict_held_out(fit.problem.vector(fit.values))
+        problem_whitened_by_sensor_noise(fit.problem).predict_held_out(fit.problem.vector(fit.values))
         for fit in (finding.nominal_model, finding.final_model)
     )
     return [
@@ -206,7 +208,7 @@ def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPrediction]:
     ]
 
 
-def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPrediction]) -> list[Animation]:
+def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]) -> list[Animation]:
     """What was predicted of every held-out recording, without the effects and with them."""
     fits = {"nominal model": finding.nominal_model}
     fits |= {"with the effects": finding.final_model} if finding.accepted_effects else {}
@@ -253,7 +255,7 @@ class JsonRefitStore:
             self._known[name] = refitted
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
-                data = {"format": _STORE_FORMAT, "key": self._key, "refits": to_plain_data(self._known)}
+                data = {"format": _STORE_FORMAT, "key": self._key, "refits": to_lossless_plain_data(self._known)}
                 write_json(self.file, data)
             except (OSError, OutputError) as error:
                 if not self._warned:
@@ -271,7 +273,7 @@ class JsonRefitStore:
         try:
             held = json.loads(self.file.read_text(encoding="utf-8"))
             if (held["format"], held["key"]) == (_STORE_FORMAT, self._key):
-                return {name: from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
+                return {name: dataclass_from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
             reason = "other inputs, another configuration or another version"
         except FileNotFoundError:
             return {}

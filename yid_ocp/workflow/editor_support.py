@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def complete_arguments(parser: argparse.ArgumentParser) -> None:
+def print_shell_completions(parser: argparse.ArgumentParser) -> None:
     """Print completions for the calling shell and exit; does nothing without the package argcomplete."""
     try:
         library = importlib.import_module("argcomplete")
@@ -59,10 +59,10 @@ def complete_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
-    from yid_ocp.config.reader import settable_keys  # it takes a second, which no other completion needs
+    from yid_ocp.config.reader import settable_keys_with_prefix  # it takes a second, which no other completion needs
 
     given = getattr(parsed_args, "config", None) or next(iter(getattr(parsed_args, "configs", None) or ()), None)
     try:
-        return settable_keys(prefix, given)
+        return settable_keys_with_prefix(prefix, given)
     except YidError:
-        return settable_keys(prefix)
+        return settable_keys_with_prefix(prefix)

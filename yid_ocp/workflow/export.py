@@ -19,27 +19,31 @@ from yid_ocp.data.hdf5_io import open_checked_hdf5
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.export.models import (
-    EXPORT_FORMAT,
+    EXPORT_MANIFEST_FORMAT,
     FormatSupport,
-    effect_support,
-    parameter_support,
+    effect_format_support,
+    parameter_format_support,
     system_to_sdf,
     system_to_urdf,
 )
-from yid_ocp.export.signals import TopicSignal, export_csv, export_mcap, signals_from_recording
+from yid_ocp.export.signals import RosTopicTimeSeries, export_csv, export_mcap, ros_signals_from_recording
 from yid_ocp.files import file_sha256, to_json_types, write_json, write_text
 from yid_ocp.model.system import System
 from yid_ocp.progress import Progress
 from yid_ocp.report.summaries import export_summary
-from yid_ocp.report.terminal import recording_summary_lines, terminal_lines
+from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.virtual.mjcf import mujoco_xml
-from yid_ocp.virtual.mujoco_replay import REPLAY_BANDWIDTH, ReplayMismatch, replay_in_mujoco
-from yid_ocp.workflow.build import build_system, parameter_settings
-from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, show_progress
-from yid_ocp.workflow.import_recording import recording_contents
+from yid_ocp.virtual.mujoco_replay import REPLAY_FEEDBACK_BANDWIDTH, ReplayMismatch, replay_in_mujoco
+from yid_ocp.workflow.build import build_system, settings_by_parameter_name
+from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
+from yid_ocp.workflow.import_recording import recording_contents_summary
 from yid_ocp.workflow.prediction_outputs import DIAGNOSIS_TRAJECTORIES_FORMAT, SOLVE_TRAJECTORIES_FORMAT
-from yid_ocp.workflow.run_folder import software_versions
-from yid_ocp.workflow.run_history import effect_values, read_run_result, with_effect_values
+from yid_ocp.workflow.run_folder import software_and_plugin_versions
+from yid_ocp.workflow.run_history import (
+    effect_parameter_values_by_label,
+    read_estimation_result,
+    settings_with_effect_values,
+)
 from yid_ocp.workflow.run_inputs import read_recordings
 
 _MODEL_FORMATS = ("mjcf", "urdf", "sdf", "yaml")
@@ -57,9 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     source, form, out = Path(arguments.source), arguments.format, arguments.out
     if source.is_dir() and form not in ("csv", _MCAP):
-        with show_progress(arguments) as progress:
+        with stderr_progress_display(arguments) as progress:
             manifest = _export_model(source, Path(out), form or "mjcf", progress)
-        print_result(arguments, manifest, lambda: terminal_lines(export_summary(manifest)), out, out)
+        print_result(arguments, manifest, lambda: summary_terminal_lines(export_summary(manifest)), out, out)
         return EXIT_DONE
     if source.is_dir() and form == "csv":
         allowed, hint = ", ".join((*_MODEL_FORMATS, _MCAP)), "export a recording, or the run's signals as mcap"
@@ -73,14 +77,19 @@ def run(arguments: argparse.Namespace) -> int:
         files, notes = _export_run_signals(source, out)
     else:
         recording, files, notes = read_recording(source, allow_nan_effort=True), [], []
-        contents, texts = recording_contents(recording), recording_summary_lines(recording)
+        contents, texts = recording_contents_summary(recording), recording_summary_lines(recording)
         if form == _MCAP:
             files = [Path(out) / f"{source.stem}.mcap"]
-            notes = _shift_notes("", export_mcap(signals_from_recording(recording), files[0]))
+            notes = _shift_notes("", export_mcap(ros_signals_from_recording(recording), files[0]))
         else:
             files = list(export_csv(recording, out))
     paths = [str(file) for file in files]
-    own = {"format": EXPORT_FORMAT, "file": paths, "kind": form or "csv", "notes": [*contents["notes"], *notes]}
+    own = {
+        "format": EXPORT_MANIFEST_FORMAT,
+        "file": paths,
+        "kind": form or "csv",
+        "notes": [*contents["notes"], *notes],
+    }
     print_result(arguments, contents | own, lambda: [*notes, *texts], "\n".join(paths), "\n".join(paths))
     return EXIT_DONE
 
@@ -126,7 +135,7 @@ class _CalibratedModel:
 
 
 def _read_calibrated_model(folder: Path) -> _CalibratedModel:
-    result = read_run_result(folder)
+    result = read_estimation_result(folder)
     try:
         parameters = {str(name): dict(entry) for name, entry in result.get("model", result)["parameters"].items()}
         values = {name: float(entry["value"]) for name, entry in parameters.items()}
@@ -135,7 +144,9 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         raise DataError("the result has no parameters", where=where, hint="run it again") from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
-    return _CalibratedModel(with_effect_values(nominal, effect_values(values)), nominal, values, std)
+    return _CalibratedModel(
+        settings_with_effect_values(nominal, effect_parameter_values_by_label(values)), nominal, values, std
+    )
 
 
 def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dict[str, Any]:
@@ -149,19 +160,26 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
     full = calibrated.system()
     if form == "yaml":
         write_text(out, dump_config(_settings_with_estimates(calibrated, full)))
-        return {"format": EXPORT_FORMAT, "file": str(out), "kind": form, "effects": {}, "parameters": {}, "gate": None}
+        return {
+            "format": EXPORT_MANIFEST_FORMAT,
+            "file": str(out),
+            "kind": form,
+            "effects": {},
+            "parameters": {},
+            "gate": None,
+        }
     system, said = _expressible(calibrated, full, form)
     text = calibrated.text(form, system)
     grasp = FormatSupport("not representable", f"{form.upper()} describes a tree: close the loop in the engine")
     if form == "mjcf":
         grasp = FormatSupport("native", "equality constraints between sites, or a tendon where it gives way")
     parameters = {}
-    for name, entry in parameter_support(full, said, form).items():
+    for name, entry in parameter_format_support(full, said, form).items():
         own, stds = full.parameters[name], calibrated.parameter_stds
         known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
         parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}
     manifest: dict[str, Any] = {
-        "format": EXPORT_FORMAT,
+        "format": EXPORT_MANIFEST_FORMAT,
         "file": out.name,
         "kind": form,
         "run": str(folder.resolve()),
@@ -170,7 +188,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
         "parameters": parameters,
         "grasps": {own.name: vars(grasp) for own in full.grasps},
         "gate": None,
-        "versions": software_versions(),
+        "versions": software_and_plugin_versions(),
     }
     if form == "mjcf":
         progress.begin_stage("replaying recordings in MuJoCo")
@@ -186,7 +204,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
 
 
 def _settings_with_estimates(calibrated: _CalibratedModel, system: System) -> RunSettings:
-    chosen = parameter_settings(calibrated.settings, system.parameters)
+    chosen = settings_by_parameter_name(calibrated.settings, system.parameters)
     estimates = {
         name: replace(chosen.get(name, ParameterSettings(free=True)), initial=calibrated.parameter_values[name])
         for name in calibrated.parameter_stds
@@ -196,7 +214,7 @@ def _settings_with_estimates(calibrated: _CalibratedModel, system: System) -> Ru
 
 def _expressible(calibrated: _CalibratedModel, full: System, form: str) -> tuple[System, dict[str, FormatSupport]]:
     """The system without the effects that a format cannot tell, and what it makes of each."""
-    said = effect_support(full, calibrated.values_for(full), form)
+    said = effect_format_support(full, calibrated.values_for(full), form)
     for _ in range(len(said) + 1):
         kept = [
             label
@@ -247,7 +265,7 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         "status": "done",
         "which": which,
         "recordings": [recording.name for recording in recordings],
-        "bandwidth": REPLAY_BANDWIDTH,
+        "bandwidth": REPLAY_FEEDBACK_BANDWIDTH,
         "channels": channels,
         "fall": _fall([(before[name], error) for name, error in after.items()]),
     }
@@ -284,7 +302,7 @@ def _fall(pairs: Sequence[tuple[ReplayMismatch, ReplayMismatch]]) -> float | Non
 def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
     """Write `OUT/RECORDING.mcap` for every recording of a run; its topics stand in docs/reports.md."""
     source, files, notes = folder / "trajectories.h5", [], []
-    read_run_result(folder)
+    read_estimation_result(folder)
     with open_checked_hdf5(source) as file:
         form = str(file.attrs.get("format", ""))
         if form not in _PREDICTION_TOPICS:
@@ -296,9 +314,9 @@ def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
     return files, notes
 
 
-def _recordings(file: h5py.File, form: str) -> dict[str, list[TopicSignal]]:
+def _recordings(file: h5py.File, form: str) -> dict[str, list[RosTopicTimeSeries]]:
     parent = file.get("recordings", {}) if form == SOLVE_TRAJECTORIES_FORMAT else file
-    found: dict[str, list[TopicSignal]] = {}
+    found: dict[str, list[RosTopicTimeSeries]] = {}
     for name in parent:
         if form == SOLVE_TRAJECTORIES_FORMAT or name not in _RESERVED_GROUPS:
             found.setdefault(name, []).extend(_of_recording(parent[name], _PREDICTION_TOPICS[form]))
@@ -307,12 +325,14 @@ def _recordings(file: h5py.File, form: str) -> dict[str, list[TopicSignal]]:
     for name, channels in file.get("events", {}).items():
         for channel, group in channels.items():
             values = {"effort": np.array(group["value"])[:, None]}
-            signal = TopicSignal(f"/events/{_topic(channel)}", "joints", np.array(group["t"]), values, (channel,))
+            signal = RosTopicTimeSeries(
+                f"/events/{_topic(channel)}", "joints", np.array(group["t"]), values, (channel,)
+            )
             found.setdefault(name, []).append(signal)
     return {name: signals for name, signals in found.items() if any(len(signal.t) for signal in signals)}
 
 
-def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator[TopicSignal]:
+def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator[RosTopicTimeSeries]:
     if "q" in group:
         t = np.array(group["t"])
         for key, names, topic, quantity in (
@@ -324,7 +344,7 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
             if key in group and (key in ("q", "command") or len(group.attrs[names])):
                 values = np.array(group[key])
                 told = _texts(group.attrs[names])
-                yield TopicSignal(f"/predicted/{topic}", "joints", t[: len(values)], {quantity: values}, told)
+                yield RosTopicTimeSeries(f"/predicted/{topic}", "joints", t[: len(values)], {quantity: values}, told)
     for sensor in group.values():
         if not isinstance(sensor, h5py.Group):
             continue
@@ -337,20 +357,20 @@ def _of_recording(group: h5py.Group, predictions: Mapping[str, str]) -> Iterator
             yield from _of_sensor(sensor, residual, predicted - measured)
 
 
-def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[TopicSignal]:
+def _of_sensor(sensor: h5py.Group, begin: str, values: Array) -> Iterator[RosTopicTimeSeries]:
     """Joints of a group as one topic, points as one each; differences of places are vectors."""
     channels, t = _texts(sensor.attrs["channels"]), np.array(sensor["t"])
     if values.shape[1] == len(channels):
         quantity = channels[0].split(".")[1]
         names = [channel.rsplit(".", 1)[1] for channel in channels]
-        yield TopicSignal(f"/{begin}/joints/{quantity}", "joints", t, {quantity: values}, names)
+        yield RosTopicTimeSeries(f"/{begin}/joints/{quantity}", "joints", t, {quantity: values}, names)
         return
     kind: Any = "vector" if begin.startswith("residual") else "point"
     for i, channel in enumerate(channels):
-        yield TopicSignal(f"/{begin}/points/{_topic(channel)}", kind, t, {"xyz": values[:, 3 * i : 3 * i + 3]})
+        yield RosTopicTimeSeries(f"/{begin}/points/{_topic(channel)}", kind, t, {"xyz": values[:, 3 * i : 3 * i + 3]})
 
 
-def _unknown_signals(group: h5py.Group) -> Iterator[TopicSignal]:
+def _unknown_signals(group: h5py.Group) -> Iterator[RosTopicTimeSeries]:
     """Unknown forces, pushes, offsets and biases, where each interval begins and where the last one ends."""
     edges = np.array(group["edges"]) + float(group.attrs.get("start", 0.0))
     mean = np.array(group["mean"])
@@ -362,7 +382,7 @@ def _unknown_signals(group: h5py.Group) -> Iterator[TopicSignal]:
     forces = [i for i, kind in enumerate(kinds) if kind == "force" and kept[i]]
     if forces:
         told = [names[i] for i in forces]
-        yield TopicSignal("/unknown/joint_states", "joints", edges, {"effort": held[:, forces]}, told)
+        yield RosTopicTimeSeries("/unknown/joint_states", "joints", edges, {"effort": held[:, forces]}, told)
     for kind, form in _UNKNOWN_SHAPES.items():
         # x, y and z by owner: `left.x`, `T1.push_y`
         owners: dict[str, dict[int, int]] = {}
@@ -373,7 +393,7 @@ def _unknown_signals(group: h5py.Group) -> Iterator[TopicSignal]:
             if kept[list(columns.values())].any():
                 xyz = np.zeros((len(edges), 3))
                 xyz[:, list(columns)] = held[:, list(columns.values())]
-                yield TopicSignal(f"/unknown/{kind}/{_topic(owner)}", form, edges, {"xyz": xyz})
+                yield RosTopicTimeSeries(f"/unknown/{kind}/{_topic(owner)}", form, edges, {"xyz": xyz})
 
 
 def _topic(name: str) -> str:

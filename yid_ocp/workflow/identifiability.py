@@ -12,18 +12,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from yid_ocp.analysis.compare import without_cable_memory
-from yid_ocp.analysis.experiment_design import BaseExperiment
+from yid_ocp.analysis.compare import problem_without_cable_memory
+from yid_ocp.analysis.experiment_design import RecordedExperiment
 from yid_ocp.analysis.identifiability import (
     GRASP_OFFSET_PRIOR_STD,
     IdentifiabilityResult,
     InitialStateKnowledge,
-    ParameterInformation,
+    ParameterIdentifiability,
     identifiability,
     unknowns_from_solution,
     with_grasp_offset_effects,
 )
-from yid_ocp.analysis.profile import ParameterProfile, is_small_problem
+from yid_ocp.analysis.profile import ParameterProfileLikelihood, is_small_enough_for_profiles
 from yid_ocp.analysis.what_if import (
     ChangedExperimentResult,
     ExperimentChange,
@@ -33,16 +33,16 @@ from yid_ocp.analysis.what_if import (
 )
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.files import from_plain_data, to_plain_data
+from yid_ocp.files import dataclass_from_plain_data, to_lossless_plain_data
 from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import identifiability_summary
 from yid_ocp.solvers import Solution, Status
 from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm
-from yid_ocp.workflow.build_problem import build_problem, issues_result
-from yid_ocp.workflow.command_runner import CommandResult, run_configured, workers_from_arguments
-from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
+from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings, workers_from_arguments
+from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files
 from yid_ocp.workflow.solve import solve_and_log
 
@@ -90,7 +90,7 @@ class IdentifiabilityOptions:
         """Parameters of those in the analysis, or others that were asked for, whose interval is wanted."""
         if self.interval_parameters not in ("auto", "all"):
             return self.interval_parameters
-        return names if self.interval_parameters == "all" or is_small_problem(problem) else ()
+        return names if self.interval_parameters == "all" or is_small_enough_for_profiles(problem) else ()
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -104,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
         rank_changes=arguments.what_if,
     )
     workers = workers_from_arguments(arguments)
-    return run_configured(arguments, run_identifiability, identifiability_summary, asked, workers)
+    return run_command_with_settings(arguments, run_identifiability, identifiability_summary, asked, workers)
 
 
 def run_identifiability(
@@ -124,12 +124,12 @@ def run_identifiability(
         Who works out intervals, one parameter a task, and the experiments of `what_if`; this process when absent.
     """
     asked = options or IdentifiabilityOptions()
-    with new_run_folder(run, out, "identifiability") as folder:
-        folder.begin_run(run, "identifiability", asked._command_line_flags())
+    with atomic_run_folder(run, out, "identifiability") as folder:
+        folder.record_run_start(run, "identifiability", asked._command_line_flags())
         progress.begin_stage("building the model and its compiled step")
         system = build_system(run)
         problem = whole = build_problem(run, build_step(run, with_grasp_offset_effects(system)))
-        limits = run.diagnosis.fit_gap_limits
+        limits = run.diagnosis.null_test_residual_limits
         solution = None
         if asked.evaluation_point == "solution":
             safe = solve_and_log(run, problem, folder, progress)
@@ -198,7 +198,7 @@ def _identifiability_result(
         "start": asked.start_knowledge,
         "grasp_std": asked.grasp_offset_std if problem.system.grasps else None,
         "fit": None if solution is None else asdict(solution.goodness_of_fit),
-        "doubts": issues_result(problem.options.data_issues),
+        "doubts": issues_to_plain_data(problem.options.data_issues),
         "what_if": None,
     }
     if information is None or unknown is None:
@@ -249,11 +249,11 @@ class _IdentifiabilityTasks:
         self, information: IdentifiabilityResult, names: Sequence[str]
     ) -> IdentifiabilityResult:
         """The analysis with profile likelihoods of the named parameters, one task per parameter."""
-        found = self._done(profile_parameter, {name: {"name": name} for name in names})
+        found = self._done(profile_likelihood_task, {name: {"name": name} for name in names})
         parameters, profiles = dict(information.parameters), dict(information.profiles)
         for name, told in zip(names, found, strict=True):
-            parameters[name] = from_plain_data(ParameterInformation, told["parameter"])
-            profiles[name] = from_plain_data(ParameterProfile, told["profile"])
+            parameters[name] = dataclass_from_plain_data(ParameterIdentifiability, told["parameter"])
+            profiles[name] = dataclass_from_plain_data(ParameterProfileLikelihood, told["profile"])
         return replace(information, parameters=parameters, profiles=profiles)
 
     def evaluate_change_sets(
@@ -271,7 +271,7 @@ class _IdentifiabilityTasks:
         self.progress.begin_stage(f"judging {len(sets)} experiments")
         done = self._done(_change_set_outcomes, tasks)
         order = [i for members in groups.values() for i in members]
-        found = [from_plain_data(ChangedExperimentResult, entry) for told in done for entry in told]
+        found = [dataclass_from_plain_data(ChangedExperimentResult, entry) for told in done for entry in told]
         return [own for _, own in sorted(zip(order, found, strict=True), key=lambda pair: pair[0])]
 
     def _done(self, function: Callable[..., Any], tasks: Mapping[str, Mapping[str, Any]]) -> list[Any]:
@@ -285,12 +285,19 @@ class _IdentifiabilityTasks:
 # -- tasks ------------------------------------------------------------------------------------------------------------
 
 
-def profile_parameter(common: Mapping[str, Any], name: str) -> dict[str, Any]:
+def profile_likelihood_task(common: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Task: profile likelihood of one parameter and its updated verdict, as plain data."""
     run, problem = _problem(common)
-    known = {"start": common["start"], "grasp_std": common["grasp_std"], "limits": run.diagnosis.fit_gap_limits}
+    known = {
+        "start": common["start"],
+        "grasp_std": common["grasp_std"],
+        "limits": run.diagnosis.null_test_residual_limits,
+    }
     found = identifiability(problem, common["x"], intervals=[name], **known)
-    return {"parameter": to_plain_data(found.parameters[name]), "profile": to_plain_data(found.profiles[name])}
+    return {
+        "parameter": to_lossless_plain_data(found.parameters[name]),
+        "profile": to_lossless_plain_data(found.profiles[name]),
+    }
 
 
 def _change_set_outcomes(
@@ -301,11 +308,11 @@ def _change_set_outcomes(
     other = system_with_second_arm(run, build_system(run))
     two_arms = None if other is None else with_grasp_offset_effects(other)
     x = unknowns_from_solution(problem, common["x"])
-    setting = BaseExperiment(problem, x, common["start"], common["grasp_std"], two_arms)
-    return [to_plain_data(entry) for entry in evaluate_change_sets(setting, sets, inflation)]
+    setting = RecordedExperiment(problem, x, common["start"], common["grasp_std"], two_arms)
+    return [to_lossless_plain_data(entry) for entry in evaluate_change_sets(setting, sets, inflation)]
 
 
 def _problem(common: Mapping[str, Any]) -> tuple[RunSettings, EstimationProblem]:
     run = load_config(common["config"])
     problem = build_problem(run, build_step(run, with_grasp_offset_effects(build_system(run))))
-    return run, problem if common["remembers"] else without_cable_memory(problem)
+    return run, problem if common["remembers"] else problem_without_cable_memory(problem)

@@ -12,12 +12,12 @@ from typing import Any
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ImportSettings
 from yid_ocp.data import Recording, preview_file, read_any, write_recording
-from yid_ocp.data.readers import FileContents
-from yid_ocp.data.readers.base import parse_units
+from yid_ocp.data.readers import FilePreview
+from yid_ocp.data.readers.base import parse_quantity_units
 from yid_ocp.errors import ConfigError
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.terminal import file_contents_lines, recording_summary_lines
-from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, show_progress
+from yid_ocp.report.terminal import recording_summary_lines, third_party_file_summary_lines
+from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
 _RESULT_FORMAT = "yid-import/1"
 _LISTS = ("joint_topics", "joints")
@@ -31,14 +31,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     file, asked = arguments.file, reader_options_from_arguments(arguments)
     if arguments.preview:
-        with show_progress(arguments) as progress:
+        with stderr_progress_display(arguments) as progress:
             progress.begin_stage(f"reading {file}")
             contents = preview_file(file, progress)
         if arguments.json:
             print_json({"format": _RESULT_FORMAT, "recording": None, **_preview_result(contents)})
             return EXIT_DONE
-        lines = file_contents_lines(contents)
-        if not is_recording_file(file):
+        lines = third_party_file_summary_lines(contents)
+        if not has_native_recording_suffix(file):
             lines += ["", "to import it:", f"  {_import_command_line(file, {**contents.reader_options, **asked})}"]
         print("\n".join(lines))
         return EXIT_DONE
@@ -47,23 +47,23 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError("nothing says where to write the recording", where="--out", allowed=allowed)
     settings = load_config(arguments.config).import_ if arguments.config else ImportSettings()
     said = {entry.name: getattr(settings, entry.name) for entry in fields(settings)}
-    with show_progress(arguments) as progress:
+    with stderr_progress_display(arguments) as progress:
         options = {name: value for name, value in said.items() if value is not None} | asked
-        recording = read_foreign_recording(file, options, progress)
+        recording = read_third_party_recording(file, options, progress)
         write_recording(recording, arguments.out)
     out = arguments.out
-    result = {"format": _RESULT_FORMAT, "recording": out, **recording_contents(recording)}
+    result = {"format": _RESULT_FORMAT, "recording": out, **recording_contents_summary(recording)}
     print_result(arguments, result, lambda: recording_summary_lines(recording), f"recording: {out}", out)
     return EXIT_DONE
 
 
-def recording_contents(recording: Recording) -> dict[str, Any]:
+def recording_contents_summary(recording: Recording) -> dict[str, Any]:
     """Contents of a recording as plain data: duration, groups and notes."""
     groups = {group.name: {"samples": len(group.t), "names": list(group.names)} for group in recording.all_groups}
     return {"duration": recording.duration, "groups": groups, "notes": list(recording.notes)}
 
 
-def _preview_result(contents: FileContents) -> dict[str, Any]:
+def _preview_result(contents: FilePreview) -> dict[str, Any]:
     keys = {"count": "n_samples", "rate": "mean_rate", "becomes": "imported_as"}
     sources = [
         {key: getattr(own, keys.get(key, key)) for key in ("name", "kind", "count", "rate", "becomes", "note")}
@@ -72,7 +72,7 @@ def _preview_result(contents: FileContents) -> dict[str, Any]:
     return {"sources": sources, "options": contents.reader_options, "notes": contents.notes}
 
 
-def read_foreign_recording(
+def read_third_party_recording(
     file: str | Path, options: Mapping[str, Any], progress: Progress = NULL_PROGRESS
 ) -> Recording:
     """Recording read from a file of another tool, with the file's hash in `source`.
@@ -89,12 +89,12 @@ def read_foreign_recording(
     """
     progress.begin_stage(f"reading {file}")
     recording = read_any(file, progress=progress, **options)
-    if recording.sha256 is None or is_recording_file(file):
+    if recording.sha256 is None or has_native_recording_suffix(file):
         return recording
     return replace(recording, source=f"{recording.source} (SHA-256 {recording.sha256})")
 
 
-def is_recording_file(file: str | Path) -> bool:
+def has_native_recording_suffix(file: str | Path) -> bool:
     """Whether a file is a recording of this package, judged by its suffix."""
     return Path(file).suffix.lower() in (".h5", ".hdf5")
 
@@ -111,7 +111,7 @@ def reader_options_from_arguments(arguments: argparse.Namespace) -> dict[str, An
     for key in (*_LISTS, *_MAPPINGS):
         if entries := _split(getattr(arguments, key)):
             options[key] = tuple(entries) if key in _LISTS else _pairs(entries, key)
-    units = parse_units(_split(arguments.units))
+    units = parse_quantity_units(_split(arguments.units))
     return options | ({"units": units} if units else {})
 
 

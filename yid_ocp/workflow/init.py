@@ -16,15 +16,19 @@ from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_details
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import InitObject, comma_separated_numbers, init_templates
+from yid_ocp.model.objects.base import InitCommandObject, comma_separated_numbers, init_command_object_templates
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.progress import Progress
 from yid_ocp.version import package_version
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, show_progress
-from yid_ocp.workflow.config_proposal import ConfigProposal, propose_config, rest_split_time
-from yid_ocp.workflow.import_recording import is_recording_file, read_foreign_recording, reader_options_from_arguments
+from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
+from yid_ocp.workflow.config_proposal import ConfigProposal, held_out_split_time, propose_config
+from yid_ocp.workflow.import_recording import (
+    has_native_recording_suffix,
+    read_third_party_recording,
+    reader_options_from_arguments,
+)
 
 _RESULT_FORMAT = "yid-init/1"
 _SCHEMA_FILE = "yid-ocp.schema.json"
@@ -37,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"the configuration is called '{out.name}'", where="--out", allowed="NAME.yaml")
     read_urdf(robot)
     item = _object_from_arguments(arguments)
-    with show_progress(arguments) as progress:
+    with stderr_progress_display(arguments) as progress:
         made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
     segments, grasps = item.settings.model_segments(), _grasps(arguments.grasp)
@@ -64,9 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
 # -- what was asked ---------------------------------------------------------------------------------------------------
 
 
-def _object_from_arguments(arguments: argparse.Namespace) -> InitObject:
+def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject:
     """The described object; `ConfigError` for a number that is missing or impossible, which names its option."""
-    templates, word = init_templates(), arguments.object
+    templates, word = init_command_object_templates(), arguments.object
     if word not in templates:
         said = unknown_name_details(word, templates)
         raise ConfigError(f"there is no choice of --object '{word}'", where="yid-ocp init", **said)
@@ -109,8 +113,8 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
     options = reader_options_from_arguments(arguments)
     made: dict[Path, Recording | None] = {}
     for file in map(Path, arguments.files):
-        if not is_recording_file(file):
-            recording = read_foreign_recording(file, options, progress)
+        if not has_native_recording_suffix(file):
+            recording = read_third_party_recording(file, options, progress)
             made[out.parent / f"{recording.name}.h5"] = recording
         elif options:
             what, flags = f"{file.name} is a recording already", ", ".join(options)
@@ -126,7 +130,7 @@ def _split(
     made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: ConfigProposal, out: Path
 ) -> dict[Path, Recording | None]:
     """A single recording in two files where it comes to rest in between, the second one to be held out."""
-    time = rest_split_time(recordings[0], proposal.joints) if len(recordings) == 1 else None
+    time = held_out_split_time(recordings[0], proposal.joints) if len(recordings) == 1 else None
     if time is None:
         return made
     [whole] = recordings
@@ -178,7 +182,7 @@ _ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
 def _config_lines(
     robot: str,
     noun: str,
-    item: InitObject,
+    item: InitCommandObject,
     proposal: ConfigProposal,
     recordings: Sequence[str],
     imports: Mapping[str, Any],
@@ -269,7 +273,7 @@ def _arms(proposal: ConfigProposal) -> Iterator[str]:
         yield _line("      ", "has_gravity_compensation", "false", carried)
 
 
-def _object(item: InitObject, proposal: ConfigProposal) -> Iterator[str]:
+def _object(item: InitCommandObject, proposal: ConfigProposal) -> Iterator[str]:
     """The object, what holds it, its damping, and points on it."""
     holder, grasps = proposal.holder_frame, proposal.grasps
     yield "  object:"
@@ -318,7 +322,7 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
 def _effects(proposal: ConfigProposal) -> Iterator[str]:
     if proposal.arm_mode == "servo":
         kind, words = "rotor_inertia", "what rotors add through their gears, free below"
-    elif proposal.is_seen_by_effort_alone:
+    elif proposal.is_object_measured_only_by_effort:
         kind, words = "effort_offset", "the zero of every torque sensor, free below"
     else:
         return
@@ -352,7 +356,11 @@ def _sensors(proposal: ConfigProposal) -> Iterator[str]:
             entries, said = [f"std: {_number(noise.std)}"], f"{noise.std:.2g} {noise.unit}, {noise.reason}"
         if frames := {place.point: place.frame for place in places if place.frame and place.frame != place.point}:
             entries.append(f"frames: {_value(frames)}")
-        if group == "joints.effort" and proposal.arm_mode == "prescribed" and not proposal.is_seen_by_effort_alone:
+        if (
+            group == "joints.effort"
+            and proposal.arm_mode == "prescribed"
+            and not proposal.is_object_measured_only_by_effort
+        ):
             entries, said = ["use: false", *entries], "true once friction and payload of the arm are in the model"
         # without a setting of its own, a comment
         yield _line("  ", group, f"{{{', '.join(entries)}}}", said) if entries else f"  # {group}: {said}"
@@ -362,7 +370,7 @@ def _sensors(proposal: ConfigProposal) -> Iterator[str]:
         yield f"  # {group} come at {clock}"
 
 
-def _parameters(item: InitObject, proposal: ConfigProposal) -> Iterator[str]:
+def _parameters(item: InitCommandObject, proposal: ConfigProposal) -> Iterator[str]:
     free = "{free: true}"
     yield _line("", "parameters", "", item.parameters_comment)
     for name, (value, comment) in item.start_values.items():
@@ -373,7 +381,7 @@ def _parameters(item: InitObject, proposal: ConfigProposal) -> Iterator[str]:
         yield _line("  ", '"*.servo_delay"', free, "from a command to its torque [s]")
         yield _line("  ", '"rotor_inertia@*.armature"', free, "of the servos' motors, at the joint [kg m^2]")
         yield '  # "*.servo_torque_limit": {initial: 3.0}   # the URDF\'s effort limit where nothing is said'
-    if proposal.is_seen_by_effort_alone:
+    if proposal.is_object_measured_only_by_effort:
         for joint in proposal.joints:
             said, why = "{free: true, initial: 0.1, bounds: [0.0, 50.0]}", "viscous friction of the arm [N m s/rad]"
             if joint in proposal.still_joints:

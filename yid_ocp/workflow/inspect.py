@@ -14,18 +14,18 @@ import numpy as np
 
 from yid_ocp.analysis.sparsity_patterns import (
     SparsityPattern,
-    kkt_pattern,
-    kkt_size,
+    full_nlp_size,
+    kkt_sparsity_pattern,
     nlp_stage_sparsity,
     step_sparsity_patterns,
 )
 from yid_ocp.analysis.step_diagnostics import (
     CheckedLinearisation,
-    ParameterDependence,
+    ParameterEquationDependence,
     linearise_and_check,
     linearise_step_equations,
     parameter_dependences,
-    step_structure,
+    step_size_summary,
 )
 from yid_ocp.analysis.step_symbols import EquationEntry, StepSymbols
 from yid_ocp.arrays import Array
@@ -35,16 +35,16 @@ from yid_ocp.errors import ModelError
 from yid_ocp.export.equations import export_step_functions, write_equation_sheet
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
-from yid_ocp.integrator.step_model import StepLinearization
+from yid_ocp.integrator.step_model import StepEquationLinearizations
 from yid_ocp.model import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_sparsity_patterns
 from yid_ocp.report.summaries import inspect_summary
-from yid_ocp.workflow.build import build_step, free_parameters
+from yid_ocp.workflow.build import build_step, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, run_configured
-from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings
+from yid_ocp.workflow.run_folder import atomic_run_folder
 
 _RESULT_FORMAT = "yid-inspect/1"
 _SHOWN_STEPS = 2  # of the NLP in its picture: what comes after looks the same
@@ -66,15 +66,17 @@ class _LinearisationPoint:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_configured(arguments, _run_inspect, inspect_summary, tuple(arguments.entries), arguments.export)
+    return run_command_with_settings(
+        arguments, _run_inspect, inspect_summary, tuple(arguments.entries), arguments.export
+    )
 
 
 def _run_inspect(
     run: RunSettings, out: str | Path | None, progress: Progress, entries: Sequence[str], export: str | None
 ) -> CommandResult[None]:
     """Write result.json, equations.txt, sparsity.png, kkt.png and linearisation.h5, and what is asked for beside."""
-    with new_run_folder(run, out, "inspect") as folder:
-        folder.begin_run(run, "inspect", [part for name in entries for part in ("--entry", name)])
+    with atomic_run_folder(run, out, "inspect") as folder:
+        folder.record_run_start(run, "inspect", [part for name in entries for part in ("--entry", name)])
         progress.begin_stage("building the model and its compiled step")
         begun = time.perf_counter()
         step = build_step(run)
@@ -86,7 +88,7 @@ def _run_inspect(
         for name in named:
             parameters.index(name)
         chosen = [symbols.equation_entry(text) for text in entries if text.strip() not in named]
-        free = free_parameters(run, parameters)
+        free = free_parameter_names(run, parameters)
         progress.begin_stage("linearising")
         problem = build_problem(run, step) if run.recordings.estimate and free else None
         point = _point(step, problem)
@@ -116,7 +118,7 @@ def _run_inspect(
                 entry.name: {key: getattr(entry, key) for key in _PARAMETER_KEYS} | {"free": entry.name in free}
                 for entry in parameters
             },
-            "equations": step_structure(step),
+            "equations": step_size_summary(step),
             "blocks": {
                 kind: [{"name": b.name, "meaning": b.meaning, "names": list(b.full_names)} for b in own if b.labels]
                 for kind, own in blocks.items()
@@ -150,7 +152,7 @@ def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint
         episode = problem.episodes[0]
         known, words = episode.initial_known_coordinates, f"rest at the first posture of {episode.name}"
         torque = episode.torque[0] if system.driven else None
-        theta = problem.predictor.episode_theta(episode, theta)
+        theta = problem.predictor.theta_with_episode_values(episode, theta)
         if episode.fixed_initial_state is not None:
             held = np.zeros(sizes["nu"]) if torque is None else torque
             words = f"the start that was fitted to the first points of {episode.name}"
@@ -163,7 +165,7 @@ def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint
     return _LinearisationPoint(words, False, np.zeros(sizes["nx"]), np.zeros(sizes["nu"]), theta, np.zeros(sizes["nc"]))
 
 
-def _linearised(step: Step, point: _LinearisationPoint) -> tuple[CheckedLinearisation, StepLinearization]:
+def _linearised(step: Step, point: _LinearisationPoint) -> tuple[CheckedLinearisation, StepEquationLinearizations]:
     at = point.state, point.torque, point.theta, point.prescribed_positions
     try:
         found = linearise_and_check(step, *at)
@@ -182,16 +184,18 @@ def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
 
 
 def _patterns(
-    symbols: StepSymbols, matrices: Mapping[str, Array], rows: StepLinearization, point: _LinearisationPoint
+    symbols: StepSymbols, matrices: Mapping[str, Array], rows: StepEquationLinearizations, point: _LinearisationPoint
 ) -> dict[str, SparsityPattern]:
-    kept = np.setdiff1d(np.arange(rows.residual_by_new.shape[1]), list(symbols.equations.system.prescribed_indices))
+    kept = np.setdiff1d(
+        np.arange(rows.residual_by_new.shape[1]), list(symbols.equations.system.prescribed_coordinate_indices)
+    )
     values = {
         **matrices,
         "dR_dy": rows.residual_by_new[0][np.ix_(kept, kept)],
         "dR_dtheta": np.vstack([rows.residual_by_theta[0], rows.p1_by_theta[0]]),
     }
     where, found = ("the rest" if point.is_equilibrium else "this point", step_sparsity_patterns(symbols))
-    return {name: entry.with_marked_nonzeros(values[name], where) for name, entry in found.items()}
+    return {name: entry.with_numerical_nonzeros_marked(values[name], where) for name, entry in found.items()}
 
 
 def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> dict[str, Any]:
@@ -204,12 +208,12 @@ def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> dic
         problem.shared_parameters,
         [sensor for sensor in sensors if not sensor.effort_joints],
         followed,
-        problem.predictor.estimated_state_indices,
+        problem.predictor.estimated_initial_state_indices,
     )
     steps = [entry.grid.steps for entry in problem.episodes]
-    draw_sparsity_patterns(picture, [[kkt_pattern(stage, min(_SHOWN_STEPS, *steps))]])
+    draw_sparsity_patterns(picture, [[kkt_sparsity_pattern(stage, min(_SHOWN_STEPS, *steps))]])
     left_out = [*(sensor.group_name for sensor in sensors if sensor.effort_joints), *problem.local_parameters]
-    return {**kkt_size(stage, steps), "left_out": left_out}
+    return {**full_nlp_size(stage, steps), "left_out": left_out}
 
 
 def _dependence(
@@ -217,8 +221,8 @@ def _dependence(
     symbols: StepSymbols,
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
-    rows: StepLinearization,
-) -> tuple[ParameterDependence, ...]:
+    rows: StepEquationLinearizations,
+) -> tuple[ParameterEquationDependence, ...]:
     """Where every parameter enters and who sees it; along the recordings where the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
     found = parameter_dependences(step, symbols, episode, point.state, point.theta, rows)
@@ -246,7 +250,7 @@ def _entry_result(entry: EquationEntry, symbols: StepSymbols, at: Array) -> dict
         "row": entry.row_name,
         "column": entry.column_name,
         "operations": entry.formula.n_operations,
-        "zero": entry.is_zero,
+        "zero": entry.is_identically_zero,
         "value": entry.numeric_value(symbols.column_symbols, at),
         "lines": entry.text_lines,
     }

@@ -21,19 +21,19 @@ from yid_ocp.errors import DataError
 from yid_ocp.export.signals import export_csv, joint_trajectory_message
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
-from yid_ocp.planning.motion_plan import MotionPlan, ParameterCovariance, plan_motion
+from yid_ocp.planning.motion_plan import ParameterCovariance, TargetMotionPlan, plan_motion_to_target
 from yid_ocp.problem.measurements import make_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_path
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import ModelTrajectory, make_animation
 from yid_ocp.report.summaries import plan_summary
-from yid_ocp.workflow.build import build_cable, build_step, free_parameters
+from yid_ocp.workflow.build import build_step, clamped_cable_topology, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, run_configured
-from yid_ocp.workflow.run_folder import new_run_folder
-from yid_ocp.workflow.run_history import RUN_FORMATS, read_result_file
-from yid_ocp.workflow.run_inputs import locate_errors, read_recordings
+from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings
+from yid_ocp.workflow.run_folder import atomic_run_folder
+from yid_ocp.workflow.run_history import ESTIMATE_RESULT_FORMATS, read_result_file
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings
 
 _RESULT_FORMAT = "yid-plan/1"
 _EFFORT_STD, _POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
@@ -42,28 +42,28 @@ _MAX_DISCRIMINATED_EFFECTS = 3  # effects that one motion is asked to separate, 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_configured(arguments, run_plan, plan_summary)
+    return run_command_with_settings(arguments, run_plan, plan_summary)
 
 
 def run_plan(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> CommandResult[MotionPlan | InformativeMotionPlan]:
+) -> CommandResult[TargetMotionPlan | InformativeMotionPlan]:
     """Plan the motion of a run's goal; write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
 
     Successful where the goal was reached within all limits; the run folder says why not.
     """
-    with new_run_folder(run, out, "plan") as folder:
-        folder.begin_run(run, "plan")
+    with atomic_run_folder(run, out, "plan") as folder:
+        folder.record_run_start(run, "plan")
         progress.begin_stage("building the model and its compiled step")
-        found: MotionPlan | InformativeMotionPlan
+        found: TargetMotionPlan | InformativeMotionPlan
         if run.plan.goal == "information":
             found, source = _plan_from_settings(run, progress)
         else:
-            step = compile_planning_step(run)
-            theta, known, source = identified_parameters(run, step)
+            step = compile_step_for_planning(run)
+            theta, known, source = identified_parameters_with_covariance(run, step)
             options = replace(run.plan, start_joint_positions=start_configuration(run, step))
-            with locate_errors(run, "plan"):
-                found = plan_motion(step, options, theta, known, progress)
+            with add_setting_location_to_errors(run, "plan"):
+                found = plan_motion_to_target(step, options, theta, known, progress)
         recording = _plan_as_recording(run, found)
         write_recording(recording, folder.path / "recording.h5")
         export_csv(recording, folder.path / "csv")
@@ -71,16 +71,16 @@ def run_plan(
         trajectory = joint_trajectory_message(found.joint_names, found.t, found.joint_positions, *rates)
         folder.write_text_file("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
         folder.log_event("end", reached=found.is_successful, message=found.message)
-        told = _plan_result(run, found) if isinstance(found, MotionPlan) else _information_plan_result(run, found)
+        told = _plan_result(run, found) if isinstance(found, TargetMotionPlan) else _information_plan_result(run, found)
         written = folder.write_result(_motion_result(run, found, source) | told)
         system, q = found.simulator.step.system, found.rollout.state[:, : found.simulator.step.system.n_coordinates]
         scene = make_animation("planned", [ModelTrajectory("planned", system, found.simulator.theta, found.t, q)])
-        more = {"plan" if isinstance(found, MotionPlan) else "information": found}
+        more = {"plan" if isinstance(found, TargetMotionPlan) else "information": found}
         folder.write_report_page(run, written, progress, animations=[scene], section_data=more)
     return CommandResult(folder.path, written, found, found.is_successful)
 
 
-def compile_planning_step(run: RunSettings) -> Step:
+def compile_step_for_planning(run: RunSettings) -> Step:
     """The compiled step of a run with prescribed arms, for planning."""
     model = replace(run.model, arms=replace(run.model.arms, mode="prescribed"))
     recordings = run.recordings if run.model.robot is None else replace(run.recordings, estimate=(), held_out=())
@@ -97,15 +97,17 @@ def start_configuration(run: RunSettings, step: Step) -> Mapping[str, float] | N
     """
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
-    [recording], cable, system = read_recordings(run, count=1), build_cable(run), step.system
+    [recording], cable, system = read_recordings(run, count=1), clamped_cable_topology(run), step.system
     clamps = () if cable is None else cable.clamp_paths
     grid = make_time_grid(recording, step.time_step, run.problem.duration)
-    with locate_errors(run, "recordings", "estimate", 0):
+    with add_setting_location_to_errors(run, "recordings", "estimate", 0):
         path = prescribed_path(recording, system, grid, LowPassFilter(run.problem.path_cutoff), clamps)
     return dict(zip(system.prescribed, map(float, path[0]), strict=True))
 
 
-def identified_parameters(run: RunSettings, step: Step) -> tuple[Array, ParameterCovariance, dict[str, Any]]:
+def identified_parameters_with_covariance(
+    run: RunSettings, step: Step
+) -> tuple[Array, ParameterCovariance, dict[str, Any]]:
     """Parameters, their covariance, and where both come from: a run folder of `solve`, or the settings.
 
     Raises
@@ -116,7 +118,7 @@ def identified_parameters(run: RunSettings, step: Step) -> tuple[Array, Paramete
     parameters = step.system.parameters
     theta = parameters.vector()
     if run.plan.parameter_run is None:
-        values = {name: parameters[name].value for name in free_parameters(run, parameters)}
+        values = {name: parameters[name].value for name in free_parameter_names(run, parameters)}
         return theta, ParameterCovariance(), {"run": None, "parameters": values}
     result, folder = _read_parameter_run(run, ("solve",))
     _require_same_effects(run, result["parameters"], parameters.names)
@@ -133,7 +135,7 @@ def identified_parameters(run: RunSettings, step: Step) -> tuple[Array, Paramete
     return theta, ParameterCovariance(certain, np.nan_to_num(covariance[np.ix_(usable, usable)])), source
 
 
-def _plan_as_recording(run: RunSettings, found: MotionPlan | InformativeMotionPlan) -> Recording:
+def _plan_as_recording(run: RunSettings, found: TargetMotionPlan | InformativeMotionPlan) -> Recording:
     q, v = found.joint_positions, found.joint_velocities
     known: dict[str, Any] = {"position_command": q, "velocity_command": v, "clock": "nominal"}
     known |= {"effort_kind": "sample", "effort_std": _EFFORT_STD}
@@ -149,9 +151,9 @@ def _plan_as_recording(run: RunSettings, found: MotionPlan | InformativeMotionPl
 
 
 def _motion_result(
-    run: RunSettings, found: MotionPlan | InformativeMotionPlan, source: dict[str, Any]
+    run: RunSettings, found: TargetMotionPlan | InformativeMotionPlan, source: dict[str, Any]
 ) -> dict[str, Any]:
-    joints = [found.simulator.step.system.mechanism.joints[i] for i in found.simulator.joint_indices]
+    joints = [found.simulator.step.system.mechanism.joints[i] for i in found.simulator.moved_joint_indices]
     return {
         "format": _RESULT_FORMAT,
         "status": "done" if found.is_successful else "failed",
@@ -175,7 +177,7 @@ def _share(values: Array, limit: float) -> float | None:
     return float(np.max(np.abs(values)) / limit) if math.isfinite(limit) and limit > 0 else None
 
 
-def _plan_result(run: RunSettings, found: MotionPlan) -> dict[str, Any]:
+def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
     return {
         "point": run.plan.point,
         "place": found.target_position.tolist(),
@@ -196,7 +198,7 @@ def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict
     if not file.is_file() or not (folder / "trajectories.h5").is_file():
         what = f"there is no finished run of {' or '.join(f'`{command}`' for command in commands)} in {folder}"
         raise run.config_error(what, *where, hint="give the run folder that it printed")
-    result, formats = read_result_file(file), [RUN_FORMATS[command] for command in commands]
+    result, formats = read_result_file(file), [ESTIMATE_RESULT_FORMATS[command] for command in commands]
     if result.get("format") not in formats:
         what = f"{folder} is a run folder of another command ({result.get('format')})"
         raise run.config_error(what, *where, allowed=" or ".join(formats))
@@ -217,7 +219,7 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
         found, sizes = parameter_and_effect_values(result)
         _require_same_effects(run, found, known.names)
         values |= {name: value for name, value in found.items() if name in known}
-    with locate_errors(run, "plan"):
+    with add_setting_location_to_errors(run, "plan"):
         plan = plan_informative_motion(problem, run.plan, values, sizes, progress)
     return plan, {"run": None if origin is None else str(origin), "parameters": values}
 
@@ -283,7 +285,9 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def next_plan_settings(confusable: Sequence[Sequence[Mapping[str, str]]], folder: Path) -> dict[str, Any] | None:
+def discrimination_plan_settings(
+    confusable: Sequence[Sequence[Mapping[str, str]]], folder: Path
+) -> dict[str, Any] | None:
     """Settings of `plan` for a motion that discriminates confusable effects; None without any."""
     if not confusable:
         return None

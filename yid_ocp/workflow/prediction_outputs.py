@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.hdf5_io import create_hdf5_atomically
-from yid_ocp.data.issues import MAX_LIMIT_RATIO, Issue
+from yid_ocp.data.issues import MAX_ISSUE_EVIDENCE, Issue
 from yid_ocp.diagnosis import DiagnosisResult
-from yid_ocp.diagnosis.localise import unknown_units
+from yid_ocp.diagnosis.localise import smoothed_unknown_units
 from yid_ocp.inference import whitening
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem, prediction_errors
@@ -103,7 +103,7 @@ def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapp
                     f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by "
                     f"{guess:.3g} {unit}"
                 )
-                evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_LIMIT_RATIO
+                evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_ISSUE_EVIDENCE
                 advice = "look at the residuals, and let `yid-ocp diagnose` say what the model lacks"
                 sensor, _, channel = group.partition(".")
                 at = (entry["recording"], sensor, channel)
@@ -136,7 +136,7 @@ def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | N
     if sensor.naive_prediction == "zero":
         return {"zero": np.zeros_like(samples.value)}
     if cable is not None and sensor.point_names and set(sensor.point_names) <= set(cable.vertices):
-        recording, held, points = episode.recording, cable.clamped_vertices, sensor.point_names
+        recording, held, points = episode.recording, cable.clamped_vertex_names, sensor.point_names
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
         arrays = {
@@ -165,17 +165,21 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     """
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
-    known = list(zip(problem.episodes, whitening.estimate_torque_biases(problem, x), strict=True))
+    known = list(zip(problem.episodes, whitening.estimate_recording_torque_biases(problem, x), strict=True))
     apart = [e for e in problem.held_out if e.initial_state_shared_with is None and _has_torque_bias(e)]
     if apart:
-        held = problem if any(problem.held_out_whitening_filters) else whitening.held_out_whitened_at(problem, x)
+        held = (
+            problem if any(problem.held_out_whitening_filters) else whitening.problem_with_whitened_held_out(problem, x)
+        )
         for (episode, result), own in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
             if (
                 isinstance(own, whitening.WhiteningFilter)
                 and not isinstance(result, str)
                 and episode.initial_state_shared_with is None
             ):
-                known.append((episode, (whitening.estimate_torque_bias(episode, result, own), own.torque_bias_std)))
+                known.append(
+                    (episode, (whitening.estimate_episode_torque_bias(episode, result, own), own.torque_bias_std))
+                )
     found = {}
     for episode, estimate in known:
         if estimate is not None and episode.input_errors is not None and _has_torque_bias(episode):
@@ -197,13 +201,13 @@ def predicted_trajectory(
 ) -> ModelTrajectory:
     """Trajectory of a predicted recording, to be animated; `theta`: parameters of all recordings, shape (ntheta,)."""
     system, q = problem.system, prediction.rollout.state[:, : problem.system.n_coordinates]
-    own = problem.predictor.episode_theta(episode, theta)
+    own = problem.predictor.theta_with_episode_values(episode, theta)
     return ModelTrajectory(name, system, own, episode.grid.node_times, q)
 
 
 SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/1"
 DIAGNOSIS_TRAJECTORIES_FORMAT = "yid-diagnosis-trajectories/1"
-HeldOutPrediction = tuple[Episode, EpisodePrediction, EpisodePrediction]
+HeldOutPredictionPair = tuple[Episode, EpisodePrediction, EpisodePrediction]
 """A held-out recording, its prediction by the nominal model and that with the effects."""
 
 
@@ -255,7 +259,9 @@ def write_solve_trajectories(
                 _store_sensor(group, episode, samples, {"predicted": predicted})
 
 
-def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, predicted: Sequence[HeldOutPrediction]) -> None:
+def write_diagnosis_trajectories(
+    path: Path, finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]
+) -> None:
     """Write held-out predictions and smoothed unknowns as `yid-diagnosis-trajectories/1`.
 
     `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
@@ -289,7 +295,7 @@ def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, predicted
                 "unknowns": trace.unknown_names,
                 "locations": [source.location for source in trace.unknown_groups],
                 "kinds": [source.kind for source in trace.unknown_groups],
-                "units": unknown_units(problem.system, trace),
+                "units": smoothed_unknown_units(problem.system, trace),
             }
             _store_texts(group, texts)
             variance = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])

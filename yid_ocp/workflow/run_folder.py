@@ -44,7 +44,7 @@ class RunFolder:
     resume_folder : Path
         Where an interrupted run may leave what the next one with the same name, or none, can use; not made here.
     input_hashes : dict of str to str
-        SHA-256 of every file that the run reads, by name; see `begin_run`.
+        SHA-256 of every file that the run reads, by name; see `record_run_start`.
     """
 
     final_path: Path
@@ -55,7 +55,7 @@ class RunFolder:
     _command_line: str = ""
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
-    def begin_run(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
+    def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
         """Write config.yaml, hash what the run reads and log the start of a command with its flags.
 
         Errors as `input_files`.
@@ -67,12 +67,12 @@ class RunFolder:
         if any(origin.startswith("--set") for origin in origins):
             near = os.path.relpath(self.final_path)
             said = [str((self.final_path if near.startswith("..") else Path(near)) / "config.yaml")]
-        self.log_start([command, *said, *flags])
+        self.log_command_start([command, *said, *flags])
 
-    def log_start(self, words: Sequence[str]) -> None:
-        """Log the start of a command with what it reads; `words`: those that give its result again."""
+    def log_command_start(self, words: Sequence[str]) -> None:
+        """Log the start of a command with its inputs; `words`: the command line that reproduces its result."""
         self._command_line = shlex.join(["yid-ocp", *words])
-        self.log_event("start", command=words[0], versions=software_versions(), inputs=self.input_hashes)
+        self.log_event("start", command=words[0], versions=software_and_plugin_versions(), inputs=self.input_hashes)
 
     def write_result(self, result: Mapping[str, Any], name: str = "result.json") -> dict[str, Any]:
         """Write a result with command, date, inputs and versions; returns what was written.
@@ -81,7 +81,7 @@ class RunFolder:
         """
         made = {"command": self._command_line, "date": local_time_text(), "inputs": self.input_hashes}
         notes: list[str] = []
-        clean: dict[str, Any] = to_json_types({**result, **made, "versions": software_versions()}, notes)
+        clean: dict[str, Any] = to_json_types({**result, **made, "versions": software_and_plugin_versions()}, notes)
         if notes:
             clean["notes"] = _grouped(notes)
         self.write_text_file(name, json.dumps(clean, indent=1, allow_nan=False) + "\n")
@@ -124,8 +124,8 @@ def _grouped(notes: list[str]) -> list[str]:
 
 
 @contextlib.contextmanager
-def new_run_folder(run: RunSettings, out: str | Path | None = None, command: str = "") -> Iterator[RunFolder]:
-    """Make a run folder that appears under its name when the block ends, and not at all when it is left by an error.
+def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: str = "") -> Iterator[RunFolder]:
+    """Context manager for a new run folder, which appears under its name only if the block ends without an error.
 
     The name is reserved first: two runs never write to one folder, and a run that ends finds its name free. What
     killed runs left beside it is cleared away.
@@ -159,7 +159,7 @@ def new_run_folder(run: RunSettings, out: str | Path | None = None, command: str
     folder = RunFolder(target, temporary, partial, lines)
     with contextlib.ExitStack() as held:
         held.callback(lock.release)
-        held.enter_context(interruption.remove_on_forced_exit(temporary))
+        held.enter_context(interruption.remove_folder_on_forced_exit(temporary))
         try:
             with _logged(folder):
                 yield folder
@@ -303,6 +303,6 @@ def local_time_text() -> str:
     return datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
 
 
-def software_versions() -> dict[str, str]:
+def software_and_plugin_versions() -> dict[str, str]:
     """Versions of Python, this package, what its numbers depend on, and packages whose plug-ins are in use."""
     return installed_versions() | plugin_versions()

@@ -22,12 +22,12 @@ from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.report.summaries import history_summary
-from yid_ocp.workflow.command_runner import CommandResult, run_and_print
-from yid_ocp.workflow.run_folder import new_run_folder
-from yid_ocp.workflow.run_inputs import recording_path
+from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print
+from yid_ocp.workflow.run_folder import atomic_run_folder
+from yid_ocp.workflow.run_inputs import resolve_recording_path
 
-RUN_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
-"""Formats of result.json by command, of runs that have estimates."""
+ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
+"""Format identifiers of result.json by command, for commands that estimate parameters."""
 _OLD_FORMATS = ("yid-diagnosis/1",)
 """Of earlier versions, which had other keys."""
 _RENAMED_KEYS_HINT = "CHANGELOG.md has the table old -> new under Unreleased"
@@ -46,7 +46,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         There is no finished run, its result cannot be read, is one of another command or of an older format, or its
         solve failed.
     """
-    file, result = Path(folder) / "result.json", read_run_result(folder)
+    file, result = Path(folder) / "result.json", read_estimation_result(folder)
     try:
         said = result.get("model", result)  # of a diagnosis, the model that it ended with
         known, parameters = said["covariance"], said["parameters"]
@@ -55,7 +55,9 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         matrix = np.array(known["matrix"], float).reshape(len(names), len(names))
         units = {name: str(parameters[name]["unit"]) for name in names}
         explains = bool(result["fit"]["explains"]) if "fit" in result else result["verdict"] == "no_gap"
-        effects = effect_values({name: entry["value"] for name, entry in parameters.items() if "@" in name})
+        effects = effect_parameter_values_by_label(
+            {name: entry["value"] for name, entry in parameters.items() if "@" in name}
+        )
     except (LookupError, TypeError, ValueError) as error:
         what = "the result does not say how sure its parameters are together"
         allowed = "keys parameters and covariance, as this version writes them"
@@ -68,7 +70,7 @@ def read_estimates(folder: str | Path) -> RunEstimates:
     return RunEstimates(str(folder), names, values, matrix, units, explains, effects)
 
 
-def effect_values(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
+def effect_parameter_values_by_label(parameters: Mapping[str, float]) -> dict[str, dict[str, float]]:
     """Values of the parameters of effects, by the effect's label and the parameter's own name."""
     found: dict[str, dict[str, float]] = {}
     for name, value in parameters.items():
@@ -78,22 +80,22 @@ def effect_values(parameters: Mapping[str, float]) -> dict[str, dict[str, float]
     return found
 
 
-def with_effect_values(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
-    """The run with effects, by label, in its model at these values; those that it has already stay as they are."""
+def settings_with_effect_values(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
+    """Settings with these effects, by label, added to the model at these values; effects already in it are kept."""
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     parts = [(label.partition("@"), values) for label, values in effects.items() if label not in present]
     added = [EffectSettings(kind=kind, location=location, values=values) for (kind, _, location), values in parts]
     return replace(run, model=replace(run.model, effects=(*run.model.effects, *added)))
 
 
-def read_run_result(folder: str | Path) -> dict[str, Any]:
+def read_estimation_result(folder: str | Path) -> dict[str, Any]:
     """Contents of result.json of a successful `solve` or `diagnose`; errors as `read_estimates`."""
     file = Path(folder) / "result.json"
     result = read_result_file(file)
-    if result.get("format") not in RUN_FORMATS.values():
+    if result.get("format") not in ESTIMATE_RESULT_FORMATS.values():
         what = f"the run folder is one of another command ({result.get('format')})"
         hint = "give a run folder of `solve` or `diagnose`"
-        raise DataError(what, where=str(file), allowed=" or ".join(RUN_FORMATS.values()), hint=hint)
+        raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_RESULT_FORMATS.values()), hint=hint)
     if result.get("status") == "failed":
         raise DataError(f"the run failed: {result.get('message')}", where=str(file), hint="give one that converged")
     return result
@@ -117,7 +119,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
     if result.get("format") in _OLD_FORMATS:
         what = f"the run is of an earlier version ({result['format']}), whose keys had other names"
         what, hint = f"{what}; {_RENAMED_KEYS_HINT}", "diagnose again with this version"
-        raise DataError(what, where=str(file), allowed=" or ".join(RUN_FORMATS.values()), hint=hint)
+        raise DataError(what, where=str(file), allowed=" or ".join(ESTIMATE_RESULT_FORMATS.values()), hint=hint)
     return result
 
 
@@ -184,7 +186,7 @@ def _difference(run: RunSettings, folder: str | Path) -> str:
         if key == "robot" and here is not None and other is not None:
             here, other = Path(here).name, Path(other).name  # a folder may have moved
         if isinstance(here, ObjectKind) and isinstance(other, ObjectKind):
-            here, other = here.without_folders(), other.without_folders()
+            here, other = here.with_file_names_only(), other.with_file_names_only()
         if here != other:
             return key
     return ""
@@ -197,13 +199,13 @@ def _settings(folder: str | Path) -> RunSettings | None:
         return None
 
 
-def with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> RunSettings:
-    """The run with the effects of its baseline at their estimated values; their estimated parameters are free."""
+def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> RunSettings:
+    """Settings with the baseline's effects at their estimated values; parameters estimated there are free."""
     if not runs:
         return run
     known, _, _ = pool_estimates(runs)
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
-    estimated = effect_values(dict(zip(known.parameter_names, known.values, strict=True)))
+    estimated = effect_parameter_values_by_label(dict(zip(known.parameter_names, known.values, strict=True)))
     added = {label: {**said, **estimated.get(label, {})} for label, said in known.effects.items()}
     freed = {
         f"{label}.{quantity}": ParameterSettings(free=True)
@@ -211,7 +213,7 @@ def with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates]) -> Run
         for quantity in estimated.get(label, ())
         if label not in present
     }
-    return replace(with_effect_values(run, added), parameters={**run.parameters, **freed})
+    return replace(settings_with_effect_values(run, added), parameters={**run.parameters, **freed})
 
 
 def load_reference_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
@@ -222,7 +224,7 @@ def load_reference_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], 
     """
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.reference_recordings):
-        file = recording_path(path)
+        file = resolve_recording_path(path)
         if not is_file(file):
             where = ("recordings", "reference_recordings", i)
             raise run.config_error(f"there is no such recording: {file}", *where, hint="check the path")
@@ -231,7 +233,7 @@ def load_reference_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], 
         there = _settings(folder)
         for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
             try:
-                found.append(read_recording(recording_path(path)))
+                found.append(read_recording(resolve_recording_path(path)))
             except YidError as error:
                 return (), f"a recording of {folder} cannot be read: {error.what}"
     return tuple(replace(recording, name=f"{recording.name} (without)") for recording in found), ""
@@ -257,7 +259,9 @@ def require_distinct_recordings(
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_and_print(arguments, lambda shown: _run_report(arguments.runs, arguments.out, shown), history_summary)
+    return run_command_and_print(
+        arguments, lambda shown: _run_report(arguments.runs, arguments.out, shown), history_summary
+    )
 
 
 def _run_report(folders: Sequence[str | Path], out: str | Path | None, progress: Progress) -> CommandResult[None]:
@@ -274,10 +278,10 @@ def _run_report(folders: Sequence[str | Path], out: str | Path | None, progress:
     progress.begin_stage(f"comparing {len(paths)} runs")
     found = assess_drift(estimates)
     settings = RunSettings(name="history", description="Runs of one model side by side.")
-    with new_run_folder(settings, out, "report") as folder:
+    with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in paths}
-        folder.log_start(["report", *map(str, folders)])
-        written = folder.write_result(history_result(found), "history.json")
+        folder.log_command_start(["report", *map(str, folders)])
+        written = folder.write_result(estimate_history_result(found), "history.json")
         folder.write_report_page(settings, written, progress)
     return CommandResult(folder.path, written, None)
 
@@ -292,8 +296,8 @@ _RESULT_KEYS = {
 """Keys of `yid-history/1` by attribute of a `RunConsistency`, where they differ."""
 
 
-def history_result(found: EstimateHistory) -> dict[str, Any]:
-    """`yid-history/1` without inputs and versions."""
+def estimate_history_result(found: EstimateHistory) -> dict[str, Any]:
+    """Parameter estimates over several runs as a `yid-history/1` result, without inputs and versions."""
     parameters = {}
     for entry in found.parameter_drifts:
         known = zip(entry.run_names, entry.values, entry.std, strict=True)

@@ -20,12 +20,12 @@ from yid_ocp.errors import ConfigError, YidError, nearest_name_hint
 from yid_ocp.files import file_sha256, is_file
 from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.registry import Registry
-from yid_ocp.sensors import CHANNELS, SENSOR_READERS
+from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS
 
 _ENTRY_POINT_GROUP = "yid_ocp.effects"
 """Entry points of this group are modules that register effects or sensors when they are imported."""
 
-_REGISTRIES: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS, CHANNELS)
+_REGISTRIES: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS, CHANNEL_KINDS)
 _loaded: dict[str, str] = {}  # what this process has run: file or entry point, and the hash or distribution
 
 
@@ -118,7 +118,7 @@ def _line(error: BaseException, path: Path) -> int | None:
 
 
 @contextlib.contextmanager
-def locate_errors(run: RunSettings, *path: str | int) -> Iterator[None]:
+def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterator[None]:
     """Context manager that adds the location of a setting to errors raised in its block."""
     try:
         yield
@@ -130,7 +130,7 @@ def locate_errors(run: RunSettings, *path: str | int) -> Iterator[None]:
 
 
 def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[str], *path: str | int) -> ConfigError:
-    """A `ConfigError` (not raised here) about a name in the settings that is none, with the nearest known one."""
+    """A `ConfigError` (not raised here) about an unknown name in the settings, with the nearest known one."""
     return run.config_error(f"there is no {noun} '{name}'", *path, hint=nearest_name_hint(name, known))
 
 
@@ -144,14 +144,14 @@ def input_files(run: RunSettings) -> dict[str, Path]:
         files[path] = _existing(run, Path(path), "plug-in", "plugins", i)
     robot = run.model.robot
     if robot is not None:
-        with locate_errors(run, "model", "robot"):
+        with add_setting_location_to_errors(run, "model", "robot"):
             file = resolve_urdf_path(robot)
         files[robot] = _existing(run, file, "URDF file", "model", "robot")
-    for key, name in {} if run.model.object is None else run.model.object.input_files().items():
+    for key, name in {} if run.model.object is None else run.model.object.input_file_paths().items():
         files[name] = _existing(run, Path(name), "file", "model", "object", key)
     for which in ("estimate", "held_out"):
         for i, path in enumerate(getattr(run.recordings, which)):
-            files[path] = _existing(run, recording_path(path), "recording", "recordings", which, i)
+            files[path] = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
     return files
 
 
@@ -164,7 +164,7 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
     raise run.config_error(f"there is no such {noun}: {file}", *key, hint=hint)
 
 
-def recording_path(path: str) -> Path:
+def resolve_recording_path(path: str) -> Path:
     """Path of a recording named in the settings; `default:NAME` is one shipped with the package."""
     if not path.startswith("default:"):
         return Path(path)
@@ -179,8 +179,8 @@ def read_recordings(run: RunSettings, which: str = "estimate", count: int | None
     paths: Sequence[str] = getattr(run.recordings, which)
     result: list[Recording] = []
     for i, path in enumerate(paths[:count]):
-        file = _existing(run, recording_path(path), "recording", "recordings", which, i)
-        with locate_errors(run, "recordings", which, i):
+        file = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
+        with add_setting_location_to_errors(run, "recordings", which, i):
             recording = read_recording(file)
         if recording.name in [entry.name for entry in result]:
             recording = replace(recording, name=f"{recording.name}_{i}")

@@ -20,9 +20,9 @@ from yid_ocp.report.animation import Animation, make_animation, recording_animat
 from yid_ocp.report.summaries import simulate_summary
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import problem_options
-from yid_ocp.workflow.command_runner import CommandResult, run_configured
+from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings
 from yid_ocp.workflow.prediction_outputs import predicted_trajectory
-from yid_ocp.workflow.run_folder import new_run_folder
+from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import read_recordings
 
 _RESULT_FORMAT = "yid-simulate/1"
@@ -31,7 +31,7 @@ _DEFAULT_DURATION = 5.0  # of a virtual experiment whose configuration does not 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_configured(arguments, run_simulate, simulate_summary, arguments.seed, arguments.noise)
+    return run_command_with_settings(arguments, run_simulate, simulate_summary, arguments.seed, arguments.noise)
 
 
 def run_simulate(
@@ -55,9 +55,9 @@ def run_simulate(
         Whether noise of the recorded standard deviations is added to what the model predicts (a virtual experiment
         always has noise).
     """
-    with new_run_folder(run, out, "simulate") as folder:
+    with atomic_run_folder(run, out, "simulate") as folder:
         flags = [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
-        folder.begin_run(run, "simulate", flags)
+        folder.record_run_start(run, "simulate", flags)
         system = build_system(run)
         if run.recordings.estimate:
             made, scenes = _predicted(run, system, progress, seed if noise else None)

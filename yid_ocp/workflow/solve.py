@@ -13,13 +13,13 @@ import numpy as np
 from yid_ocp.analysis.clock_checks import check_fit_residuals
 from yid_ocp.analysis.compare import CableMemoryDecision, decide_cable_memory
 from yid_ocp.analysis.discretisation import (
-    DiscretisationShift,
-    RefinedProblem,
-    StepErrorGrowth,
-    discretisation_shifts,
-    inflate_estimates,
-    joint_subdivision,
-    largest_error_growth,
+    AlternatingErrorGrowth,
+    DiscretisationEstimateShift,
+    FinerDiscretisationProblem,
+    discretisation_estimate_shifts,
+    fine_joints_by_coarse_joint,
+    inflate_estimates_by_discretisation,
+    largest_alternating_error_growth,
 )
 from yid_ocp.analysis.profile import with_profile_intervals
 from yid_ocp.arrays import Array
@@ -27,8 +27,8 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import YidError
-from yid_ocp.inference.uncertainty import covariance_to_dict, mark_not_trusted, typical_parameter_sizes
-from yid_ocp.integrator.step import with_time_step
+from yid_ocp.inference.uncertainty import covariance_to_dict, estimates_marked_not_trusted, typical_parameter_magnitudes
+from yid_ocp.integrator.step import step_with_time_step
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -37,9 +37,9 @@ from yid_ocp.problem.prediction_errors import rmse_by_channel
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
-from yid_ocp.workflow.build import build_cable, build_step, build_system, link_division_factor
-from yid_ocp.workflow.build_problem import build_problem, issues_result
-from yid_ocp.workflow.command_runner import CommandResult, run_configured
+from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, divided_link_parameter_scale
+from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
+from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings
 from yid_ocp.workflow.prediction_outputs import (
     channels_worse_than_baseline,
     estimated_torque_offsets,
@@ -47,7 +47,7 @@ from yid_ocp.workflow.prediction_outputs import (
     worse_than_baseline_issues,
     write_solve_trajectories,
 )
-from yid_ocp.workflow.run_folder import RunFolder, new_run_folder
+from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
 _Refinement = Literal["links", "time_step"]
 
@@ -58,7 +58,7 @@ _RESULT_FORMAT = "yid-solve/1"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_configured(arguments, run_solve, solve_summary)
+    return run_command_with_settings(arguments, run_solve, solve_summary)
 
 
 def run_solve(
@@ -68,14 +68,14 @@ def run_solve(
 
     Where it failed the run folder holds the reason and the best point.
     """
-    with new_run_folder(run, out) as folder:
-        folder.begin_run(run, "solve")
+    with atomic_run_folder(run, out) as folder:
+        folder.record_run_start(run, "solve")
         progress.begin_stage("building the model and its compiled step")
         safe = solve_and_log(run, build_problem(run), folder, progress)
-        solution, stability = with_stability_check(safe.problem, safe.solution)
+        solution, stability = stability_checked_solution(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
         solution = with_profile_intervals(problem, solution, progress)
-        shifts: dict[str, DiscretisationShift] = {}
+        shifts: dict[str, DiscretisationEstimateShift] = {}
         notes: list[str] = []
         if solution.evaluation is not None:
             at = (solution.x, solution.evaluation, _requested_refinements(run))
@@ -84,16 +84,16 @@ def run_solve(
         data_std, solution = solution.std, _with_discretisation_uncertainty(solution, shifts)
         progress.begin_stage("predicting the held-out recordings")
         held_out = problem.predict_held_out(solution.x)
-        cable = build_cable(run)
-        solution, doubts = with_fit_issues(problem, solution, held_out, cable)
+        cable = clamped_cable_topology(run)
+        solution, doubts = solution_and_fit_issues(problem, solution, held_out, cable)
         end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
         folder.log_event("end", **end)
         write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
         more = {
-            "doubts": issues_result(doubts),
+            "doubts": issues_to_plain_data(doubts),
             "safeguard": safe.message,
             "covariance": _covariance_result(solution, data_std),
-            "discretisation": shift_results(shifts, data_std),
+            "discretisation": discretisation_shift_results(shifts, data_std),
             "discretisation_notes": notes,
             "stability": stability,
             "torque_offsets": {} if solution.evaluation is None else estimated_torque_offsets(problem, solution.x),
@@ -114,17 +114,17 @@ def solve_and_log(
         folder.log_event("iterate", iteration=entry.iteration, cost=entry.cost, gradient=entry.gradient_norm, x=values)
         progress.report_iterate(entry)
 
-    limits = run.diagnosis.fit_gap_limits
+    limits = run.diagnosis.null_test_residual_limits
     return decide_cable_memory(problem, run.solver, solve(problem, run.solver, callback=iterate, limits=limits), limits)
 
 
-def with_fit_issues(
+def solution_and_fit_issues(
     problem: EstimationProblem,
     solution: Solution,
     held_out: Sequence[_Prediction],
     cable: CableTopology | None = None,
 ) -> tuple[Solution, tuple[Issue, ...]]:
-    """The solution with untrusted verdicts where its fit raises issues, and all issues of the data.
+    """The solution, its verdicts set to untrusted where the fit is poor, and all issues of data and fit.
 
     Parameters
     ----------
@@ -139,7 +139,9 @@ def with_fit_issues(
     found = check_fit_residuals(problem, solution.x, solution.evaluation) + worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
-        solution = replace(solution, goodness_of_fit=believed, parameters=mark_not_trusted(solution.parameters))
+        solution = replace(
+            solution, goodness_of_fit=believed, parameters=estimates_marked_not_trusted(solution.parameters)
+        )
     return solution, (*problem.options.data_issues, *found)
 
 
@@ -157,7 +159,7 @@ def solve_result(
     held_out: Sequence[_Prediction],
     cable: CableTopology | None = None,
 ) -> dict[str, Any]:
-    """Entries of `yid-solve/1` without inputs and versions."""
+    """Contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = _prediction_errors(problem, solution, held_out, cable)
     return {
         "format": _RESULT_FORMAT,
@@ -192,8 +194,10 @@ def _prediction_errors(
 # -- discretisation ---------------------------------------------------------------------------------------------------
 
 
-def shift_results(shifts: Mapping[str, DiscretisationShift], std: Mapping[str, float]) -> dict[str, Any]:
-    """Shifts for result.json in the parameter's unit, with the standard deviation from the data alone."""
+def discretisation_shift_results(
+    shifts: Mapping[str, DiscretisationEstimateShift], std: Mapping[str, float]
+) -> dict[str, Any]:
+    """Discretisation shifts of estimates for result.json, with each parameter's standard deviation from the data."""
     return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}
 
 
@@ -214,7 +218,7 @@ def measure_discretisation_shifts(
     progress: Progress = NULL_PROGRESS,
     *,
     models_alone: bool = False,
-) -> tuple[dict[str, DiscretisationShift], list[str]]:
+) -> tuple[dict[str, DiscretisationEstimateShift], list[str]]:
     """Shifts of the estimates when every link is divided in two and when the time step is halved.
 
     Of every shared free parameter, none where nothing was tried; and why something that was asked for is not known.
@@ -225,18 +229,18 @@ def measure_discretisation_shifts(
     at_x : Evaluation
         With its Jacobian.
     models_alone : bool
-        At a point that is no estimate; see `discretisation_shifts`.
+        At a point that is no estimate; see `discretisation_estimate_shifts`.
     """
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
     for key in what:
         words = "twice the links" if key == "links" else "half the time step"
-        if key == "links" and (run.model.object is None or run.model.object.link_count is None):
+        if key == "links" and (run.model.object is None or run.model.object.links_per_segment_or_total is None):
             continue
         progress.begin_stage(f"trying {words}")
         try:
             refined = _with_twice_the_links(run, problem) if key == "links" else _with_half_the_step(problem)
-            own = discretisation_shifts(refined, problem, x, at_x, model_difference_only=models_alone)
+            own = discretisation_estimate_shifts(refined, problem, x, at_x, model_difference_only=models_alone)
         except YidError as error:
             own = error.what
         if isinstance(own, str):
@@ -245,42 +249,45 @@ def measure_discretisation_shifts(
             found[key] = own
     links, steps = found.get("links", {}), found.get("time_step", {})
     names = problem.shared_parameters if found else ()
-    return {name: DiscretisationShift(links.get(name), steps.get(name)) for name in names}, notes
+    return {name: DiscretisationEstimateShift(links.get(name), steps.get(name)) for name in names}, notes
 
 
-def _with_discretisation_uncertainty(solution: Solution, shifts: Mapping[str, DiscretisationShift]) -> Solution:
-    sizes = {} if solution.problem is None else typical_parameter_sizes(solution.problem, solution.x)
-    return replace(solution, parameters=inflate_estimates(solution.parameters, shifts, sizes))
+def _with_discretisation_uncertainty(solution: Solution, shifts: Mapping[str, DiscretisationEstimateShift]) -> Solution:
+    sizes = {} if solution.problem is None else typical_parameter_magnitudes(solution.problem, solution.x)
+    return replace(solution, parameters=inflate_estimates_by_discretisation(solution.parameters, shifts, sizes))
 
 
-def _with_twice_the_links(run: RunSettings, problem: EstimationProblem) -> RefinedProblem:
+def _with_twice_the_links(run: RunSettings, problem: EstimationProblem) -> FinerDiscretisationProblem:
     system, options = build_system(run, link_division=2), problem.options
     steps = sum(episode.grid.steps for episode in problem.episodes)
     compiled = problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE
     step = build_step(replace(run, problem=replace(run.problem, use_compiler=compiled)), system)
-    factors = {name: float(link_division_factor(run, name, 2)) for name in system.parameters.names}
+    factors = {name: float(divided_link_parameter_scale(run, name, 2)) for name in system.parameters.names}
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     options = replace(options, prior_stds=priors, multivariate_prior=options.multivariate_prior.scaled_by(factors))
     made = EstimationProblem(step, _recordings(problem), problem.free, options)
-    return RefinedProblem(made, factors, joint_subdivision(problem.system, system))
+    return FinerDiscretisationProblem(made, factors, fine_joints_by_coarse_joint(problem.system, system))
 
 
-def _with_half_the_step(problem: EstimationProblem) -> RefinedProblem:
-    step = with_time_step(problem.step, problem.step.time_step / 2)
-    return RefinedProblem(EstimationProblem(step, _recordings(problem), problem.free, problem.options))
+def _with_half_the_step(problem: EstimationProblem) -> FinerDiscretisationProblem:
+    step = step_with_time_step(problem.step, problem.step.time_step / 2)
+    return FinerDiscretisationProblem(EstimationProblem(step, _recordings(problem), problem.free, problem.options))
 
 
 def _recordings(problem: EstimationProblem) -> list[Recording]:
     return [episode.recording for episode in problem.episodes]
 
 
-def with_stability_check(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
+def stability_checked_solution(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
     """The solution, marked as not converged where the step is unstable, and stability data for result.json.
 
     Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not
     stable and leave that place; one that ends there has followed the step's own errors.
     """
-    begin, end = (largest_error_growth(problem, problem.initial_unknowns), largest_error_growth(problem, solution.x))
+    begin, end = (
+        largest_alternating_error_growth(problem, problem.initial_unknowns),
+        largest_alternating_error_growth(problem, solution.x),
+    )
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.is_stable:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
@@ -291,7 +298,7 @@ def with_stability_check(problem: EstimationProblem, solution: Solution) -> tupl
     return solution, found
 
 
-def _growth_result(growth: StepErrorGrowth | None) -> dict[str, Any] | None:
+def _growth_result(growth: AlternatingErrorGrowth | None) -> dict[str, Any] | None:
     if growth is None:
         return None
     return {

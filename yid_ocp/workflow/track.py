@@ -19,7 +19,14 @@ from yid_ocp.config.settings import OutputSettings, RecordingSettings, RunSettin
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, OutputError, YidError
-from yid_ocp.files import file_sha256, from_plain_data, json_sha256, os_error_reason, to_plain_data, write_text
+from yid_ocp.files import (
+    dataclass_from_plain_data,
+    file_sha256,
+    json_sha256,
+    os_error_reason,
+    to_lossless_plain_data,
+    write_text,
+)
 from yid_ocp.model.system import System
 from yid_ocp.parallel import InlineExecutor, Task, TaskResult, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import Progress
@@ -31,17 +38,23 @@ from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
 from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
-from yid_ocp.vision.sequence_calibration import DimensionCheck, ForeignObject, SequenceCalibration
+from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionCheck
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.surface_meshes import CameraScene
 from yid_ocp.vision.track import FrameTracker
-from yid_ocp.vision.track_result import FrameReport, TrackResult, count_drop_reasons, draw_frame_stages, draw_track
+from yid_ocp.vision.track_result import (
+    FrameReport,
+    TrackResult,
+    count_drop_reasons,
+    draw_frame_processing_stages,
+    draw_tracked_points,
+)
 from yid_ocp.vision.virtual_camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, render_virtual_frames
 from yid_ocp.workflow.build import build_system
-from yid_ocp.workflow.build_problem import issues_result, single_recording_issues
-from yid_ocp.workflow.command_runner import CommandResult, run_configured, workers_from_arguments
-from yid_ocp.workflow.run_folder import RunFolder, new_run_folder
-from yid_ocp.workflow.run_inputs import locate_errors, recording_path
+from yid_ocp.workflow.build_problem import issues_to_plain_data, single_recording_issues
+from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings, workers_from_arguments
+from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path
 
 _RESULT_FORMAT = "yid-track/1"
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
@@ -49,7 +62,7 @@ _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_configured(arguments, _run_track, track_summary, workers_from_arguments(arguments))
+    return run_command_with_settings(arguments, _run_track, track_summary, workers_from_arguments(arguments))
 
 
 def _run_track(
@@ -60,20 +73,20 @@ def _run_track(
     Where not one frame is good, the run folder says why when the error is raised.
     """
     settings = run.track
-    with new_run_folder(run, out, "track") as folder:
-        folder.begin_run(run, "track")
+    with atomic_run_folder(run, out, "track") as folder:
+        folder.record_run_start(run, "track")
         system = build_system(run)
         tasks, made = _frame_tasks(run, system, folder, progress)
         found, refused = None, None
         try:
-            with locate_errors(run, "track"):
+            with add_setting_location_to_errors(run, "track"):
                 tracker, recording = _frame_tracker(tasks.settings, system)
                 doubts = [] if recording is None else single_recording_issues(run, system, recording)
                 progress.begin_stage("finding what is common to the frames")
                 common = tasks.calibrate_sequence()
                 progress.begin_stage("tracking")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
-                frames, note = tracker.reject_outlying_frames(done)
+                frames, note = tracker.assign_root_and_mark_outliers(done)
                 try:
                     found = tracker.to_track_result(frames, note, common)
                 except DataError as error:
@@ -83,14 +96,14 @@ def _run_track(
             raise
         progress.begin_stage("drawing")
         for frame in _drawn(frames, settings.n_drawn_frames):
-            stages = tracker.frame_stages(frame, common)
+            stages = tracker.frame_processing_stages(frame, common)
             if stages is not None:
-                draw_frame_stages(stages, folder.path / "pictures")
+                draw_frame_processing_stages(stages, folder.path / "pictures")
         result = _track_result(frames, common, tracker.foreign_objects(frames), found) | {"root": note}
         told, tracked = [], None
         if found is not None:
-            draw_track(found, folder.path / "track.png")
-            tracked = found.to_recording(recording)
+            draw_tracked_points(found, folder.path / "track.png")
+            tracked = found.recording_with_points(recording)
             write_recording(tracked, folder.path / "recording.h5")
             # what was tracked may be elsewhere than the object reaches, where the model says where it stands
             if settings.options.root_placement == "model":
@@ -100,7 +113,7 @@ def _run_track(
             shape = ModelTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
             told = [make_animation("tracked", [shape], tracked)]
             result["truth_errors"] = {} if made is None else _truth_errors(system, found, made)
-        result |= {"doubts": issues_result(doubts), "refused": "" if refused is None else refused.what}
+        result |= {"doubts": issues_to_plain_data(doubts), "refused": "" if refused is None else refused.what}
         written = folder.write_result(result)
         files = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
         more = {"pictures": [path for path in files if path.exists()]}
@@ -160,13 +173,13 @@ def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, An
         "nodes": frame.n_skeleton_nodes,
         "delay": None if np.isnan(frame.stamp_delay) else frame.stamp_delay,
         "distance": fit and fit.mean_distance,
-        "covered": fit and fit.visible_coverage,
+        "covered": fit and fit.visible_length_coverage,
         "contested": fit and fit.contested_fraction,
         "seconds": frame.cpu_seconds,
     }
 
 
-def _sizes_result(sizes: DimensionCheck) -> dict[str, Any]:
+def _sizes_result(sizes: TubeDimensionCheck) -> dict[str, Any]:
     fits = sizes.model_values * np.exp(sizes.log_ratio)
     return {
         "frames": sizes.n_frames,
@@ -174,9 +187,9 @@ def _sizes_result(sizes: DimensionCheck) -> dict[str, Any]:
         "of": {
             name: {
                 "model": sizes.model_values[i],
-                "fits": fits[i] if sizes.is_determined[i] else None,
-                "std": fits[i] * sizes.log_ratio_std[i] if sizes.is_determined[i] else None,
-                "doubted": bool(sizes.is_contradicted[i]),
+                "fits": fits[i] if sizes.is_dimension_determined[i] else None,
+                "std": fits[i] * sizes.dimension_log_ratio_std[i] if sizes.is_dimension_determined[i] else None,
+                "doubted": bool(sizes.is_model_value_contradicted[i]),
                 "used": sizes.is_estimated[i],
             }
             for i, name in enumerate(sizes.names)
@@ -235,12 +248,12 @@ def _truth_errors(system: System, found: TrackResult, made: VirtualFrames) -> Ma
 # -- frames -----------------------------------------------------------------------------------------------------------
 
 
-def simulate_frames(
+def simulate_recording_and_camera_frames(
     run: RunSettings, system: System, settings: VirtualFramesSettings
 ) -> tuple[Recording, VirtualFrames]:
     """Recording and camera frames of a virtual experiment, with initial parameter values as truth."""
     from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
-    from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine
+    from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
     grasps = [grasp.name for grasp in system.grasps]
@@ -248,11 +261,13 @@ def simulate_frames(
         if name not in grasps:
             where = ("track", "virtual_frames", "grasp_start_offsets", name)
             raise run.config_error(f"there is no grasp '{name}'", *where, allowed=", ".join(grasps))
-    with locate_errors(run, "track", "virtual_frames"):
+    with add_setting_location_to_errors(run, "track", "virtual_frames"):
         posture = grasping_joint_angles(system, offsets=settings.grasp_start_offsets)
         simulation = SimulationOptions(settings.duration)
         excitation = MultisineOptions(gripper_travel=settings.max_gripper_travel, duration=settings.duration)
-        motion = random_multisine(system, seed=settings.seed, initial_joint_angles=posture, excitation=excitation)
+        motion = random_multisine_motion(
+            system, seed=settings.seed, initial_joint_angles=posture, excitation=excitation
+        )
         experiment = VirtualExperiment(
             motion=motion,
             initial_joint_angles=posture,
@@ -285,15 +300,15 @@ def camera_scene(run: RunSettings, system: System) -> CameraScene:
 
 def _read_frames(run: RunSettings, key: Literal["frames_path", "background_frames"]) -> FrameSequence:
     said = run.track
-    with locate_errors(run, "track", key):
+    with add_setting_location_to_errors(run, "track", key):
         return read_frames(getattr(said, key), pose=said.camera_pose, unit=said.length_unit, topic=said.frame_topic)
 
 
 def _read_joints(run: RunSettings) -> Recording | None:
     if not run.recordings.estimate:
         return None
-    with locate_errors(run, "recordings", "estimate", 0):
-        path = recording_path(run.recordings.estimate[0])
+    with add_setting_location_to_errors(run, "recordings", "estimate", 0):
+        path = resolve_recording_path(run.recordings.estimate[0])
         return replace(read_recording(path, allow_nan_effort=True), name=path.stem)
 
 
@@ -322,20 +337,20 @@ class _FrameTasks:
         [found] = require_task_values(self._run(_calibrate_sequence_task, {"what is common": {}}, InlineExecutor()))
         if "refused" in found:
             raise DataError(**found["refused"])
-        return from_plain_data(SequenceCalibration, found)
+        return dataclass_from_plain_data(SequenceCalibration, found)
 
     def track_frames(
         self, tracker: FrameTracker, common: SequenceCalibration, workers: WorkerConfig | Executor, progress: Progress
     ) -> list[FrameReport]:
         """Tracking results of all frames, ordered by stamp."""
-        names, told = tracker.sequence.frame_names, to_plain_data(common)
+        names, told = tracker.sequence.frame_names, to_lossless_plain_data(common)
         tasks = {names[i]: {"common": told, "index": i} for i in tracker.frame_order}
         results = self._run(_track_frame_task, tasks, workers, progress.report_parts_done)
         require_task_values([result for result in results if "abruptly" not in result.error])
         return [
-            tracker.unprocessed_report(i, common.camera_calibration, f"work on it failed: {result.error}")
+            tracker.unprocessed_frame_report(i, common.camera_calibration, f"work on it failed: {result.error}")
             if "abruptly" in result.error
-            else from_plain_data(FrameReport, result.value)
+            else dataclass_from_plain_data(FrameReport, result.value)
             for i, result in zip(tracker.frame_order, results, strict=True)
         ]
 
@@ -363,14 +378,14 @@ def _frame_tasks(
 ) -> tuple[_FrameTasks, VirtualFrames | None]:
     """Tracking tasks of frames in files, written before where a virtual camera sees them; and the latter's truth."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
-    joints = recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
+    joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.frames_path is not None:
         _read_joints(run)
         _read_frames(run, "frames_path")  # says in words of the settings what is wrong with the files
         frames = Path(said.frames_path)
     else:
         progress.begin_stage("simulating a virtual experiment in MuJoCo")
-        recording, made = simulate_frames(run, system, said.virtual_frames)
+        recording, made = simulate_recording_and_camera_frames(run, system, said.virtual_frames)
         progress.begin_stage("filming it")
         work.mkdir(parents=True, exist_ok=True)
         frames, joints = own_files = work / "frames", work / f"{run.name}.h5"
@@ -382,7 +397,7 @@ def _frame_tasks(
     track = replace(said, frames_path=str(frames), n_drawn_frames=0, keep_frames=False)
     own = replace(run, track=track, recordings=recordings, output=OutputSettings(), name="", description="")
     files = {"frames": frames, "joints": joints, "background": said.background_frames}
-    with locate_errors(run, "track", "frames_path"):
+    with add_setting_location_to_errors(run, "track", "frames_path"):
         inputs = {key: file_sha256(Path(path)) for key, path in files.items() if path is not None}
         text = dump_config(own)
         work_folder = work / json_sha256([text, inputs])[:16]
@@ -401,7 +416,9 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     """Task: sequence calibration of a run as plain data, or the reason why it failed."""
     del inputs  # they belong to what the result depends on
     try:
-        made: dict[str, Any] = to_plain_data(_tracker(config.read_text(encoding="utf-8"), config).calibrate_sequence())
+        made: dict[str, Any] = to_lossless_plain_data(
+            _tracker(config.read_text(encoding="utf-8"), config).calibrate_sequence()
+        )
     except DataError as error:
         return {"refused": {"what": error.what, "where": error.where, "allowed": error.allowed, "hint": error.hint}}
     return made
@@ -411,7 +428,9 @@ def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[s
     """Task: tracking result of one frame as plain data."""
     del inputs
     tracker = _tracker(config.read_text(encoding="utf-8"), config)
-    made: dict[str, Any] = to_plain_data(tracker.track_frame(index, from_plain_data(SequenceCalibration, common)))
+    made: dict[str, Any] = to_lossless_plain_data(
+        tracker.track_frame(index, dataclass_from_plain_data(SequenceCalibration, common))
+    )
     return made
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
 
-from yid_ocp.data.readers.base import PREVIEWS as PREVIEWS
+from yid_ocp.data.readers.base import FILE_PREVIEWERS as FILE_PREVIEWERS
 from yid_ocp.data.readers.base import READERS as READERS
-from yid_ocp.data.readers.base import FileContents, FileSource, mean_sample_rate
+from yid_ocp.data.readers.base import FileDataSourceSummary, FilePreview, mean_sample_rate
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
@@ -53,17 +53,18 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     return reader(path, **given, **_told(reader, progress))
 
 
-def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FileContents:
-    """Contents of a file of any known format, and the options for `read_any`; errors as that."""
+def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FilePreview:
+    """Preview of a file of any known format, with the options for `read_any`; it raises the same errors."""
     path = Path(path)
     known_as = _format_of(path)
-    if known_as in PREVIEWS:
-        return PREVIEWS[known_as](path, **_told(PREVIEWS[known_as], progress))
+    if known_as in FILE_PREVIEWERS:
+        return FILE_PREVIEWERS[known_as](path, **_told(FILE_PREVIEWERS[known_as], progress))
     recording = read_any(path)
     sources = (
-        FileSource(g.name, "group", len(g.t), mean_sample_rate(g.t), ", ".join(g.names)) for g in recording.all_groups
+        FileDataSourceSummary(g.name, "group", len(g.t), mean_sample_rate(g.t), ", ".join(g.names))
+        for g in recording.all_groups
     )
-    return FileContents(tuple(sources), {}, ("a recording already", *recording.notes))
+    return FilePreview(tuple(sources), {}, ("a recording already", *recording.notes))
 
 
 def _told(reader: Callable[..., Any], progress: Progress) -> dict[str, Any]:

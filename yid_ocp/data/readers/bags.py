@@ -15,17 +15,17 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers.base import (
-    PREVIEWS,
+    FILE_PREVIEWERS,
     READERS,
-    ConversionOptions,
-    FileContents,
-    FileSource,
-    check_point_names,
+    FileDataSourceSummary,
+    FilePreview,
+    SelectionAndUnitOptions,
+    check_unique_point_names,
     convert_to_si_and_validate,
     guess_units,
     merge_on_fastest_clock,
     parse_renamings,
-    zero_order_hold,
+    zero_order_hold_positions,
 )
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
@@ -33,8 +33,8 @@ from yid_ocp.files import file_sha256
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
-JOINT_STATE = "sensor_msgs/msg/JointState"
-"""Type of the messages with the joints."""
+JOINT_STATE_MESSAGE_TYPE = "sensor_msgs/msg/JointState"
+"""ROS type name of joint state messages."""
 _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
 _POSES = (
     "geometry_msgs/msg/PoseStamped",
@@ -43,7 +43,7 @@ _POSES = (
 )
 _TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PLACES = (_POINT_STAMPED, *_POSES)
-_KNOWN = (JOINT_STATE, *_PLACES)
+_KNOWN = (JOINT_STATE_MESSAGE_TYPE, *_PLACES)
 _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom")
 """Last parts of topics that say what a message is, not what was seen."""
 
@@ -88,7 +88,7 @@ class OpenBag:
             raise DataError("reading bags needs the package rosbags", where=str(path), hint=hint) from error
         self.path = path
         counted: Counter[tuple[str, str]] = Counter()
-        with self.reading():
+        with self.read_errors_as_data_errors():
             # older ROS 2 bags do not hold the definitions of their messages; these have not changed since
             self.reader: Any = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self.reader.open()
@@ -97,8 +97,8 @@ class OpenBag:
         self.topics = tuple(_BagTopic(topic, kind, count) for (topic, kind), count in sorted(counted.items()))
 
     @contextmanager
-    def reading(self) -> Iterator[None]:
-        """Damage that is found within is a `DataError`."""
+    def read_errors_as_data_errors(self) -> Iterator[None]:
+        """Context manager that turns every error while the bag is read into a `DataError`."""
         try:
             yield
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
@@ -107,26 +107,26 @@ class OpenBag:
             hint = "check with `ros2 bag info` or `rosbag info`; a bag cut off by a crash needs `ros2 bag reindex`"
             raise DataError(what, where=where, allowed=allowed, hint=hint) from error
 
-    def topics_of(self, *kinds: str) -> list[str]:
-        """Topics of some types."""
+    def topic_names_of_types(self, *kinds: str) -> list[str]:
+        """Names of the topics that have one of the given message types."""
         return [topic.name for topic in self.topics if topic.kind in kinds]
 
-    def check_topic(self, name: str, known: Sequence[str], noun: str) -> None:
+    def check_topic_is_known(self, name: str, known: Sequence[str], noun: str) -> None:
         """Raise `DataError` if a topic is not among the known ones."""
         if name not in known:
             what = f"there are no {noun} on the topic '{name}'"
             raise DataError(what, where=str(self.path), **unknown_name_details(name, known))
 
-    def nothing_usable(self, what: str, allowed: str) -> DataError:
-        """Error of a bag that holds only other topics."""
+    def no_usable_topics_error(self, what: str, allowed: str) -> DataError:
+        """The `DataError` to raise for a bag without usable topics; it lists those that the bag holds."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "no topics at all"
         return DataError(what, where=str(self.path), allowed=allowed, hint=f"it holds {held}")
 
 
-def bag_clock(
+def relative_message_time_function(
     messages: Sequence[BagMessage], origins: Sequence[BagMessage] | None = None
 ) -> Callable[[BagMessage], float]:
-    """Seconds of a message since the first one, or since the first of `origins`."""
+    """Function from a message to its time since the first message, or since the first of `origins` [s]."""
     # one message without a stamp makes the two clocks incomparable, so then no stamp is used
     stamped = all(message.stamp > 0 for message in (*messages, *(origins or ())))
     origin = min((message.stamp if stamped else message.logged for message in origins or messages), default=0)
@@ -151,8 +151,8 @@ class _Contents:
 
 
 @dataclass(frozen=True)
-class BagOptions(ConversionOptions):
-    """What is read of a bag, and what is kept of it.
+class BagOptions(SelectionAndUnitOptions):
+    """Options of `read_bag`: which topics, joints and points are read, under which names and in which units.
 
     Joints are needed where the messages of a topic do not all have the same ones; messages that lack one are skipped.
     Points are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`; all topics of points, poses and transforms
@@ -209,9 +209,9 @@ def read_bag(
     seen = _named_places(bag, options.points, str(path))
     if not groups and not seen:
         allowed = f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}"
-        raise bag.file.nothing_usable("the bag has no joint states and no points", allowed)
+        raise bag.file.no_usable_topics_error("the bag has no joint states and no points", allowed)
     places = [message for entries in seen.values() for _, message in entries]
-    seconds = bag_clock([*(m for entry in groups for m in entry.messages), *places])
+    seconds = relative_message_time_function([*(m for entry in groups for m in entry.messages), *places])
     joint_group, more = _on_one_clock(groups, seconds, str(path))
     found = []
     for frame, entries in seen.items():
@@ -228,11 +228,11 @@ def read_bag(
     return convert_to_si_and_validate(raw, str(path), replace(options, joints=None, points=None))
 
 
-@PREVIEWS.register(".bag")
-@PREVIEWS.register(".mcap")
-@PREVIEWS.register(".db3")
-@PREVIEWS.register("folder")
-def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FileContents:
+@FILE_PREVIEWERS.register(".bag")
+@FILE_PREVIEWERS.register(".mcap")
+@FILE_PREVIEWERS.register(".db3")
+@FILE_PREVIEWERS.register("folder")
+def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FilePreview:
     """What a bag holds: its topics, what they would become, and units that their values look like."""
     path = Path(path)
     file_sha256(path)
@@ -241,7 +241,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     options: dict[str, Any] = {}
     notes: list[str] = []
     sources = [_preview_source(topic, bag, names) for topic in bag.file.topics]
-    states = bag.file.topics_of(JOINT_STATE)
+    states = bag.file.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE)
     owners: dict[str, list[str]] = {}
     for message in bag.states:
         for joint in message.content.name:
@@ -261,7 +261,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     units, why = guess_units(raw) if raw is not None else ({}, ())
     if units:
         options["units"] = units
-    return FileContents(tuple(sources), options, (*notes, *why))
+    return FilePreview(tuple(sources), options, (*notes, *why))
 
 
 def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Contents:
@@ -270,7 +270,7 @@ def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _C
     places: list[BagMessage] = []
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
     bag = OpenBag(path)
-    with bag.reading(), closing(bag.reader) as reader:
+    with bag.read_errors_as_data_errors(), closing(bag.reader) as reader:
         wanted = [connection for connection in reader.connections if connection.msgtype in wanted_kinds]
         total = sum(connection.msgcount for connection in wanted)
         # an empty selection would mean all topics, images included
@@ -284,7 +284,7 @@ def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _C
                 continue
             plain = _plain(content, connection.msgtype)
             message = BagMessage(connection.topic, int(logged), _stamp(content), plain)
-            (states if connection.msgtype == JOINT_STATE else places).append(message)
+            (states if connection.msgtype == JOINT_STATE_MESSAGE_TYPE else places).append(message)
     return _Contents(bag, tuple(states), tuple(places))
 
 
@@ -301,7 +301,7 @@ def _tree(topic: str, logged: int, content: Any) -> Iterator[BagMessage]:
 def _plain(content: Any, kind: str) -> SimpleNamespace:
     """What is needed of a message, in Python's types: a bag brings definitions of its own, which may be damaged."""
     frame = str(content.header.frame_id)
-    if kind == JOINT_STATE:
+    if kind == JOINT_STATE_MESSAGE_TYPE:
         names = [str(name) for name in content.name]
         values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
         return SimpleNamespace(frame=frame, name=names, **values)
@@ -336,9 +336,13 @@ class _States:
 
 def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
     """Choose topics, joints and the messages that have them; with what was left out."""
-    known, topics, command = bag.file.topics_of(JOINT_STATE), options.joint_topics, options.command_topic
+    known, topics, command = (
+        bag.file.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE),
+        options.joint_topics,
+        options.command_topic,
+    )
     for topic in (*(topics or ()), *((command,) if command else ())):
-        bag.file.check_topic(topic, known, "joint states")
+        bag.file.check_topic_is_known(topic, known, "joint states")
     chosen = [topic for topic in (known if topics is None else topics) if topic != command]
     wanted = None if options.joints is None else parse_renamings(options.joints, "joint", where)
     found, notes = [], []
@@ -402,7 +406,7 @@ def _on_one_clock(
     )
     for entry, (_, group) in zip(groups, made, strict=True):
         if entry.command:
-            together = replace(together, position_command=zero_order_hold(group, together.t))
+            together = replace(together, position_command=zero_order_hold_positions(group, together.t))
     return together, notes
 
 
@@ -437,7 +441,7 @@ _MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 def _names_of(bag: _Contents) -> dict[str, str]:
     """Topics that become points by themselves, and the last part of each that says what was seen."""
     names = {}
-    for topic in bag.file.topics_of(*_PLACES):
+    for topic in bag.file.topic_names_of_types(*_PLACES):
         parts = [part for part in topic.split("/") if part]
         telling = [part for part in parts if part.lower() not in _PLAIN_WORDS]
         names[topic] = (telling or parts)[-1]
@@ -448,11 +452,11 @@ def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) 
     """Sort the points by frame of reference, each with its name."""
     present = sorted({message.source for message in bag.places})
     names = _names_of(bag) if points is None else dict(points)
-    known = [*present, *(f"{tree}:FRAME" for tree in bag.file.topics_of(*_TREES))]
+    known = [*present, *(f"{tree}:FRAME" for tree in bag.file.topic_names_of_types(*_TREES))]
     for source in () if points is None else names:
         if source not in present:
-            bag.file.check_topic(source, known, "points")
-    check_point_names(names, where)
+            bag.file.check_topic_is_known(source, known, "points")
+    check_unique_point_names(names, where)
     groups: _MessagesByFrame = {}
     for message in bag.places:
         if message.source in names:
@@ -499,13 +503,13 @@ def _positions(
 # -- preview ----------------------------------------------------------------------------------------------------------
 
 
-def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> FileSource:
+def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> FileDataSourceSummary:
     own = [m for m in (*bag.states, *bag.places) if m.source.partition(":")[0] == topic.name]
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.count - 1) / span if span > 0 else float("nan")
     becomes, note = "", "not a type that is understood"
-    if topic.kind == JOINT_STATE:
+    if topic.kind == JOINT_STATE_MESSAGE_TYPE:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
         becomes, note = f"joints {', '.join(joints)}", ""
     elif topic.name in names:
@@ -514,7 +518,9 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     elif topic.kind in _TREES:
         children = sorted({message.source.partition(":")[2] for message in own})
         note = f"frames {', '.join(children)}: --points {topic.name}:FRAME=POINT"
-    return FileSource(topic.name, topic.kind, topic.count, rate, becomes, note if topic.count else "no messages")
+    return FileDataSourceSummary(
+        topic.name, topic.kind, topic.count, rate, becomes, note if topic.count else "no messages"
+    )
 
 
 def _for_guess(bag: _Contents) -> Recording | None:

@@ -19,8 +19,8 @@ _RecordingReader = Callable[..., Recording]
 
 
 @dataclass(frozen=True)
-class FileSource:
-    """One data source in a file of another tool: a topic, a column or a marker."""
+class FileDataSourceSummary:
+    """Summary of one data source in a file of another tool: a topic, a column or a marker."""
 
     # what the file calls it, and its type
     name: str
@@ -32,8 +32,8 @@ class FileSource:
 
 
 @dataclass(frozen=True)
-class FileContents:
-    """Contents of a file of another tool, and the reader options that import it.
+class FilePreview:
+    """Preview of a file of another tool: summaries of its data sources, and the reader options to import it.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class FileContents:
         What else should be known, such as guesses of units.
     """
 
-    sources: tuple[FileSource, ...]
+    sources: tuple[FileDataSourceSummary, ...]
     reader_options: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -51,10 +51,10 @@ class FileContents:
 READERS: Registry[_RecordingReader] = Registry("recording format")
 """Readers by file suffix, and by word for what is stored as a folder; each takes a path, then named options."""
 
-PREVIEWS: Registry[Callable[..., FileContents]] = Registry("recording format with a preview")
+FILE_PREVIEWERS: Registry[Callable[..., FilePreview]] = Registry("recording format with a preview")
 """Functions that list a file's contents without importing it, by the same keys; each takes a path."""
 
-SKIP_COLUMN = "skip"
+SKIPPED_COLUMN_MEANING = "skip"
 """Column meaning that leaves the column out."""
 
 _TO_SI: Mapping[str, Mapping[str, float]] = {
@@ -70,7 +70,7 @@ _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 """Largest plausible angle [rad] and coordinate [m]; larger values look like degrees or millimetres."""
 
 
-def parse_units(words: Iterable[str]) -> dict[str, str]:
+def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
     """Unit of each quantity, parsed from words such as `deg`, `mm` or `velocity=rpm`; `DataError` for no unit."""
     units: dict[str, str] = {}
     for word in words:
@@ -123,7 +123,7 @@ def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, 
 
 
 @dataclass(frozen=True)
-class ConversionOptions:
+class SelectionAndUnitOptions:
     """Which joints and points of a file are kept, under which names, and in which units it has them."""
 
     joints: Sequence[str] | None = None  # `name` or `recorded=name`, in this order; all of them when absent
@@ -135,7 +135,7 @@ class ConversionOptions:
     gears: Mapping[str, float] | None = None
 
 
-def convert_to_si_and_validate(raw: Recording, where: str, options: ConversionOptions) -> Recording:
+def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAndUnitOptions) -> Recording:
     """Convert a recording as it stands in a file to SI units, select its joints and points, and validate it.
 
     Raises
@@ -181,7 +181,7 @@ def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], wher
     for name in chosen:
         if name not in known:
             raise DataError(f"there is no point '{name}'", where=where, **unknown_name_details(name, known))
-    check_point_names(chosen, where)
+    check_unique_point_names(chosen, where)
     kept = []
     for group in groups:
         own = [name for name in chosen if name in group.names]
@@ -193,7 +193,7 @@ def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], wher
     return tuple(kept)
 
 
-def check_point_names(chosen: Mapping[str, str], where: str) -> None:
+def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
     """Raise `DataError` if two sources give points of the same name."""
     names = list(chosen.values())
     shared = [source for source, name in chosen.items() if names.count(name) > 1]
@@ -202,7 +202,7 @@ def check_point_names(chosen: Mapping[str, str], where: str) -> None:
         raise DataError(what, where=where, allowed="a name for each", hint=f"name them: points {shared[0]}=NAME, ...")
 
 
-def _torque_factors(names: Sequence[str], options: ConversionOptions, where: str) -> Array:
+def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, where: str) -> Array:
     """N m per recorded number of every joint, shape (nj,)."""
     constants, gears = options.torque_constants or {}, options.gears or {}
     for word, given in (("torque_constants", constants), ("gears", gears)):
@@ -305,8 +305,8 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
     return replace(clock, names=names, t=t, **channels), tuple(notes)
 
 
-def zero_order_hold(group: JointGroup, t: Array) -> Array:
-    """Positions of a group at other times by zero-order hold, shape (N, nj); before its first sample, that one."""
+def zero_order_hold_positions(group: JointGroup, t: Array) -> Array:
+    """Joint positions at other times by zero-order hold, shape (N, nj); the first sample's before it."""
     return group.position[np.maximum(np.searchsorted(group.t, t + 1e-9, side="right") - 1, 0)]
 
 

@@ -15,11 +15,11 @@ import numpy as np
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.hdf5_io import check_readable_in_fork
 from yid_ocp.data.readers.base import (
-    PREVIEWS,
+    FILE_PREVIEWERS,
     READERS,
-    ConversionOptions,
-    FileContents,
-    FileSource,
+    FileDataSourceSummary,
+    FilePreview,
+    SelectionAndUnitOptions,
     convert_to_si_and_validate,
 )
 from yid_ocp.data.recording import PointGroup, Recording
@@ -39,7 +39,7 @@ class _Markers:
     t: Array
     position: Array
     unit: str
-    others: tuple[FileSource, ...]
+    others: tuple[FileDataSourceSummary, ...]
 
 
 @READERS.register(".c3d")
@@ -72,11 +72,13 @@ def read_c3d(
     group = PointGroup("points", found.names, found.t, found.position, None, sensor, frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
-    return convert_to_si_and_validate(raw, str(path), ConversionOptions(points=points, units={**own, **(units or {})}))
+    return convert_to_si_and_validate(
+        raw, str(path), SelectionAndUnitOptions(points=points, units={**own, **(units or {})})
+    )
 
 
-@PREVIEWS.register(".c3d")
-def _preview_c3d(path: str | os.PathLike[str]) -> FileContents:
+@FILE_PREVIEWERS.register(".c3d")
+def _preview_c3d(path: str | os.PathLike[str]) -> FilePreview:
     """What a C3D file holds; errors as `read_c3d`."""
     path = Path(path)
     file_sha256(path)
@@ -84,7 +86,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> FileContents:
     rate = 1.0 / float(found.t[1] - found.t[0]) if len(found.t) > 1 else math.nan
     seen: BoolArray = np.asarray(np.isfinite(found.position).all(axis=2))
     sources = [
-        FileSource(
+        FileDataSourceSummary(
             name,
             "marker",
             int(seen[:, i].sum()),
@@ -96,7 +98,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> FileContents:
     ]
     notes = [f"the file says that its unit is {found.unit}"] if found.unit else ["the file says no unit: --units mm?"]
     options = {"points": {name: name for name in found.names}}
-    return FileContents((*sources, *found.others), options, tuple(notes))
+    return FilePreview((*sources, *found.others), options, tuple(notes))
 
 
 def _markers(path: Path) -> _Markers:
@@ -139,8 +141,10 @@ def _markers(path: Path) -> _Markers:
         what = "no labelled marker of the C3D file was ever seen"
         raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label them and export it again")
     counts = (~unseen).sum(axis=0)
-    others = [FileSource(labels[i] or f"marker {i + 1}", "marker", int(counts[i]), rate, "", why[i]) for i in why]
-    others += [FileSource(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
+    others = [
+        FileDataSourceSummary(labels[i] or f"marker {i + 1}", "marker", int(counts[i]), rate, "", why[i]) for i in why
+    ]
+    others += [FileDataSourceSummary(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
     names = _short([labels[i] for i in kept])
     t = np.arange(len(position)) / rate
     return _Markers(names, t, position[:, kept], unit, tuple(others))

@@ -15,12 +15,12 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers.base import (
-    PREVIEWS,
+    FILE_PREVIEWERS,
     READERS,
-    SKIP_COLUMN,
-    ConversionOptions,
-    FileContents,
-    FileSource,
+    SKIPPED_COLUMN_MEANING,
+    FileDataSourceSummary,
+    FilePreview,
+    SelectionAndUnitOptions,
     convert_to_si_and_validate,
     guess_units,
     mean_sample_rate,
@@ -40,8 +40,8 @@ _LISTED = 5
 
 
 @dataclass(frozen=True)
-class CsvOptions(ConversionOptions):
-    """How a table is read, and what is kept of it.
+class CsvOptions(SelectionAndUnitOptions):
+    """Options of `read_csv`: what the columns of the table mean, and which of them are kept.
 
     Attributes
     ----------
@@ -116,8 +116,8 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     return Recording(group, tuple(seen))
 
 
-@PREVIEWS.register(".csv")
-def _preview_csv(path: str | os.PathLike[str]) -> FileContents:
+@FILE_PREVIEWERS.register(".csv")
+def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
     """What a table holds: columns, what their names say, and units that its values look like."""
     path = Path(path)
     file_sha256(path)
@@ -155,7 +155,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> FileContents:
     known = [(m, i) for i, m in enumerate(meanings) if m and numeric[i]]
     t = table[:, next((i for m, i in known if m == ("t", "")), 0)]
     sources = tuple(
-        FileSource(
+        FileDataSourceSummary(
             name,
             "numbers" if ok else "text",
             int(np.isfinite(column).sum()),
@@ -173,13 +173,13 @@ def _preview_csv(path: str | os.PathLike[str]) -> FileContents:
         units, why = {}, ()
     if units:
         options["units"] = units
-    return FileContents(sources, options, (*notes, *why))
+    return FilePreview(sources, options, (*notes, *why))
 
 
 def _proposed(name: str, numeric: bool) -> str:
     """A meaning to be filled in for a column whose name does not say it."""
     if not numeric:
-        return SKIP_COLUMN
+        return SKIPPED_COLUMN_MEANING
     return "CHANNEL:JOINT" if name.isdecimal() else f"CHANNEL:{name}"
 
 
@@ -297,9 +297,8 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
         own = _given_meaning(name, given[name], where) if name in given else _conventional_meaning(name)
         if own is None and name not in given:
             allowed = f"t, {', '.join(f'{prefix}<joint>' for prefix in _PREFIXES)}, <point>_x, <point>_y, <point>_z"
-            hint = (
-                f"rename it, or say what it is: columns {name}=position:JOINT, or {name}={SKIP_COLUMN} to leave it out"
-            )
+            skipped = f"{name}={SKIPPED_COLUMN_MEANING} to leave it out"
+            hint = f"rename it, or say what it is: columns {name}=position:JOINT, or {skipped}"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and own in meanings:
             other = header[meanings.index(own)]
@@ -324,14 +323,17 @@ def _conventional_meaning(column: str) -> tuple[str, str] | None:
 
 
 def _given_meaning(column: str, given: str, where: str) -> tuple[str, str] | None:
-    if given == SKIP_COLUMN:
+    if given == SKIPPED_COLUMN_MEANING:
         return None
     if given == "t":
         return "t", ""
     kind, _, name = given.partition(":")
     known = (*JOINT_CHANNEL_UNITS, *_AXES)
     if not name or kind not in known:
-        what, allowed = f"column '{column}' is given the meaning '{given}'", f"t, {SKIP_COLUMN}, or KIND:NAME with a "
+        what, allowed = (
+            f"column '{column}' is given the meaning '{given}'",
+            f"t, {SKIPPED_COLUMN_MEANING}, or KIND:NAME with a ",
+        )
         allowed += f"joint's or a point's name and one of {', '.join(known)}"
         hint = nearest_name_hint(kind, known) if kind not in known else f"{kind}:NAME"
         raise DataError(what, where=where, allowed=allowed, hint=hint)

@@ -14,11 +14,11 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers.base import (
-    PREVIEWS,
+    FILE_PREVIEWERS,
     READERS,
-    ConversionOptions,
-    FileContents,
-    FileSource,
+    FileDataSourceSummary,
+    FilePreview,
+    SelectionAndUnitOptions,
     convert_to_si_and_validate,
     guess_units,
 )
@@ -65,8 +65,8 @@ def read_lerobot(
     `observation.state` is the measured position of the joints, or position, velocity and effort where the names of its
     entries end in `.pos`, `.vel` and `.torque`, `.effort` or `.current`; `action` is the commanded position. Times are
     frame numbers over the frames a second, a nominal clock. Images and other features are in `notes`. The other options
-    are those of `ConversionOptions`: a gripper that is not in the model is left out with `joints`; many of these robots
-    record degrees.
+    are those of `SelectionAndUnitOptions`: a gripper that is not in the model is left out with `joints`; many of these
+    robots record degrees.
 
     Raises
     ------
@@ -87,11 +87,11 @@ def read_lerobot(
         notes=tuple(f"{name} was left out ({why})" for name, why in left),
     )
     where = f"{dataset.folder}, episode {episode}"
-    return convert_to_si_and_validate(raw, where, ConversionOptions(joints, None, units, torque_constants, gears))
+    return convert_to_si_and_validate(raw, where, SelectionAndUnitOptions(joints, None, units, torque_constants, gears))
 
 
-@PREVIEWS.register("LeRobot dataset")
-def _preview_lerobot(path: str | os.PathLike[str]) -> FileContents:
+@FILE_PREVIEWERS.register("LeRobot dataset")
+def _preview_lerobot(path: str | os.PathLike[str]) -> FilePreview:
     """What a LeRobot dataset holds, by its first episode; errors as `read_lerobot`."""
     dataset = _dataset(Path(path))
     table, _ = _episode(dataset, 0)
@@ -99,7 +99,7 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> FileContents:
     group = JointGroup(names, np.asarray(table["frame_index"], float) / dataset.rate, clock="nominal", **channels)
     why, count = dict(left), len(group.t)
     sources = tuple(
-        FileSource(
+        FileDataSourceSummary(
             name,
             str(feature.get("dtype", "")),
             count,
@@ -115,7 +115,7 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> FileContents:
         options["units"] = units | ({"position_command": units["position"]} if "position" in units else {})
     said = f"{dataset.episodes} episodes at {dataset.rate:g} Hz, {dataset.info.get('codebase_version', 'no version')}"
     robot = dataset.info.get("robot_type")
-    return FileContents(sources, options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
+    return FilePreview(sources, options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
 
 
 def _dataset(folder: Path) -> _Dataset:

@@ -17,23 +17,28 @@ from yid_ocp.diagnosis.diagnose import diagnose, fit_nominal_model
 from yid_ocp.diagnosis.diagnosis_result import DiagnosisResult
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, CandidateChoice, make_candidate_effects
 from yid_ocp.diagnosis.refit import refit_with_effects
-from yid_ocp.diagnosis.screening import CandidateLinearization, linearize_candidates
-from yid_ocp.diagnosis.select import gap_closure
+from yid_ocp.diagnosis.screening import AllCandidatesLinearization, linearize_candidates
+from yid_ocp.diagnosis.select import held_out_gap_closure
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.effects.base import EffectBase, segment_springs
+from yid_ocp.effects.base import EffectBase, segment_elastic_joints
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
-from yid_ocp.virtual.injected import INJECTABLE_KINDS, OUT_OF_LIBRARY_EFFECTS, InjectedEffect, run_injected_experiment
-from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine
+from yid_ocp.virtual.injected import (
+    INJECTABLE_EFFECT_KINDS,
+    OUT_OF_LIBRARY_EFFECTS,
+    InjectedEffect,
+    run_experiment_with_effects,
+)
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 _Key = TypeVar("_Key", str, float)
 _DETECTABLE_MULTIPLES = (1.0, 3.0, 10.0)
 """Multiples of the detectable size."""
-CATEGORY_SHARES: Mapping[str, float] = {
+BLIND_CASE_CATEGORY_SHARES: Mapping[str, float] = {
     "null": 0.2,
     "single": 0.48,
     "pair": 0.1,
@@ -48,22 +53,22 @@ _MIN_CASES_PER_EXPERIMENT = 3  # cases below which an experiment is not worth it
 
 
 @dataclass(frozen=True)
-class PlannedCase:
+class PlannedBlindCase:
     """A planned case: experiment, category and effect size."""
 
     number: int
     experiment: str
-    category: str  # of `CATEGORY_SHARES`
+    category: str  # of `BLIND_CASE_CATEGORY_SHARES`
     multiple: float | None  # of the detectable size; None where that has no meaning
 
 
-def plan_cases(
+def plan_blind_cases(
     count: int,
     seed: int,
     weights: Mapping[str, float],
     chains: frozenset[str] = frozenset(),
     purpose: str = ENSEMBLE_PURPOSES[0],
-) -> list[PlannedCase]:
+) -> list[PlannedBlindCase]:
     """Return the planned cases of an ensemble, in an order given by the seed.
 
     Parameters
@@ -85,7 +90,7 @@ def plan_cases(
     if not kept:
         kept = {max(weights, key=lambda name: weights[name]): 1.0}
     slots: list[tuple[str, float | None]] = []
-    for category, number in _dealt(count, CATEGORY_SHARES).items():
+    for category, number in _dealt(count, BLIND_CASE_CATEGORY_SHARES).items():
         if category == "single":
             for size, times in _dealt(number, dict.fromkeys(_DETECTABLE_MULTIPLES, 1.0)).items():
                 slots += [(category, size)] * times
@@ -101,7 +106,7 @@ def plan_cases(
         given[name] += 1
         cases.append((name, *(slot if able else ("single", _DETECTABLE_MULTIPLES[1]))))
     order = np.random.default_rng([seed, ENSEMBLE_PURPOSES.index(purpose), 2]).permutation(count)
-    return [PlannedCase(number, *cases[int(place)]) for number, place in enumerate(order)]
+    return [PlannedBlindCase(number, *cases[int(place)]) for number, place in enumerate(order)]
 
 
 def _dealt(count: int, parts: Mapping[_Key, float]) -> dict[_Key, int]:
@@ -139,7 +144,7 @@ _GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.08
 
 
 @dataclass(frozen=True)
-class CaseLabel:
+class CaseGroundTruth:
     """True effects and parameters of a case, sealed until scoring."""
 
     case: str
@@ -154,10 +159,10 @@ class CaseLabel:
         return asdict(self)
 
     @staticmethod
-    def from_dict(data: Mapping[str, Any]) -> CaseLabel:
+    def from_dict(data: Mapping[str, Any]) -> CaseGroundTruth:
         """From JSON."""
         injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
-        return CaseLabel(**{**data, "injected": injected})
+        return CaseGroundTruth(**{**data, "injected": injected})
 
 
 @dataclass(frozen=True)
@@ -170,13 +175,13 @@ class BlindCase:
     excluded_kinds: tuple[str, ...]  # left out of the library; mostly one that has nothing to do with the case
 
 
-def seal_labels(labels: Sequence[CaseLabel]) -> tuple[str, str]:
+def seal_labels_with_hash(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
     """Return the labels as JSON text and its SHA-256 hash, published before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
-def open_sealed_labels(text: str, commitment: str) -> list[CaseLabel]:
+def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
     """Read sealed labels after checking their hash.
 
     Raises
@@ -186,11 +191,11 @@ def open_sealed_labels(text: str, commitment: str) -> list[CaseLabel]:
     """
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
         raise DataError("the labels are not those that were committed to", where="sealed labels")
-    return [CaseLabel.from_dict(entry) for entry in json.loads(text)]
+    return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
 
 
 @dataclass(frozen=True)
-class RecordingConditions:
+class SyntheticRecordingConditions:
     """Settings of the synthetic recordings of an experiment."""
 
     estimation_count: int = 1  # to estimate on; one more is held out
@@ -205,7 +210,7 @@ _Detectable = tuple[EffectBase, Mapping[str, float], Array]
 amplitudes a move the residual."""
 
 
-class CaseGenerator:
+class BlindCaseGenerator:
     """Generator of random blind cases of one experiment.
 
     Parameters
@@ -234,7 +239,7 @@ class CaseGenerator:
         limits: Thresholds = DEFAULT_THRESHOLDS,
         *,
         simulated_system: System | None = None,
-        conditions: RecordingConditions | None = None,
+        conditions: SyntheticRecordingConditions | None = None,
     ) -> None:
         self.simulated_system = problem.system if simulated_system is None else simulated_system
         if not self.simulated_system.driven or self.simulated_system.prescribed:
@@ -245,13 +250,13 @@ class CaseGenerator:
         self.problem, self.seed, self._finer = problem, seed, finer
         self._candidates, self._limits = candidates, limits
         recording = problem.episodes[0].recording
-        self.initial_configuration = initial_joint_positions(self.simulated_system, recording)
+        self.initial_configuration = initial_driven_joint_positions(self.simulated_system, recording)
         seen = any(group.pose is not None for group in recording.points)
-        self.conditions = replace(conditions or RecordingConditions(), has_camera=seen)
+        self.conditions = replace(conditions or SyntheticRecordingConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
-        if not {effect.kind for effect in self._effects} & set(INJECTABLE_KINDS):
+        if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):
             what, where = "none of the candidates can be done in MuJoCo", "diagnosis.candidates"
-            raise ConfigError(what, where=where, allowed=", ".join(INJECTABLE_KINDS))
+            raise ConfigError(what, where=where, allowed=", ".join(INJECTABLE_EFFECT_KINDS))
         self._detectable: tuple[_Detectable, ...] | None = None
 
     def _rng(self, *path: int) -> np.random.Generator:
@@ -275,12 +280,12 @@ class CaseGenerator:
         if links > 1:
             assert self._finer is not None
             system = self._finer(links)
-            values = finer_chain_parameters(nominal, system, truth)
+            values = scale_parameters_to_more_links(nominal, system, truth)
         posture = self.initial_configuration
         made = simulate_random_motion(nominal, system, posture, truth, values, injected, rng, self.conditions)
         return replace(made, name=name, description="", source="", true_parameters={})
 
-    def _linearize_clean_recordings(self) -> CandidateLinearization:
+    def _linearize_clean_recordings(self) -> AllCandidatesLinearization:
         """The candidates' signatures on clean recordings."""
         rng = self._rng(0)
         names = [*(f"clean_{i}" for i in range(self.conditions.estimation_count)), "other"]
@@ -303,15 +308,15 @@ class CaseGenerator:
             )
         return self._detectable
 
-    def detectable_effects_to_json(self) -> list[dict[str, Any]]:
+    def detectable_effect_sizes_to_json(self) -> list[dict[str, Any]]:
         """Return the sensitivity of every candidate, which gives its detectable size, JSON-compatible."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable_effects
         ]
 
-    def load_detectable_effects(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Load detectable sizes computed by another process, from `detectable_effects_to_json`."""
+    def load_detectable_effect_sizes(self, detectable: Sequence[Mapping[str, Any]]) -> None:
+        """Load detectable sizes computed by another process, from `detectable_effect_sizes_to_json`."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
@@ -324,7 +329,7 @@ class CaseGenerator:
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
-    def draw_case(self, wanted: PlannedCase) -> tuple[BlindCase, CaseLabel]:
+    def draw_planned_case(self, wanted: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
         """Draw a planned case; the same seed and purpose give the same case.
 
         Raises
@@ -347,7 +352,7 @@ class CaseGenerator:
             except ModelError:
                 continue  # the motion throws the object about; draw another
             left_out = (injected[0].kind,) if wanted.category == "left_out" else self._other_kind(injected, rng)
-            label = CaseLabel(name, wanted.category, injected, multiple, truth, wanted.experiment)
+            label = CaseGroundTruth(name, wanted.category, injected, multiple, truth, wanted.experiment)
             return BlindCase(name, tuple(estimate), held_out, left_out), label
         raise ModelError(
             f"none of {MAX_CASE_DRAWS} motions can be simulated",
@@ -360,7 +365,7 @@ class CaseGenerator:
         return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
     def _injected(
-        self, wanted: PlannedCase, rng: np.random.Generator
+        self, wanted: PlannedBlindCase, rng: np.random.Generator
     ) -> tuple[tuple[InjectedEffect, ...], float | None]:
         if wanted.category in ("null", "finer_chain"):
             return (), None
@@ -375,7 +380,7 @@ class CaseGenerator:
         """An effect of the library at so many times its detectable size, or as near as its range lets it come."""
         groups: dict[str, dict[str, list[_Detectable]]] = {}
         for entry in self._detectable_effects:
-            if entry[0].kind in INJECTABLE_KINDS:
+            if entry[0].kind in INJECTABLE_EFFECT_KINDS:
                 groups.setdefault(entry[0].kind, {}).setdefault(entry[0].location, []).append(entry)
         drawn = []
         for _ in range(40):
@@ -420,7 +425,7 @@ class CaseGenerator:
             size *= self._largest_torque(location)
         elif part_of == "stiffness":
             start = dict(zip(self.problem.system.parameters.names, self.problem.theta, strict=True))
-            bends = any(spring.deformation == "bend" for spring in segment_springs(system, location))
+            bends = any(spring.deformation == "bend" for spring in segment_elastic_joints(system, location))
             size *= float(start.get(f"{location}.bend", 10.0)) if bends else 10.0
         return InjectedEffect(kind, location, {"size": size})
 
@@ -440,7 +445,7 @@ def simulate_random_motion(
     values: Mapping[str, float],
     injected: Sequence[InjectedEffect],
     rng: np.random.Generator,
-    conditions: RecordingConditions,
+    conditions: SyntheticRecordingConditions,
 ) -> Recording:
     """Simulate a random motion planned for the nominal system, from a configuration of the driven joints.
 
@@ -448,7 +453,7 @@ def simulate_random_motion(
     """
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
-    motion = random_multisine(
+    motion = random_multisine_motion(
         nominal, truth, seed=int(rng.integers(2**31)), initial_joint_angles=posture, excitation=excitation
     )
     experiment = VirtualExperiment(
@@ -459,10 +464,10 @@ def simulate_random_motion(
         camera=PointCamera() if conditions.has_camera else None,
         seed=int(rng.integers(2**31)),
     )
-    return run_injected_experiment(simulated, values, injected, experiment)
+    return run_experiment_with_effects(simulated, values, injected, experiment)
 
 
-def initial_joint_positions(system: System, recording: Recording) -> dict[str, float]:
+def initial_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:
     """Return the initial positions of the driven joints of a recording.
 
     Raises
@@ -482,7 +487,7 @@ def initial_joint_positions(system: System, recording: Recording) -> dict[str, f
     return {name: float(joints.position[0, names.index(name)]) for name in system.driven}
 
 
-def finer_chain_parameters(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
+def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
     """Return the parameters of the same tubes with more links: joint springs and dampers scaled by their number.
 
     A segment whose links did not change, or whose stiffness is that of its cross section, keeps its values.
@@ -504,8 +509,8 @@ def finer_chain_parameters(nominal: System, finer: System, truth: Mapping[str, f
     return values
 
 
-def diagnose_case(
-    ensemble: CaseGenerator,
+def diagnose_blind_case(
+    ensemble: BlindCaseGenerator,
     case: BlindCase,
     candidates: CandidateChoice = "all",
     thresholds: Thresholds | None = None,
@@ -517,8 +522,8 @@ def diagnose_case(
     return diagnose(problem, candidates, held_out, **how)
 
 
-def best_possible_closure(
-    ensemble: CaseGenerator, case: BlindCase, label: CaseLabel, candidates: CandidateChoice = "all"
+def true_effects_gap_closure(
+    ensemble: BlindCaseGenerator, case: BlindCase, label: CaseGroundTruth, candidates: CandidateChoice = "all"
 ) -> float:
     """Return the held-out closure of the true effects after a refit, the best a diagnosis could reach."""
     problem = ensemble._nominal_problem(case.estimation_recordings)
@@ -538,4 +543,4 @@ def best_possible_closure(
     fit = refit_with_effects(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
     if fit is None or len(chosen) < len(true):
         return math.nan
-    return gap_closure(nominal.held_out_loss, fit.held_out_loss).fraction
+    return held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss).fraction

@@ -14,13 +14,13 @@ from typing import Any, Literal
 import numpy as np
 import scipy.stats
 
-from yid_ocp.diagnosis.blind.ensemble import CATEGORY_SHARES, CaseLabel
+from yid_ocp.diagnosis.blind.ensemble import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EFFECTS
-from yid_ocp.files import finite_json
+from yid_ocp.files import json_with_nonfinite_as_none
 
 _FORMAT = "yid-blind/1"
-_CATEGORIES = tuple(CATEGORY_SHARES)
+_CATEGORIES = tuple(BLIND_CASE_CATEGORY_SHARES)
 _OUT_OF_LIBRARY_CATEGORIES = ("outside", "left_out")
 """Categories whose true effect is not among the candidates."""
 _MAX_CONFUSABLE_SET = 3  # largest confusable set that counts as correct
@@ -28,7 +28,7 @@ _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
 
 
 @dataclass(frozen=True)
-class CaseScore:
+class BlindCaseScore:
     """Score of one diagnosis against its label."""
 
     case: str
@@ -55,7 +55,7 @@ class CaseScore:
     p_value: float = math.nan  # of the null test on the held-out recordings
 
     @property
-    def named(self) -> tuple[str, ...]:
+    def named_effect_labels(self) -> tuple[str, ...]:
         """Labels the diagnosis names: the confusable set, or the first effect added."""
         return self.confusable or tuple(self.answer.split(" + ")[:1])
 
@@ -70,10 +70,10 @@ class CaseScore:
         return self.verdict if self.answer == "-" else self.answer.partition("@")[0]
 
 
-def score_case(
-    label: CaseLabel, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
-) -> CaseScore:
-    """Score a `yid-diagnosis/2` result against its label; `best` is of `best_possible_closure`."""
+def score_blind_case(
+    label: CaseGroundTruth, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
+) -> BlindCaseScore:
+    """Score a `yid-diagnosis/2` result against its label; `best` is of `true_effects_gap_closure`."""
 
     def labels(entries: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
         return tuple(f"{e['kind']}@{e['location']}" for e in entries)
@@ -103,7 +103,7 @@ def score_case(
             if found["std"] > 0:
                 z[f"{effect.label}.{name}"] = miss / found["std"]
     before = result["gap"].get("before") or {}
-    return CaseScore(
+    return BlindCaseScore(
         case=label.case,
         category=label.category,
         truth=" + ".join(true) or "-",
@@ -151,7 +151,7 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
     return {"count": count, "of": total, "rate": count / total, "low": low, "high": high}
 
 
-def score_ensemble(marks: Sequence[CaseScore]) -> dict[str, Any]:
+def ensemble_success_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """Return the rates over an ensemble; None for a rate without cases."""
 
     def mean(values: Sequence[float]) -> float | None:
@@ -168,7 +168,7 @@ def score_ensemble(marks: Sequence[CaseScore]) -> dict[str, Any]:
         "kind_first": [m.kind_first for m in seen],
         "kind_in_two": [m.kind_second for m in seen],
         "location_first": [m.location_first for m in seen],
-        "sets_cover": [m.truth in m.named for m in named],
+        "sets_cover": [m.truth in m.named_effect_labels for m in named],
         "unknown_recall": [m.verdict == "unknown" for m in strange],
         **{f"unknown_{sort}": [m.verdict == "unknown" for m in by[sort]] for sort in _OUT_OF_LIBRARY_CATEGORIES},
         "unknown_location": [m.location_first for m in strange if m.gap],
@@ -193,7 +193,7 @@ def score_ensemble(marks: Sequence[CaseScore]) -> dict[str, Any]:
             for size, own in detected.items()
         },
         "detection_intervals": detected,
-        "set_size": mean([len(m.named) for m in named]),
+        "set_size": mean([len(m.named_effect_labels) for m in named]),
         "closure_of_best": mean([m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]),
         "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
         "seconds": mean([m.seconds for m in marks if math.isfinite(m.seconds)]),
@@ -207,7 +207,7 @@ def score_ensemble(marks: Sequence[CaseScore]) -> dict[str, Any]:
     }
 
 
-def _experiment_rates(own: Sequence[CaseScore]) -> dict[str, Any]:
+def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """Cases, false alarms and right answers of one experiment."""
     return {
         "cases": len(own),
@@ -216,7 +216,7 @@ def _experiment_rates(own: Sequence[CaseScore]) -> dict[str, Any]:
     }
 
 
-def _confusion_matrix(marks: Sequence[CaseScore]) -> dict[str, Any]:
+def _confusion_matrix(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """The confusion matrix: true classes (rows), answers (columns) and counts."""
     rows = sorted({m.sort for m in marks}, key=lambda name: (name in _CATEGORIES, name))
     columns = sorted({m.said for m in marks}, key=lambda name: (name in _VERDICTS, name))
@@ -224,7 +224,7 @@ def _confusion_matrix(marks: Sequence[CaseScore]) -> dict[str, Any]:
     return {"true": rows, "said": columns, "counts": counts}
 
 
-def _calibration_rates(marks: Sequence[CaseScore]) -> dict[str, Any]:
+def _calibration_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """The empirical coverage of parameter intervals and of p-values of clean recordings."""
     z = [abs(value) for m in marks if m.category == "single" for value in m.z.values()]
     p = [m.p_value for m in marks if m.category == "null" and math.isfinite(m.p_value)]
@@ -359,8 +359,8 @@ def _conformal_quantile(
 
 
 def calibrate_thresholds(
-    labels: Sequence[CaseLabel],
-    marks: Sequence[CaseScore],
+    labels: Sequence[CaseGroundTruth],
+    marks: Sequence[BlindCaseScore],
     answers: Sequence[Mapping[str, Any]],
     limits: Thresholds = DEFAULT_THRESHOLDS,
     coverage: float = _TARGET_COVERAGE,
@@ -369,7 +369,7 @@ def calibrate_thresholds(
 
     Parameters
     ----------
-    marks : sequence of CaseScore
+    marks : sequence of BlindCaseScore
         Of the same cases.
     answers : sequence of mapping
         `result` of each, with its `statistics`, and those with open thresholds (`open`) where no gap was seen.
@@ -410,10 +410,10 @@ def calibrate_thresholds(
             "side": rule.side,
             "cases": len(sample),
             "coverage": attained,
-            "quantile": finite_json(value),
+            "quantile": json_with_nonfinite_as_none(value),
             "limit": rule.limit,
             "is": getattr(limits, rule.setting),
-            "sample": finite_json(sorted(sample)),
+            "sample": json_with_nonfinite_as_none(sorted(sample)),
             "effects_beyond": {f"{size:.3g}": _binomial_proportion(hits) for size, hits in beyond.items()},
             "strange_beyond": _binomial_proportion(strange),
         }

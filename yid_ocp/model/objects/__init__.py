@@ -3,7 +3,7 @@
 from importlib import import_module
 from pkgutil import iter_modules
 
-from yid_ocp.model.objects.base import OBJECTS as OBJECTS
+from yid_ocp.model.objects.base import OBJECT_KINDS as OBJECT_KINDS
 from yid_ocp.model.objects.base import ObjectKind as ObjectKind
 
 # every file of this folder registers its kinds when it is imported

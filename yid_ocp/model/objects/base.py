@@ -25,7 +25,7 @@ START_CLAMP, END_CLAMP = "clamp_start", "clamp_end"
 _Vector3 = tuple[float, float, float]
 _STANDARD_GRAVITY = 9.81
 _DAMPING_TIME = 0.02  # damping over rigidity, where the search for it starts [s]
-SIZE_MEANINGS = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
+SIZE_DESCRIPTIONS = {"length": "its length [m]", "mass": "its mass [kg]", "radius": "its radius [m]"}
 _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 
 
@@ -47,8 +47,8 @@ class MountSettings:
 
 
 @dataclass(frozen=True)
-class ClampPath:
-    """How a prescribed `floating_clamp` follows two measured points: its origin is at one, z looks at another.
+class ClampPoseDefinition:
+    """How a clamp's pose follows from two measured points: its origin is at one, its z axis points to the other.
 
     What the points do not tell is the turn about z: with `level` the third angle stays zero (x axis across world y);
     with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
@@ -102,30 +102,32 @@ class CableTopology:
         return (*self.parent_vertices, *(vertex for chain in self.child_vertices.values() for vertex in chain[1:]))
 
     @property
-    def clamped_vertices(self) -> tuple[str, ...]:
+    def clamped_vertex_names(self) -> tuple[str, ...]:
         """Names of the four vertices held by the clamps."""
         return (*self.parent_vertices[:2], *self.parent_vertices[-2:])
 
     @property
-    def free_vertices(self) -> tuple[str, ...]:
+    def free_vertex_names(self) -> tuple[str, ...]:
         """Names of the vertices that no clamp holds, on which predictions are evaluated."""
-        return tuple(vertex for vertex in self.vertices if vertex not in self.clamped_vertices)
+        return tuple(vertex for vertex in self.vertices if vertex not in self.clamped_vertex_names)
 
     @property
-    def branch_vertices(self) -> dict[str, tuple[str, ...]]:
+    def branch_vertex_names(self) -> dict[str, tuple[str, ...]]:
         """Names of the vertices of every branch, by segment, the parent first."""
         return {self.parent_segment: self.parent_vertices, **self.child_vertices}
 
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of neighbouring vertices, branch by branch."""
-        return tuple(pair for chain in self.branch_vertices.values() for pair in pairwise(chain))
+        """Names of the two vertices of every edge, branch by branch."""
+        return tuple(pair for chain in self.branch_vertex_names.values() for pair in pairwise(chain))
 
     @property
-    def clamp_paths(self) -> tuple[ClampPath, ClampPath]:
-        """Paths of the two clamps, start and end."""
+    def clamp_paths(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
+        """Points that define the poses of the two clamps, start and end."""
         p = self.parent_vertices
-        return ClampPath(START_CLAMP, p[0], p[1], "transported"), ClampPath(END_CLAMP, p[-2], p[-1], "transported")
+        return ClampPoseDefinition(START_CLAMP, p[0], p[1], "transported"), ClampPoseDefinition(
+            END_CLAMP, p[-2], p[-1], "transported"
+        )
 
     def undeformed_polyline(self, chain: Sequence[str]) -> Array:
         """Undeformed positions of some vertices, shape (len(chain), 3) [m]."""
@@ -136,7 +138,7 @@ class CableTopology:
 
 
 @dataclass(frozen=True)
-class InitObject:
+class InitCommandObject:
     """An object described on the command line of `init`.
 
     Attributes
@@ -156,8 +158,8 @@ class InitObject:
 
 
 @dataclass(frozen=True)
-class InitTemplate:
-    """A word of `init --object`.
+class InitCommandObjectTemplate:
+    """What one word of `init --object` stands for: how the object is built and which numbers it needs.
 
     Attributes
     ----------
@@ -171,16 +173,16 @@ class InitTemplate:
     """
 
     default_links: int
-    build: Callable[[Mapping[str, Any], int], InitObject]
+    build: Callable[[Mapping[str, Any], int], InitCommandObject]
     further_numbers: Mapping[str, str] = field(default_factory=dict)
     has_branches: bool = False
 
 
-def required_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
-    """Numbers of an object in the order of their meanings; `ConfigError` where one is missing."""
+def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
+    """The numbers that an object needs, in the order of `meanings`; `ConfigError` where one is missing."""
     for name, meaning in meanings.items():
         if name not in numbers:
-            flag, value = (f"--{name}", " NUMBER") if name in SIZE_MEANINGS else ("--number", f" {name}=NUMBER")
+            flag, value = (f"--{name}", " NUMBER") if name in SIZE_DESCRIPTIONS else ("--number", f" {name}=NUMBER")
             raise ConfigError(f"{noun} needs a {name}", where=flag, allowed=meaning, hint=f"add {flag}{value}")
     return [float(numbers[name]) for name in meanings]
 
@@ -212,7 +214,7 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectKind:
-    """A kind of flexible object, whose fields are its settings; one class in one file, registered in `OBJECTS`.
+    """A kind of flexible object, whose fields are its settings; one class in one file, registered in `OBJECT_KINDS`.
 
     A class overrides `kind`, and `model_segments` or `build`, and what else differs; one that is a system of its own is
     a `ClampedObject` as well.
@@ -221,14 +223,14 @@ class ObjectKind:
     ----------
     default_link_refinement : bool
         Whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition.
-    init_templates : mapping of str to InitTemplate
+    init_templates : mapping of str to InitCommandObjectTemplate
         Words of `init --object`.
     settings_examples : mapping of section to str
         YAML for the page of settings.
     """
 
     default_link_refinement: ClassVar[bool] = False
-    init_templates: ClassVar[Mapping[str, InitTemplate]] = {}
+    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {}
     settings_examples: ClassVar[Mapping[str, str]] = {}
 
     kind: Annotated[str, OptionInfo("what the object is")]
@@ -250,24 +252,24 @@ class ObjectKind:
         return None, None
 
     @property
-    def stands_in_world(self) -> bool:
-        """Whether nothing moves the object's root."""
+    def is_root_fixed_in_world(self) -> bool:
+        """Whether the object's root is fixed to the world: no robot frame or clamp moves it."""
         return False
 
     @property
-    def link_count(self) -> int | None:
+    def links_per_segment_or_total(self) -> int | None:
         """Number of links per segment, in total where segments differ; None without divisible links."""
         counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.model_segments()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
-    def link_division_factor(self, parameter: str, link_division: int) -> int:
+    def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
         """Factor on a per-joint parameter that keeps a segment's stiffness when each link is divided."""
         owner, _, quantity = parameter.rpartition(".")
         per_joint = {segment.name for segment in self.model_segments() if not segment.stiffness_per_curvature}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
-    def input_files(self) -> dict[str, str]:
-        """Files that the settings name, by key."""
+    def input_file_paths(self) -> dict[str, str]:
+        """Paths of the files that the object's settings name, by settings key."""
         own: Any = type(self)
         return {
             key: getattr(self, option.field_name)
@@ -275,9 +277,9 @@ class ObjectKind:
             if any(isinstance(m, OptionInfo) and m.is_path for m in split_annotated(option.type_hint)[1])
         }
 
-    def without_folders(self) -> ObjectKind:
+    def with_file_names_only(self) -> ObjectKind:
         """The same object with file names in place of paths, to be compared with that of another run."""
-        names = {key: Path(file).name for key, file in self.input_files().items()}
+        names = {key: Path(file).name for key, file in self.input_file_paths().items()}
         return replace(self, **names)
 
 
@@ -291,7 +293,7 @@ class ClampedObject(Protocol):
     def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
         """The whole system, from its measured edge lengths [m]."""
 
-    def recording_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+    def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         """Parameter values that one recording's edge lengths [m] give, where not all recordings share them."""
 
 
@@ -305,7 +307,7 @@ class MountedObject(ObjectKind):
     mount: Annotated[MountSettings | None, OptionInfo("where its root sits; the world's origin when absent")] = None
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The object, each link divided."""
+        """The flexible object, each of its links divided into `link_division` links."""
         return flexible_object(self.model_segments(damping, link_division), gravity_fraction=self.gravity_fraction)
 
     @property
@@ -314,14 +316,14 @@ class MountedObject(ObjectKind):
         return (None, None) if self.mount is None else (self.mount.parent_frame, self.mount.pose)
 
     @property
-    def stands_in_world(self) -> bool:
-        """Whether nothing moves the root."""
+    def is_root_fixed_in_world(self) -> bool:
+        """Whether the object's root is fixed to the world: no robot frame or clamp moves it."""
         return self.mount is None or not self.mount.parent_frame
 
 
-OBJECTS: Registry[type[ObjectKind]] = Registry("kind")
+OBJECT_KINDS: Registry[type[ObjectKind]] = Registry("kind")
 
 
-def init_templates() -> dict[str, InitTemplate]:
-    """Words of `init --object`, of all kinds."""
-    return {word: template for kind in OBJECTS for word, template in OBJECTS[kind].init_templates.items()}
+def init_command_object_templates() -> dict[str, InitCommandObjectTemplate]:
+    """Templates of all kinds of objects, by the word of `init --object` that selects them."""
+    return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}

@@ -28,26 +28,33 @@ from annotated_types import Ge, Gt, Le, Len
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, ModelError, nearest_name_hint
-from yid_ocp.model.flexible import UNIT_AXES, ElasticJoint, FlexibleObject, Segment, flexible_object, polyline_rotations
+from yid_ocp.model.flexible import (
+    AXIS_UNIT_VECTORS,
+    ElasticJoint,
+    FlexibleObject,
+    Segment,
+    flexible_object,
+    parallel_transport_rotations,
+)
 from yid_ocp.model.mechanism import Frame, LinkChain, Mechanism, Placement
 from yid_ocp.model.objects.base import END_CLAMP as _END_CLAMP
-from yid_ocp.model.objects.base import OBJECTS, CableTopology, ObjectKind
+from yid_ocp.model.objects.base import OBJECT_KINDS, CableTopology, ObjectKind
 from yid_ocp.model.objects.base import START_CLAMP as _START_CLAMP
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.rotations import symbolic_axis_rotation
+from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
 from yid_ocp.model.system import Grasp, System, floating_clamp
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
 _START_ROLL_PARAMETER, _END_ROLL_PARAMETER = f"{_START_CLAMP}.roll", f"{_END_CLAMP}.roll"
 _REST_ANGLE_SUFFIX = ".rest"
-START_SPEED_SCALE_PARAMETER = "start.speed_scale"
+START_SPEED_SCALE_PARAMETER_NAME = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{_START_CLAMP}_edge", "last_edge"
 # Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
-START_SHAPE_SUFFIXES = ("start", "load")
+START_ANGLE_AND_LOAD_SUFFIXES = ("start", "load")
 # Parameter that is told the root mean square speed of the measured points at the start [m/s].
-START_SPEED_PARAMETER = "start.speed"
+START_SPEED_PARAMETER_NAME = "start.speed"
 
 
 @dataclass(frozen=True)
@@ -121,30 +128,30 @@ def read_vertex_positions(path: str | Path) -> dict[str, Array]:
         raise DataError("the table of vertices is malformed", where=str(path), allowed=allowed) from error
 
 
-def edge_length_parameters(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of the edge length parameters by name, from the edges' lengths [m]."""
     values = {f"{_START_CLAMP}.length": lengths[cable.parent_vertices[0], cable.parent_vertices[1]]}
-    for name, chain in cable.branch_vertices.items():
+    for name, chain in cable.branch_vertex_names.items():
         first = 1 if name == cable.parent_segment else 0
         for i, edge in enumerate(pairwise(chain[first:])):
             values[f"{name}.length_{i}"] = lengths[edge]
     return values
 
 
-def estimable_parameters(cable: CableTopology, options: CableOptions | None = None) -> tuple[str, ...]:
+def estimable_parameter_names(cable: CableTopology, options: CableOptions | None = None) -> tuple[str, ...]:
     """Names of the parameters that a cable's motion alone can identify: stiffness, damping and rest shape, no mass."""
     options = options or CableOptions()
     names: list[str] = []
-    for name in cable.branch_vertices:
+    for name in cable.branch_vertex_names:
         names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
         if options.branches.get(name, options.default_branch).separate_twist_damping:
             names.append(f"{name}.twist_damping")
         if options.shape_memory is not None:
             names.append(f"{name}.memory")
     if options.shape_memory is not None:
-        names.append(START_SPEED_SCALE_PARAMETER)
+        names.append(START_SPEED_SCALE_PARAMETER_NAME)
     if options.has_rest_angle_parameters:
-        for name, chain in cable.branch_vertices.items():
+        for name, chain in cable.branch_vertex_names.items():
             links = len(chain) - (2 if name == cable.parent_segment else 1)
             names += [f"{name}_{i}_{axis}{_REST_ANGLE_SUFFIX}" for i in range(links) for axis in "xy"]
     return tuple(names)
@@ -166,13 +173,13 @@ def cable_system(
     if options.shape_memory is not None:
         item = _with_memory(item, options.shape_memory)
     clamps = _start_clamp(lengths[cable.parent_vertices[0], cable.parent_vertices[1]], cable)
-    clamps = clamps.with_mechanism(floating_clamp(_END_CLAMP))
+    clamps = clamps.with_attached_mechanism(floating_clamp(_END_CLAMP))
     rotation = ca.SX(ca.DM.eye(3))
     if options.end_clamp == "weld":
         text = "roll of the end clamp about the last edge"
         end_roll = Parameter(_END_ROLL_PARAMETER, 0.0, "rad", -np.pi, np.pi, text)
         clamps = replace(clamps, parameters=clamps.parameters.with_added([end_roll]))
-        rotation = symbolic_axis_rotation(UNIT_AXES["z"], end_roll.symbol)
+        rotation = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], end_roll.symbol)
     return System.build(
         clamps,
         objects=((_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None),),
@@ -205,16 +212,18 @@ def _with_parameters(
 def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
     text = "share of the start's shape in the rest shape"
     shares = {s.name: Parameter(f"{s.name}.memory", memory, "1", 0.0, 1.0, text) for s in item.segment_layouts}
-    speed = Parameter(START_SPEED_PARAMETER, 0.0, "m/s", 0.0, np.inf, "speed of the vertices at the recording's start")
+    speed = Parameter(
+        START_SPEED_PARAMETER_NAME, 0.0, "m/s", 0.0, np.inf, "speed of the vertices at the recording's start"
+    )
     text = "start speed at which the memory counts half"
-    scale = Parameter(START_SPEED_SCALE_PARAMETER, 0.3, "m/s", 1e-3, np.inf, text)
+    scale = Parameter(START_SPEED_SCALE_PARAMETER_NAME, 0.3, "m/s", 1e-3, np.inf, text)
     trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
     entries, elastic = [*shares.values(), speed, scale], []
     told = (("rad", "angle at the recording's start"), ("N m", "torque borne at the recording's start"))
     for spring in item.elastic_joints:
         angle, load = (
             Parameter(f"{spring.joint_name}.{suffix}", 0.0, unit, description=text)
-            for suffix, (unit, text) in zip(START_SHAPE_SUFFIXES, told, strict=True)
+            for suffix, (unit, text) in zip(START_ANGLE_AND_LOAD_SUFFIXES, told, strict=True)
         )
         entries += [angle, load]
         shift = angle.symbol - load.symbol / (spring.stiffness + _MIN_STIFFNESS)
@@ -229,7 +238,7 @@ def _with_vertices(
     """The object with its vertices as frames, the parent's arc length measured from clamp to clamp."""
     tree = item.mechanism
     frames = dict(tree.frames)
-    for name, chain in cable.branch_vertices.items():
+    for name, chain in cable.branch_vertex_names.items():
         first = 2 if name == cable.parent_segment else 1
         frames |= {vertex: frames[f"{name}_{i}_tip"] for i, vertex in enumerate(chain[first:])}
         if name != cable.parent_segment:
@@ -248,7 +257,7 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     roll = Parameter(_START_ROLL_PARAMETER, 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
     edge = Parameter(f"{_START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
     carrier = clamp.frame(_START_CLAMP)
-    turn = symbolic_axis_rotation(UNIT_AXES["z"], roll.symbol)
+    turn = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], roll.symbol)
     tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
     frames = {**clamp.frames, cable.parent_vertices[0]: carrier, cable.parent_vertices[1]: tip, _START_EDGE_FRAME: tip}
     return Mechanism(_START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
@@ -256,19 +265,19 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
 
 def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
     parent = cable.parent_vertices
-    turns = polyline_rotations(cable.undeformed_polyline(parent))
+    turns = parallel_transport_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
     carried = [turns[0]]
     for turn in turns[1:]:
         carried.append(carried[-1] @ turn)
     segments = []
-    for name, chain in cable.branch_vertices.items():
+    for name, chain in cable.branch_vertex_names.items():
         branch = options.branches.get(name, options.default_branch)
         if name == cable.parent_segment:
             chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
         else:
             junction = parent.index(chain[0])
-            own, before = polyline_rotations(cable.undeformed_polyline(chain), carried[junction - 1]), None
+            own, before = parallel_transport_rotations(cable.undeformed_polyline(chain), carried[junction - 1]), None
             at = junction - 2
         if not options.undeformed_rest_shape:
             own = [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
@@ -297,7 +306,7 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
     return segments
 
 
-@OBJECTS.register("cable")
+@OBJECT_KINDS.register("cable")
 @dataclass(frozen=True, kw_only=True)
 class Cable(CableOptions, ObjectKind):
     """A branched cable held at both ends by clamps that follow measured points; lengths come from recordings."""
@@ -342,8 +351,8 @@ model:
             self.parent_vertices, dict(self.child_vertices), read_vertex_positions(self.undeformed_shape_file)
         )
         for name in self.branches:
-            if name not in found.branch_vertices:
-                hint = nearest_name_hint(name, found.branch_vertices)
+            if name not in found.branch_vertex_names:
+                hint = nearest_name_hint(name, found.branch_vertex_names)
                 raise ModelError(f"there is no branch '{name}'", where=f"branches.{name}", hint=hint)
         return found
 
@@ -351,6 +360,6 @@ model:
         """The whole system, from the measured edge lengths [m]."""
         return cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
 
-    def recording_parameters(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
+    def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
         """Edge length parameters of one recording, where not all recordings share them."""
-        return edge_length_parameters(self.topology(), edge_lengths) if self.lengths_per_recording else {}
+        return edge_length_parameter_values(self.topology(), edge_lengths) if self.lengths_per_recording else {}

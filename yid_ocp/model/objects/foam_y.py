@@ -11,14 +11,14 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
-from yid_ocp.model.objects.base import OBJECTS, InitObject, InitTemplate, MountedObject
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObject
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
 _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trunk in Baxter's `base` [m]
 
 
-def y_segments() -> tuple[Segment, ...]:
+def foam_y_segments() -> tuple[Segment, ...]:
     """Segments of the paper's foam Y: trunk T1, branches T2 (45 degrees towards +y) and T3 (towards -y)."""
     lean = math.radians(45.0)
     return (
@@ -28,28 +28,30 @@ def y_segments() -> tuple[Segment, ...]:
     )
 
 
-def y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
+def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
     """The paper's foam Y as a flexible object, its trunk's foot at (0.85, 0, -0.93) m.
 
     The nominal stiffness per joint is that of four links, however many rigid `links` every tube has.
     """
-    segments = [replace(segment, links=links) for segment in y_segments()]
+    segments = [replace(segment, links=links) for segment in foam_y_segments()]
     return flexible_object(segments, _FOOT_POSE, "y_object", gravity_fraction)
 
 
-def _init_object(numbers: Mapping[str, Any], links: int) -> InitObject:
-    names = [f"{segment.name}.{quantity}" for segment in y_segments() for quantity in ("bend", "twist")]
-    return InitObject(
+def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+    names = [f"{segment.name}.{quantity}" for segment in foam_y_segments() for quantity in ("bend", "twist")]
+    return InitCommandObject(
         FoamY(links=links), dict.fromkeys(names, (3.0, "")), "stiffness of every joint of a tube [N m/rad]", True
     )
 
 
-@OBJECTS.register("foam_y")
+@OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
 class FoamY(MountedObject):
     """The paper's foam letter Y; its foot stands where the paper's does when there is no mount."""
 
-    init_templates: ClassVar[Mapping[str, InitTemplate]] = {"foam_y": InitTemplate(4, _init_object)}
+    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
+        "foam_y": InitCommandObjectTemplate(4, _init_object)
+    }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: foam_y": """\
 model:
@@ -70,7 +72,9 @@ model:
         """The three tubes; the nominal stiffness per joint is that of four links, whatever `links` says."""
         n = link_division
         links = self.links * n
-        return [replace(s, links=links, bend=s.bend * n, twist=s.twist * n, damping=damping * n) for s in y_segments()]
+        return [
+            replace(s, links=links, bend=s.bend * n, twist=s.twist * n, damping=damping * n) for s in foam_y_segments()
+        ]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
         """The object, its foot at (0.85, 0, -0.93) m without a mount."""

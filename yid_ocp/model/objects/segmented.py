@@ -11,15 +11,15 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment
 from yid_ocp.model.objects.base import (
-    OBJECTS,
-    SIZE_MEANINGS,
-    InitObject,
-    InitTemplate,
+    OBJECT_KINDS,
+    SIZE_DESCRIPTIONS,
+    InitCommandObject,
+    InitCommandObjectTemplate,
     MountedObject,
     MountSettings,
     bending_start_values,
     comma_separated_numbers,
-    required_numbers,
+    required_object_numbers,
 )
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.options import OptionInfo
@@ -106,36 +106,38 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
     )
 
 
-def _init_object(word: str, segments: Mapping[str, SegmentSettings]) -> InitObject:
+def _init_object(word: str, segments: Mapping[str, SegmentSettings]) -> InitCommandObject:
     item = SegmentedObject(segments=segments)
-    return InitObject(item, bending_start_values(item.model_segments(), _RIGIDITY_RATIO[word]))
+    return InitCommandObject(item, bending_start_values(item.model_segments(), _RIGIDITY_RATIO[word]))
 
 
-def _cable(numbers: Mapping[str, Any], links: int) -> InitObject:
-    length, mass, radius = required_numbers("a cable", numbers, SIZE_MEANINGS)
+def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+    length, mass, radius = required_object_numbers("a cable", numbers, SIZE_DESCRIPTIONS)
     section = _section(numbers)
     given = None if section else radius
     return _init_object("cable", {"cable": _init_segment(links, length, mass, given, cross_section=section)})
 
 
-def _beam(numbers: Mapping[str, Any], links: int) -> InitObject:
-    length, mass = required_numbers("a beam", numbers, {name: SIZE_MEANINGS[name] for name in ("length", "mass")})
+def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+    length, mass = required_object_numbers(
+        "a beam", numbers, {name: SIZE_DESCRIPTIONS[name] for name in ("length", "mass")}
+    )
     section = _section(numbers)
     if section is None and "radius" not in numbers:
         what, hint = "a beam needs a radius or a section", "add --radius NUMBER, or --section WIDTH,HEIGHT"
-        raise ConfigError(what, where="--radius", allowed=SIZE_MEANINGS["radius"], hint=hint)
+        raise ConfigError(what, where="--radius", allowed=SIZE_DESCRIPTIONS["radius"], hint=hint)
     radius = None if section else float(numbers["radius"])
     return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section=section)})
 
 
-def _tree(numbers: Mapping[str, Any], links: int) -> InitObject:
+def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     if numbers.get("branch"):
         return _init_object("tree", _grown([_branch(text, links) for text in numbers["branch"]]))
     if not numbers.get("branches"):
         allowed = "--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones"
         hint = "--branches 4 --length 0.4 --mass 0.03 --radius 0.008"
         raise ConfigError("a tree needs branches", where="--branch", allowed=allowed, hint=hint)
-    length, mass, radius = required_numbers("each branch of a tree", numbers, SIZE_MEANINGS)
+    length, mass, radius = required_object_numbers("each branch of a tree", numbers, SIZE_DESCRIPTIONS)
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
         raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="1 to 16")
@@ -182,16 +184,16 @@ def _branch(text: str, links: int) -> tuple[str, SegmentSettings]:
 # -- the kind ---------------------------------------------------------------------------------------------------------
 
 
-@OBJECTS.register("segments")
+@OBJECT_KINDS.register("segments")
 @dataclass(frozen=True, kw_only=True)
 class SegmentedObject(MountedObject):
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitTemplate]] = {
-        "cable": InitTemplate(8, _cable),
-        "beam": InitTemplate(6, _beam),
-        "tree": InitTemplate(4, _tree, has_branches=True),
+    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
+        "cable": InitCommandObjectTemplate(8, _cable),
+        "beam": InitCommandObjectTemplate(6, _beam),
+        "tree": InitCommandObjectTemplate(4, _tree, has_branches=True),
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: segments": """\

@@ -13,13 +13,13 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.model.flexible import FlexibleObject, Segment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects.base import (
-    OBJECTS,
-    SIZE_MEANINGS,
-    InitObject,
-    InitTemplate,
+    OBJECT_KINDS,
+    SIZE_DESCRIPTIONS,
+    InitCommandObject,
+    InitCommandObjectTemplate,
     MountedObject,
     bending_start_values,
-    required_numbers,
+    required_object_numbers,
 )
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
@@ -28,13 +28,13 @@ _SEGMENT = "rod"
 _FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
 
 
-def _init_object(numbers: Mapping[str, Any], links: int) -> InitObject:
-    length, mass, radius, tip = required_numbers("a tapered rod", numbers, SIZE_MEANINGS | _FURTHER_NUMBERS)
+def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+    length, mass, radius, tip = required_object_numbers("a tapered rod", numbers, SIZE_DESCRIPTIONS | _FURTHER_NUMBERS)
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return InitObject(item, bending_start_values(item.model_segments(), 1.0))
+    return InitCommandObject(item, bending_start_values(item.model_segments(), 1.0))
 
 
-@OBJECTS.register("tapered_rod")
+@OBJECT_KINDS.register("tapered_rod")
 @dataclass(frozen=True, kw_only=True)
 class TaperedRod(MountedObject):
     """A solid round rod whose radius changes linearly from its clamped base to its tip; the segment is called `rod`.
@@ -44,8 +44,8 @@ class TaperedRod(MountedObject):
     """
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitTemplate]] = {
-        "tapered_rod": InitTemplate(8, _init_object, _FURTHER_NUMBERS)
+    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
+        "tapered_rod": InitCommandObjectTemplate(8, _init_object, _FURTHER_NUMBERS)
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: tapered_rod": """\
@@ -71,7 +71,7 @@ parameters:
         return [replace(rod, joint_axes=self.joint_axes)]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The object, each link divided."""
+        """The flexible object, each of its links divided into `link_division` links."""
         return _tapered(super().build(damping, link_division), self.tip_radius / self.base_radius)
 
 

@@ -65,7 +65,7 @@ _PrepareContext = Callable[[ReportData], Mapping[str, Any] | None]
 
 
 @dataclass(frozen=True)
-class ReportSection:
+class _ReportSection:
     """One registered section: order, title and the function that prepares its template context."""
 
     order: int
@@ -78,17 +78,17 @@ class ReportSection:
         return Path(inspect.getfile(self.prepare_context)).parent
 
 
-REPORT_SECTIONS: Registry[ReportSection] = Registry("report section")
+REPORT_SECTIONS: Registry[_ReportSection] = Registry("report section")
 
 
-def register_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
+def register_report_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
     """Decorator that registers a function as the section `name`, lower orders first.
 
     What it returns is rendered by `NAME.html`, or by `figures.html` (pairs of title and figure) where there is none.
     """
 
     def enter(prepare: _PrepareContext) -> _PrepareContext:
-        REPORT_SECTIONS.register(name)(ReportSection(order, title, prepare))
+        REPORT_SECTIONS.register(name)(_ReportSection(order, title, prepare))
         return prepare
 
     return enter

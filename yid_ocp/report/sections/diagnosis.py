@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.diagnosis import DiagnosisResult
-from yid_ocp.diagnosis.diagnosis_messages import overspeed_messages
-from yid_ocp.diagnosis.localise import informed_z_scores, unknown_units
-from yid_ocp.inference.null_test import residual_channels
+from yid_ocp.diagnosis.diagnosis_messages import joint_overspeed_messages
+from yid_ocp.diagnosis.localise import smoothed_unknown_units, smoothed_unknown_z_scores
+from yid_ocp.inference.null_test import residual_channel_samples
 from yid_ocp.inference.smoother import SmootherResult
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import categorical_charts, figures
-from yid_ocp.report.categorical_charts import BeforeAfter, RankedCandidate, TimeMapRow
-from yid_ocp.report.figures import TimePlot
-from yid_ocp.report.sections import ReportData, register_section
-from yid_ocp.report.terminal import display_scale_and_unit, format_error_and_unit
+from yid_ocp.report.categorical_charts import RankedCandidate, TimeHeatMapRow, ValueBeforeAfter
+from yid_ocp.report.figures import TimePlotData
+from yid_ocp.report.sections import ReportData, register_report_section
+from yid_ocp.report.terminal import display_scale_and_unit, format_error_value_and_unit
 
 _MAX_CANDIDATES = 15  # candidates; the rest is in result.json
 _MAX_MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them all
@@ -43,7 +43,7 @@ class _Chapter:
     figures: Sequence[tuple[str, Any]] = ()
 
 
-@register_section("diagnosis", 5, "The gap and what makes it")
+@register_report_section("diagnosis", 5, "The gap and what makes it")
 def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
     """Chapters on gap, events, locations, candidates, curves and changed parameters."""
     result = findings.result
@@ -68,15 +68,15 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
     floor, changed = _floor(finding), bool(finding.accepted_effects)
-    by_unit: dict[str, dict[str, BeforeAfter]] = {}
+    by_unit: dict[str, dict[str, ValueBeforeAfter]] = {}
     for channel, (error, unit) in before.items():
         factor, shown = display_scale_and_unit(unit)
         later = factor * after[channel][0] if changed and channel in after else None
         reference = factor * floor[channel] if channel in floor else None
-        by_unit.setdefault(shown, {})[channel] = BeforeAfter(factor * error, later, reference=reference)
+        by_unit.setdefault(shown, {})[channel] = ValueBeforeAfter(factor * error, later, reference=reference)
     words = (_NOMINAL_LABEL, _EXTENDED_LABEL, "noise alone")
     shown_figures = [
-        ("", categorical_charts.before_after_figure(rows, f"held-out error (rms) [{unit}]", words))
+        ("", categorical_charts.values_before_after_figure(rows, f"held-out error (rms) [{unit}]", words))
         for unit, rows in by_unit.items()
     ]
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
@@ -91,7 +91,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
         )
         if falls:
             most, least = max(falls, key=lambda c: falls[c]), min(falls, key=lambda c: falls[c])
-            errors = (" ".join(format_error_and_unit(*model[most])) for model in (before, after))
+            errors = (" ".join(format_error_value_and_unit(*model[most])) for model in (before, after))
             worse = f"; {least} gets worse by {-100 * falls[least]:.0f} %" if falls[least] < -0.02 else ""
             sentences.append(f"The error of {most} changes most, from {' to '.join(errors)}{worse}.")
     else:
@@ -156,8 +156,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: 
     trace = smoothed.smoothed_unknowns[i]
     groups, names, edges = trace.unknown_groups, trace.unknown_names, trace.interval_edges
     kept = sorted(kept, key=lambda k: (-smoothed.log_evidence_drop[groups[k]], groups[k].location, groups[k].kind))
-    _, _, values = informed_z_scores(smoothed, i, finding.thresholds.informed_fraction)
-    units = unknown_units(finding.nominal_model.problem.system, trace)
+    _, _, values = smoothed_unknown_z_scores(smoothed, i, finding.thresholds.informed_fraction)
+    units = smoothed_unknown_units(finding.nominal_model.problem.system, trace)
     mean, std = trace.posterior_mean * trace.reference_std, trace.posterior_std * trace.reference_std
     axis = "value in its standard deviations"
     if np.any(np.isfinite(values)):
@@ -181,8 +181,8 @@ def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: 
             for j in range(len(mean))
         ]
         group = f"{groups[k].location} {groups[k].kind} [{units[k]}]"
-        rows.append(TimeMapRow(names[k], group, values[:, k], texts))
-    return categorical_charts.time_map_figure(edges, rows, axis), sentence
+        rows.append(TimeHeatMapRow(names[k], group, values[:, k], texts))
+    return categorical_charts.time_heat_map_figure(edges, rows, axis), sentence
 
 
 def _side(smoothed: SmootherResult) -> str:
@@ -199,7 +199,7 @@ def _side(smoothed: SmootherResult) -> str:
         f"By evidence the gap lies in {verdicts[smoothed.gap_origin]}: the log evidence rises by "
         f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
         f"alone, by {evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain "
-        f"{100 * smoothed.explainable_fraction:.0f} % of the gap where it was fitted."
+        f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap where it was fitted."
     )
 
 
@@ -216,17 +216,17 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         "is judged below, as far as that can be done."
         if events.force_series
         else "",
-        *overspeed_messages(events),
+        *joint_overspeed_messages(events),
     ]
-    by_recording: dict[str, list[TimePlot]] = {}
+    by_recording: dict[str, list[TimePlotData]] = {}
     for force in events.force_series:
         found = [event for event in events.for_recording(force.recording) if event.channel == force.channel]
         pulses = [(e.detected_pulse, e.start_time, e.end_time) for e in found if e.detected_pulse is not None]
-        shape = sum((pulse.evaluate_at(force.t) for pulse, *_ in pulses), np.zeros(len(force.t)))
+        shape = sum((pulse.filtered_force_at(force.t) for pulse, *_ in pulses), np.zeros(len(force.t)))
         courses = (shape, force.allowed_model_error, -force.allowed_model_error)
         lines = {name: (force.t, values) for name, values in zip(_EVENT_COLORS, courses, strict=True)}
         title, spans = f"{force.channel} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
-        plot = TimePlot(title, lines, force.t, force.force, marked_intervals=spans)
+        plot = TimePlotData(title, lines, force.t, force.force, marked_intervals=spans)
         by_recording.setdefault(force.recording, []).append(plot)
     shown = [
         (f"Recording {name}", figures.time_plots_figure(plots, figures.BEFORE_COLOR, _EVENT_COLORS))
@@ -271,7 +271,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
 def _promised(finding: DiagnosisResult) -> tuple[dict[str, float], bool]:
     """Promised decrease of r'r: in per cent of its excess over noise, or as it is where there is hardly an excess."""
     fit = finding.nominal_model
-    rows = np.concatenate([series.residual_indices for series in residual_channels(fit.problem)])
+    rows = np.concatenate([series.residual_indices for series in residual_channel_samples(fit.problem)])
     excess = float(np.sum(fit.evaluation.residual[rows] ** 2)) - (len(rows) - len(fit.values))
     percent = finding.verdict != "no_gap" and excess > 0
     factor = 100 / excess if percent else 1.0
@@ -298,7 +298,7 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         "can; 100 % cannot be told apart by these motions and sensors, whatever the residual is.",
         f"Alike: {listed}." if close else f"No two of them are alike; the closest are {said[0][1]}.",
     ]
-    figure = categorical_charts.matrix_figure(names, values, "trace of", "explained by [%]")
+    figure = categorical_charts.explained_fraction_matrix_figure(names, values, "trace of", "explained by [%]")
     return _Chapter("What could be mistaken for what", sentences, [("", figure)])
 
 
@@ -309,12 +309,12 @@ def _curves(
     finding: DiagnosisResult, predicted: Sequence[tuple[Episode, EpisodePrediction, EpisodePrediction]]
 ) -> _Chapter | None:
     changed = bool(finding.accepted_effects)
-    found: list[tuple[float, str, tuple[TimePlot, TimePlot]]] = []
+    found: list[tuple[float, str, tuple[TimePlotData, TimePlotData]]] = []
     for episode, before, after in predicted:
         for k, samples in enumerate(episode.measurements):
             sensor = samples.sensor
             t = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
-            for column, channel in enumerate(samples.channel_of_column):
+            for column, channel in enumerate(samples.output_channel_names):
                 y, std = samples.value[:, column], samples.std[:, column]
                 lines = {_NOMINAL_LABEL: before.predicted_outputs[k][:, column]}
                 if changed:
@@ -329,10 +329,10 @@ def _curves(
     if not found:
         return None
     # the same joint in every recording would say the same thing again
-    best: dict[str, tuple[str, tuple[TimePlot, TimePlot]]] = {}
+    best: dict[str, tuple[str, tuple[TimePlotData, TimePlotData]]] = {}
     for _, recording, pair in sorted(found, key=lambda entry: -entry[0]):
         best.setdefault(pair[0].axis_title, (recording, pair))
-    by_recording: dict[str, list[TimePlot]] = {}
+    by_recording: dict[str, list[TimePlotData]] = {}
     for recording, pair in list(best.values())[:_MAX_CHANNELS]:
         by_recording.setdefault(recording, []).extend(pair)
     shown = [
@@ -350,17 +350,18 @@ def _curves(
 def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     if not finding.accepted_effects or not finding.nominal_changes:
         return None
-    by_unit: dict[str, dict[str, BeforeAfter]] = {}
+    by_unit: dict[str, dict[str, ValueBeforeAfter]] = {}
     moved = []
     for entry in finding.nominal_changes:
         std, before, after = finding.nominal_model.std.get(entry.name, 0.0), entry.value_before, entry.value_after
-        by_unit.setdefault(entry.unit, {})[entry.name] = BeforeAfter(before, after, std, entry.std_after)
+        by_unit.setdefault(entry.unit, {})[entry.name] = ValueBeforeAfter(before, after, std, entry.std_after)
         if abs(after - before) > 0.1 * max(abs(before), 1e-9):
             text = f"{entry.name} goes from {before:.3g} to {after:.3g} {entry.unit}"
             moved.append((abs(after - before) / max(abs(before), 1e-9), text))
     words = ("fitted without the effects", _EXTENDED_LABEL, "")
     shown = [
-        ("", categorical_charts.before_after_figure(rows, f"value [{unit}]", words)) for unit, rows in by_unit.items()
+        ("", categorical_charts.values_before_after_figure(rows, f"value [{unit}]", words))
+        for unit, rows in by_unit.items()
     ]
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     sentences = [

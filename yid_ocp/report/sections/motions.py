@@ -14,8 +14,8 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
-from yid_ocp.report.figures import TimePlot
-from yid_ocp.report.sections import ReportData, joint_channel_unit, register_section
+from yid_ocp.report.figures import TimePlotData
+from yid_ocp.report.sections import ReportData, joint_channel_unit, register_report_section
 from yid_ocp.sensors import Sensor
 
 _MAX_RECORDINGS = 4  # recordings; a page with more is slow to open
@@ -26,7 +26,7 @@ _SHOWN_CHANNELS = ("position", "velocity", "effort", "position_command")
 _ROLE_LABELS = {"estimate": "estimated on", "held_out": "held out"}
 
 
-@register_section("scene", 3, "In motion")
+@register_report_section("scene", 3, "In motion")
 def _animation(findings: ReportData) -> Mapping[str, Any] | None:
     """The command's animations, else the predicted motion of each recording, held-out first."""
     scenes = [entry for entry in findings.animations or _predicted_motions(findings) if len(entry.t) > 1]
@@ -53,13 +53,13 @@ def _problem_and_theta(findings: ReportData, role: str, episode: Episode) -> tup
     assert problem is not None
     assert solution is not None
     theta, _ = problem.split(solution.x, problem.episodes.index(episode) if role == "estimate" else 0)
-    return problem, problem.predictor.episode_theta(episode, theta)
+    return problem, problem.predictor.theta_with_episode_values(episode, theta)
 
 
-@register_section("fit", 20, "How well it fits")
+@register_report_section("fit", 20, "How well it fits")
 def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
     """Measured and predicted values with residuals over time, and a residual histogram."""
-    found: list[tuple[str, list[TimePlot]]] = []
+    found: list[tuple[str, list[TimePlotData]]] = []
     whitened: dict[str, list[np.ndarray]] = {}
     for role, episode, outcome in findings.predicted_episodes if findings.problem is not None else ():
         for title, curves in _fitted_curves(findings, role, episode, outcome):
@@ -74,13 +74,13 @@ def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
     return {
         "figures": [(title, figures.time_plots_figure(curves)) for title, curves in found[:_MAX_PICTURES]],
         "left": max(len(found) - _MAX_PICTURES, 0),
-        "histogram": figures.residual_histogram_figure(residuals) if residuals else None,
+        "histogram": figures.whitened_residual_histogram_figure(residuals) if residuals else None,
     }
 
 
 def _fitted_curves(
     findings: ReportData, role: str, episode: Episode, outcome: EpisodePrediction
-) -> list[tuple[str, list[TimePlot]]]:
+) -> list[tuple[str, list[TimePlotData]]]:
     """Title and curves of each point, or of all joints of a group together."""
     found = []
     for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
@@ -92,7 +92,7 @@ def _fitted_curves(
         names = sensor.channel_names
         parts = {name: range(width * c, width * (c + 1)) for c, name in enumerate(names)} if width > 1 else {}
         for title, columns in (parts or {sensor.group_name: range(len(names))}).items():
-            curves: list[TimePlot] = []
+            curves: list[TimePlotData] = []
             for i in columns:
                 name = sensor.output_names[i].rsplit(".", 1)[1]
                 told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
@@ -108,10 +108,10 @@ def _course(
     """What a sensor of points would have seen at every node, for one that looks seldom, shape (N + 1, k)."""
     problem, own = _problem_and_theta(findings, role, episode)
     values = problem.predictor.node_values(outcome.rollout)
-    return problem.model_functions.compiled_sensor(sensor)(values, own).output
+    return problem.model_functions.compiled_sensor_function(sensor)(values, own).output
 
 
-@register_section("recorded", 30, "What was recorded")
+@register_report_section("recorded", 30, "What was recorded")
 def _recorded_signals(findings: ReportData) -> Mapping[str, Any] | None:
     """Recorded joint channels and points over time."""
     recordings: list[Recording] = findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]
@@ -124,7 +124,7 @@ def _recorded_signals(findings: ReportData) -> Mapping[str, Any] | None:
     return {"figures": shown} if shown else None
 
 
-def _recorded_curves(recording: Recording, system: System | None) -> list[tuple[str, TimePlot]]:
+def _recorded_curves(recording: Recording, system: System | None) -> list[tuple[str, TimePlotData]]:
     found = []
     for group in recording.groups:
         if isinstance(group, JointGroup):
@@ -133,12 +133,12 @@ def _recorded_curves(recording: Recording, system: System | None) -> list[tuple[
                 if values is not None:
                     words, unit = channel.replace("_", " "), joint_channel_unit(system, group.names, channel)
                     lines = {name: (group.t, values[:, i]) for i, name in enumerate(group.names)}
-                    found.append((f"Joints: {words}", TimePlot(f"{words} [{unit}]", lines)))
+                    found.append((f"Joints: {words}", TimePlotData(f"{words} [{unit}]", lines)))
         else:
             lines = {
                 f"{name}.{axis}": (group.t, group.position[:, i, c])
                 for i, name in enumerate(group.names[:_MAX_POINTS])
                 for c, axis in enumerate("xyz")
             }
-            found.append((f"Points: {group.name}", TimePlot("position [m]", lines)))
+            found.append((f"Points: {group.name}", TimePlotData("position [m]", lines)))
     return found

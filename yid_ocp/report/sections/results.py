@@ -13,16 +13,16 @@ import numpy as np
 from yid_ocp.analysis.compare import MethodComparison
 from yid_ocp.analysis.profile import CHI2_QUANTILE_95
 from yid_ocp.report import categorical_charts, figures
-from yid_ocp.report.figures import TimePlot, lines_over_time_figure
-from yid_ocp.report.png_figures import CALIBRATION_LABELS
-from yid_ocp.report.sections import ReportData, joint_channel_unit, register_section
+from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
+from yid_ocp.report.png_figures import BLIND_CALIBRATION_LABELS
+from yid_ocp.report.sections import ReportData, joint_channel_unit, register_report_section
 from yid_ocp.report.summaries import SUMMARY_BY_FORMAT
 from yid_ocp.report.terminal import SummaryBlock, SummaryStatement, SummaryTable
 
 _Row = TypeVar("_Row")
 
 
-@register_section("verdict", 0, "What was found")
+@register_report_section("verdict", 0, "What was found")
 def _verdict(findings: ReportData) -> Mapping[str, Any] | None:
     """Conclusions, verdicts and the blocks up to the key table."""
     blocks, end = _result_blocks(findings)
@@ -31,7 +31,7 @@ def _verdict(findings: ReportData) -> Mapping[str, Any] | None:
     return {"verdict": said, "blocks": _without_verdicts(blocks[:end])} if blocks else None
 
 
-@register_section("numbers", 60, "In numbers")
+@register_report_section("numbers", 60, "In numbers")
 def _remaining_tables(findings: ReportData) -> Mapping[str, Any] | None:
     """Blocks after the key table, without verdicts."""
     blocks, end = _result_blocks(findings)
@@ -61,7 +61,7 @@ def _by_unit(
     return [(title, draw(own, unit)) for unit, own in grouped.items()]
 
 
-@register_section("estimates", 10, "Estimates")
+@register_report_section("estimates", 10, "Estimates")
 def _estimates(findings: ReportData) -> Mapping[str, Any] | None:
     """Free parameters ± 2 std, untrusted ones marked; one figure per unit."""
     result, lost = findings.result, ("not_identifiable", "not_trusted")
@@ -73,7 +73,7 @@ def _estimates(findings: ReportData) -> Mapping[str, Any] | None:
     return {"figures": _by_unit(rows, categorical_charts.estimates_figure)} if rows else None
 
 
-@register_section("search", 40, "How it was found")
+@register_report_section("search", 40, "How it was found")
 def _solver_history(findings: ReportData) -> Mapping[str, Any] | None:
     solution = findings.solution
     if solution is None or len(solution.history) < 2:
@@ -82,7 +82,7 @@ def _solver_history(findings: ReportData) -> Mapping[str, Any] | None:
     return {"solution": solution, "finite": math.isfinite(solution.cost), "figure": figure}
 
 
-@register_section("inputs", 90, "What it was made from")
+@register_report_section("inputs", 90, "What it was made from")
 def _provenance(findings: ReportData) -> Mapping[str, Any] | None:
     """Date, command line, input hashes, versions and notes on non-finite values."""
     result = findings.result
@@ -92,14 +92,14 @@ def _provenance(findings: ReportData) -> Mapping[str, Any] | None:
     return {"date": "", "inputs": {}, "notes": []} | {**result, "command": command}
 
 
-@register_section("pictures", 50, "Pictures")
+@register_report_section("pictures", 50, "Pictures")
 def _image_files(findings: ReportData) -> Mapping[str, Any] | None:
     files = findings.section_data.get("pictures", ())
     shown = [(path.name, base64.b64encode(path.read_bytes()).decode("ascii")) for path in files]
     return {"pictures": shown} if shown else None
 
 
-@register_section("days", 10, "From run to run")
+@register_report_section("days", 10, "From run to run")
 def _parameter_history(findings: ReportData) -> Mapping[str, Any] | None:
     """Parameter values ± 2 std per run, of a history or a batch of one model."""
     result = findings.result if findings.result.get("format") == "yid-history/1" else findings.result.get("history")
@@ -109,10 +109,10 @@ def _parameter_history(findings: ReportData) -> Mapping[str, Any] | None:
         (name, entry["unit"], {run: (own["value"], own["std"]) for run, own in entry["values"].items()})
         for name, entry in result["parameters"].items()
     ]
-    return {"figures": _by_unit(rows, categorical_charts.values_by_source_figure)}
+    return {"figures": _by_unit(rows, categorical_charts.parameter_values_by_source_figure)}
 
 
-@register_section("methods", 10, "Methods")
+@register_report_section("methods", 10, "Methods")
 def _method_comparison(findings: ReportData) -> Mapping[str, Any] | None:
     """Estimates of every method and its cost over time."""
     comparison: MethodComparison | None = findings.section_data.get("comparison")
@@ -127,11 +127,11 @@ def _method_comparison(findings: ReportData) -> Mapping[str, Any] | None:
     for run in comparison.method_results:
         history = [entry for entry in run.solution.history if not entry.note]
         costs[run.method] = ([entry.seconds for entry in history], [entry.cost for entry in history])
-    shown = _by_unit(rows, categorical_charts.values_by_source_figure, "Estimates")
-    return {"figures": [*shown, ("Cost over time", figures.cost_over_time_figure(costs))]}
+    shown = _by_unit(rows, categorical_charts.parameter_values_by_source_figure, "Estimates")
+    return {"figures": [*shown, ("Cost over time", figures.excess_cost_over_time_figure(costs))]}
 
 
-@register_section("proof", 10, "What was seen and named")
+@register_report_section("proof", 10, "What was seen and named")
 def _blind_validation(findings: ReportData) -> Mapping[str, Any] | None:
     """Detection rate by effect size, confusion matrix and calibration."""
     result = findings.result
@@ -148,11 +148,11 @@ def _blind_validation(findings: ReportData) -> Mapping[str, Any] | None:
     said = result["confusion"]
     counts = np.array(said["counts"], float).reshape(len(said["true"]), len(said["said"]))
     if counts.size:
-        figure = categorical_charts.confusion_figure(said["true"], said["said"], counts, "true", "said first")
+        figure = categorical_charts.confusion_matrix_figure(said["true"], said["said"], counts, "true", "said first")
         shown.append(("What was said of what", figure))
     kept = {
         label: {entry["level"]: entry for entry in result["calibration"][key] if entry["of"]}
-        for key, label in CALIBRATION_LABELS.items()
+        for key, label in BLIND_CALIBRATION_LABELS.items()
     }
     if any(kept.values()):
         figure = figures.rate_intervals_figure(kept, "promised", "kept", True)
@@ -160,7 +160,7 @@ def _blind_validation(findings: ReportData) -> Mapping[str, Any] | None:
     return {"figures": shown} if shown else None
 
 
-@register_section("identifiability", 10, "What can be told")
+@register_report_section("identifiability", 10, "What can be told")
 def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
     """Profile likelihoods, and predicted parameter stds for every changed experiment."""
     result = findings.result
@@ -177,13 +177,13 @@ def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
     return {"figure": figure, "changes": changes, "names": names} if figure is not None or changes else None
 
 
-@register_section("information", 10, "The motion that tells most")
+@register_report_section("information", 10, "The motion that tells most")
 def _informative_motion(findings: ReportData) -> Mapping[str, Any] | None:
     """Joint positions, velocities and efforts over time."""
     return _motion_figures(findings, "information")
 
 
-@register_section("plan", 10, "The planned motion")
+@register_report_section("plan", 10, "The planned motion")
 def _planned_motion(findings: ReportData) -> Mapping[str, Any] | None:
     """Distance of the point from its target, joint positions and efforts over time."""
     return _motion_figures(findings, "plan")
@@ -199,11 +199,11 @@ def _motion_figures(findings: ReportData, key: str) -> Mapping[str, Any] | None:
         off = 1e3 * (where - found.target_position)
         lines = {axis: (found.t, off[:, i]) for i, axis in enumerate("xyz")}
         tolerance = 1e3 * findings.result["tolerance"]
-        curves.append(TimePlot("from the place [mm]", lines, band_half_height=tolerance))
+        curves.append(TimePlotData("from the place [mm]", lines, band_half_height=tolerance))
     courses = {f"joints, from the start [{unit('position')}]": found.joint_positions - found.joint_positions[0]}
     if key == "information":
         courses[f"velocity [{unit('velocity')}]"] = found.joint_velocities
     courses[f"effort [{unit('effort')}]"] = found.joint_efforts
     for words, values in courses.items():
-        curves.append(TimePlot(words, {name: (found.t, values[:, i]) for i, name in enumerate(found.joint_names)}))
+        curves.append(TimePlotData(words, {name: (found.t, values[:, i]) for i, name in enumerate(found.joint_names)}))
     return {"figures": [("", lines_over_time_figure(curve)) for curve in curves]}
