@@ -37,7 +37,7 @@ def made(monkeypatch):
     monkeypatch.setattr(module, "applied_torque_error_feedthrough", lambda gain, momentum: np.eye(NU))
     monkeypatch.setattr(module, "_INITIAL_RANDOM_SAMPLES", 8)
     functions = SimpleNamespace(
-        step=None, momentum_shift=SimpleNamespace(momentum_derivative_by_torque=lambda theta: None)
+        step=None, momentum_shift=SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
     )
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(

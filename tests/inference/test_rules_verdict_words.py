@@ -36,7 +36,7 @@ def test_an_interval_may_have_open_ends(interval, expected):
     ],
 )
 def test_a_value_is_told_with_what_is_known_of_it(std, interval, expected):
-    assert uncertainty.parameter_value_text(22.1234, std, interval) == expected
+    assert uncertainty.value_and_uncertainty_text(22.1234, std, interval) == expected
 
 
 @pytest.mark.parametrize("chi2", [None, math.nan])

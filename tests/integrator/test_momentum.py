@@ -86,7 +86,9 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
     np.testing.assert_allclose(value[1:], 0.5 * TIME_STEP / 2 * torque[:-1], atol=1e-12)
     np.testing.assert_allclose(slope[:, :, 0] * 0.5, value, atol=1e-12)
     np.testing.assert_array_equal(slope[:, :, 1], 0.0)
-    np.testing.assert_allclose(shift.momentum_derivative_by_torque(theta), TIME_STEP / 2 * np.eye(2), atol=1e-15)
+    np.testing.assert_allclose(
+        shift.momentum_derivative_by_previous_torque(theta), TIME_STEP / 2 * np.eye(2), atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("names", [EFFECTS["two that hold"], EFFECTS["friction"]], ids=["holds", "slides"])

@@ -34,11 +34,11 @@ from yid_ocp.inference.uncertainty import (
     misfit_widened_covariance,
     parameter_estimates,
     parameter_unknown_names,
-    parameter_value_text,
     parameter_verdict,
     percent_text,
     typical_parameter_magnitudes,
     unknowns_covariance_and_reduced_chi2,
+    value_and_uncertainty_text,
     with_profile_interval,
 )
 from yid_ocp.inference.whitening import problem_whitened_at
@@ -141,7 +141,7 @@ class IdentifiabilityResult(ReprMixin):
     def _summary(self) -> ReprSummary:
         rows = [("parameter", "value", "unit", "")]
         for name, entry in self.parameters.items():
-            value = parameter_value_text(entry.value, finite_or_none(entry.std), None)
+            value = value_and_uncertainty_text(entry.value, finite_or_none(entry.std), None)
             rows.append((name, value, entry.unit, VERDICT_TABLE_TEXTS[entry.verdict]))
         found = sum(entry.verdict == "identifiable" for entry in self.parameters.values())
         return ReprSummary(f"{found} of {count_with_noun(len(self.parameter_names), 'parameter')} found", rows)

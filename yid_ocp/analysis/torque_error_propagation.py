@@ -145,7 +145,7 @@ class _Motion:
 
     def __init__(self, course: NominalTrajectory, errors: InputErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
-        momentum = course.model_functions.momentum_shift.momentum_derivative_by_torque(course.theta)
+        momentum = course.model_functions.momentum_shift.momentum_derivative_by_previous_torque(course.theta)
         by_state, by_torque, by_angles = [], [], []
         for k, here in enumerate(linearized_steps(step, course.theta, course.rollout)):
             state, by_error = here.state_by_state.copy(), here.state_by_torque.copy()

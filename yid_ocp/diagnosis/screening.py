@@ -285,7 +285,7 @@ class CandidatePairScore:
 
 
 @dataclass(frozen=True)
-class JointScores:
+class AllCandidatesScoreModel:
     """Joint linear model of the residual in the amplitudes of all candidates, each at one shape value."""
 
     effects: tuple[EffectBase, ...]
@@ -322,7 +322,9 @@ class JointScores:
             yield CandidatePairScore((one, other), values, float(penalized))
 
 
-def score_candidates_jointly(point: AllCandidatesLinearization, chosen: Sequence[CandidateScore] = ()) -> JointScores:
+def score_candidates_jointly(
+    point: AllCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
+) -> AllCandidatesScoreModel:
     """Return the joint linear model of all candidates, at the scores' shape values or the middle of the grid."""
     shape = {
         s.effect.label: {k: v for k, v in s.predicted_values.items() if k in s.effect.shape_parameter_names}
@@ -337,10 +339,10 @@ def score_candidates_jointly(point: AllCandidatesLinearization, chosen: Sequence
     ]
     every = np.hstack([np.zeros((len(point.projected_residual), 0)), *(s.projected_sensitivity for s in kept)])
     effects, shapes = tuple(s.effect for s in kept), tuple(s.shape_values for s in kept)
-    return JointScores(effects, shapes, every.T @ every, -(every.T @ point.projected_residual))
+    return AllCandidatesScoreModel(effects, shapes, every.T @ every, -(every.T @ point.projected_residual))
 
 
-def confusability_matrix(everything: JointScores) -> ConfusabilityMatrix:
+def confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMatrix:
     """Return the matrix of signature fractions that candidates explain, amplitudes scaled by prior range."""
     ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
@@ -363,7 +365,7 @@ class ScreeningResult:
     detectability: tuple[CandidateDetectability, ...]
     candidate_scores: tuple[CandidateScore, ...]  # best first
     confusability: ConfusabilityMatrix
-    joint_scores: JointScores
+    joint_scores: AllCandidatesScoreModel
 
 
 def screen_candidates(

@@ -21,7 +21,7 @@ from yid_ocp.virtual.mjcf import (
     MUJOCO_APPROXIMATED_ASPECTS,
     JointDynamicsTerms,
     ParameterEvaluator,
-    effect_joint_terms_and_aspects,
+    effect_joint_terms_and_changed_aspects,
     format_xml_numbers,
     joint_dynamics_terms,
     model_aspects_of_parameters,
@@ -205,7 +205,7 @@ def effect_format_support(system: System, values: Mapping[str, float], form: str
         if amplitudes and all(theta[name] == neutral[name] for name in amplitudes):
             found[label] = _NEUTRAL
         else:
-            _, aspects = effect_joint_terms_and_aspects(system, effect, value)
+            _, aspects = effect_joint_terms_and_changed_aspects(system, effect, value)
             parts = [_READING if x == "reading" else _SUPPORT_BY_FORMAT[form][x] for x in sorted(aspects)]
             found[label] = _worst(parts)
     return found

@@ -149,7 +149,7 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
             frame = sensor.output_frames[column]
             biased.append((k, column))
             names.append(name)
-            sources.append(SmoothedUnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
+            sources.append(SmoothedUnknownGroup(sensor_bias_source_name(course.system, sensor, frame), "bias"))
             reference.append(limits.bias_prior_std * float(np.nanmedian(samples.std[:, column])))
     held, biases = np.array(grasped, int), tuple(biased)
     return _SmootherUnknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), biases)
@@ -176,7 +176,7 @@ def _unknown_forces(
     return names, sources, [size[place[name]] for name in names], forced
 
 
-def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
+def sensor_bias_source_name(system: System, sensor: Sensor, frame: str) -> str:
     """Return the location of a sensor's bias: the camera, the arm that holds the frame, else the sensor's group."""
     if sensor.camera_pose is not None:
         return "camera"

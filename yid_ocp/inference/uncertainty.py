@@ -462,7 +462,9 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     return f"{said}: no number is to be trusted; run `yid-ocp diagnose`"
 
 
-def parameter_value_text(value: float, std: float | None, interval: tuple[float | None, float | None] | None) -> str:
+def value_and_uncertainty_text(
+    value: float, std: float | None, interval: tuple[float | None, float | None] | None
+) -> str:
     """Format a value with its 95 % interval, or else its standard deviation where the data inform it."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"

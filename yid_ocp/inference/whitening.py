@@ -194,7 +194,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     made, steps, momentum = (
         [],
         linear(),
-        course.model_functions.momentum_shift.momentum_derivative_by_torque(course.theta),
+        course.model_functions.momentum_shift.momentum_derivative_by_previous_torque(course.theta),
     )
     for k in range(count + 1):
         fresh = k + 1 < count and errors.sample_of_step[k + 1] != errors.sample_of_step[k]

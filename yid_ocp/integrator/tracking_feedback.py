@@ -244,7 +244,7 @@ class EffectMomentumShift:
             if rows:
                 self._memories.append((own, _Memory(step, symbols, law, rows, columns)))
 
-    def momentum_derivative_by_torque(self, theta: Array) -> Array:
+    def momentum_derivative_by_previous_torque(self, theta: Array) -> Array:
         """Derivative of the momentum by the torques of the previous step, shape (nu, nu) [s]."""
         arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
         return np.array(self._impulse(*arguments, theta, self._time_step))
@@ -280,7 +280,7 @@ class EffectMomentumShift:
             total += by_all[2] @ _one_before(by_z) + by_all[3] @ by_z
         if true.torque_sensitivity is not None:
             pushed = true.torque_sensitivity
-            total[:, :, : pushed.shape[2]] += self.momentum_derivative_by_torque(theta) @ _one_before(pushed)
+            total[:, :, : pushed.shape[2]] += self.momentum_derivative_by_previous_torque(theta) @ _one_before(pushed)
         return (value - plain)[:, :, 0], total
 
     def _remembered(
@@ -313,7 +313,7 @@ def applied_torque_error_feedthrough(gain: Array, by_torque: Array) -> Array:
     """Derivative of the applied torque by an error of the recorded torque, feedback included, (nu, nu).
 
     The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
-    `gain` (nu, nb) is that of one step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_torque`.
+    `gain` (nu, nb) is that of one step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_previous_torque`.
     """
     nu = len(by_torque)
     return np.eye(nu) + gain[:, nu:] @ by_torque if gain.shape[1] > nu else np.eye(nu)

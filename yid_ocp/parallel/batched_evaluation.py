@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, TypeVar
 
-from yid_ocp.parallel.threads_and_processes import limit_threads, max_threads
+from yid_ocp.parallel.threads_and_processes import limit_max_threads, max_threads
 
 _MAX_CONCURRENT_ITEMS = 8  # largest number of concurrent items, equal to the largest batch size
 _Item = TypeVar("_Item")
@@ -128,7 +128,7 @@ def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable
 
     def work() -> None:
         _HERE.march = march
-        limit_threads(1)
+        limit_max_threads(1)
         try:
             while not march.abandoned and not errors:
                 with guard:

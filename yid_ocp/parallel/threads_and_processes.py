@@ -30,7 +30,7 @@ def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item])
     if workers < 2:
         return [function(entry) for entry in entries]
     own = max_threads() // workers
-    with ThreadPoolExecutor(max_workers=workers, initializer=limit_threads, initargs=(own,)) as pool:
+    with ThreadPoolExecutor(max_workers=workers, initializer=limit_max_threads, initargs=(own,)) as pool:
         return list(pool.map(function, entries))
 
 
@@ -54,7 +54,7 @@ def max_threads() -> int:
     return min(own, getattr(_SHARE, "count", own))
 
 
-def limit_threads(count: int) -> None:
+def limit_max_threads(count: int) -> None:
     """Limit the number of threads that the current thread may use."""
     _SHARE.count = count
 

@@ -227,8 +227,8 @@ class EpisodePredictor:
             torque, by_torque = FirstOrderLag(*lag, self.step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
             torque, first = (
-                torque - errors.torque_error_left_after_effects,
-                first - errors.torque_error_left_after_effects[0],
+                torque - errors.torque_error_subtracted_after_effects,
+                first - errors.torque_error_subtracted_after_effects[0],
             )
         if corrections.corrects_angles:
             true, _, by_angle, _, _ = corrections.true_angles_and_efforts(

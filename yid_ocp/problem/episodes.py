@@ -161,7 +161,7 @@ class InputErrorModel:
         return self.torque_bias + self.torque_noise
 
     @property
-    def torque_error_left_after_effects(self) -> Array:
+    def torque_error_subtracted_after_effects(self) -> Array:
         """Part of the torque error still to be subtracted after effects on torques apply, shape (N, nu) [N m]."""
         return self.total_torque_error - self.transmitted_torque_noise
 

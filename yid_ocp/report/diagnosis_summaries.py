@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, parameter_value_text
+from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     CodeBlock,
     SummaryBlock,
@@ -116,7 +116,7 @@ def _baseline_rows(result: Mapping[str, Any]) -> TableRows:
     """Parameters in the baseline and now."""
     rows: TableRows = [("parameter", "baseline", "now", "unit", "moved by", "")]
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
-        values = (parameter_value_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
+        values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
         moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
         rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
     return rows
@@ -286,7 +286,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], names: Sequence[str], units: 
             if own["value"] is None:
                 cells.append("")
             elif own["verdict"] in _FOUND_VERDICTS:
-                cells.append(parameter_value_text(own["value"], own["std"], None))
+                cells.append(value_and_uncertainty_text(own["value"], own["std"], None))
             else:
                 cells.append(VERDICT_TABLE_TEXTS[own["verdict"]])
         fit = "" if entry["chi2_per_dof"] is None else f"{entry['chi2_per_dof']:.3g}"
@@ -301,9 +301,11 @@ def history_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
     for name, entry in result["parameters"].items():
         known = entry["values"]
-        cells = (parameter_value_text(known[r]["value"], known[r]["std"], None) if r in known else "" for r in runs)
+        cells = (
+            value_and_uncertainty_text(known[r]["value"], known[r]["std"], None) if r in known else "" for r in runs
+        )
         p = "" if len(known) < 2 else p_value_text(entry["p_value"])
-        together = parameter_value_text(entry["mean"], entry["mean_std"], None)
+        together = value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
         rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
     return [
         SummaryTable(rows, "Parameters", is_key_table=True),

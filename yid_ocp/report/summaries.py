@@ -10,8 +10,8 @@ from yid_ocp.inference.uncertainty import (
     VERDICT_TABLE_TEXTS,
     goodness_of_fit_message,
     interval_text,
-    parameter_value_text,
     percent_text,
+    value_and_uncertainty_text,
 )
 from yid_ocp.report.diagnosis_summaries import batch_summary, blind_summary, diagnose_summary, history_summary
 from yid_ocp.report.terminal import (
@@ -168,7 +168,7 @@ def compare_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
                 # elsewhere a curvature tells nothing of how sure it is
                 ended = entry["status"] not in ("stalled", "failed")
                 known = (found["std"], found["interval"]) if ended else (None, None)
-                cells.append(parameter_value_text(found["value"], *known))
+                cells.append(value_and_uncertainty_text(found["value"], *known))
             others = [f"{result[key][name]:.4g}" if name in result[key] else "" for key in beside]
             rows.append((name, *cells, *others, VERDICT_TABLE_TEXTS[own["verdict"]]))
     said = [f"{n} did not converge: {e['message']}" for n, e in methods.items() if e["status"] != "converged"]

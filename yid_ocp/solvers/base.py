@@ -28,8 +28,8 @@ from yid_ocp.inference.uncertainty import (
     finite_or_none,
     misfit_widened_covariance,
     parameter_estimates,
-    parameter_value_text,
     unknowns_covariance_and_reduced_chi2,
+    value_and_uncertainty_text,
 )
 from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
 from yid_ocp.problem.episodes import EpisodePrediction
@@ -113,7 +113,9 @@ class Solution(ReprMixin):
 
     def _summary(self) -> ReprSummary:
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
-        words = {name: parameter_value_text(e.value, finite_or_none(e.std), e.interval) for name, e in free.items()}
+        words = {
+            name: value_and_uncertainty_text(e.value, finite_or_none(e.std), e.interval) for name, e in free.items()
+        }
         rows = [("parameter", "value", "unit", "")]
         rows += [(name, words[name], e.unit, VERDICT_TABLE_TEXTS[e.verdict]) for name, e in free.items()]
         told = [f"{name} = {words[name]} {e.unit}" for name, e in free.items() if e.verdict == "identifiable"][:3]

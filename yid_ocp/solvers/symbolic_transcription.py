@@ -354,7 +354,9 @@ class _Maker:
         if key not in self._stages:
             feedback = episode.tracking_feedback
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
-            momentum = self._problem.model_functions.momentum_shift.momentum_derivative_by_torque(self._problem.theta)
+            momentum = self._problem.model_functions.momentum_shift.momentum_derivative_by_previous_torque(
+                self._problem.theta
+            )
             made = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
             self._stages[key] = made
         return self._stages[key]

@@ -128,7 +128,7 @@ def model_aspects_of_parameters(system: System, symbols: ca.SX) -> set[str]:
     return {name for name, parts in entered.items() if any(_depends(part, symbols) for part in parts)}
 
 
-def effect_joint_terms_and_aspects(
+def effect_joint_terms_and_changed_aspects(
     system: System, effect: Effect, value: ParameterEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
     """Terms that a system's effect adds at single joints, and the `MODEL_ASPECT_DESCRIPTIONS` it changes."""
@@ -160,7 +160,7 @@ def effect_joint_terms_and_aspects(
 def joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms]:
     """Springs, dampers, rotor inertia and friction by joint, from the description and from effects.
 
-    Of other effects only these parts; aspects of `effect_joint_terms_and_aspects` show what is missing.
+    Of other effects only these parts; aspects of `effect_joint_terms_and_changed_aspects` show what is missing.
     """
     found: dict[str, JointDynamicsTerms] = {}
 
@@ -177,7 +177,7 @@ def joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str,
             stiffness = 1 / float(value(compliance)[0])
             add(joint, JointDynamicsTerms(stiffness, damping=system.joint_relaxation_times.get(joint, 0.0) * stiffness))
     for effect in system.effects:
-        for joint, own in effect_joint_terms_and_aspects(system, effect, value)[0].items():
+        for joint, own in effect_joint_terms_and_changed_aspects(system, effect, value)[0].items():
             add(joint, own)
     return found
 
@@ -486,7 +486,9 @@ def compile_mjcf(text: str) -> Any:
 def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bool) -> None:
     able = _NATIVE_ASPECTS | MUJOCO_APPROXIMATED_ASPECTS if emulate else _NATIVE_ASPECTS
     for effect in system.effects:
-        for aspect in sorted(effect_joint_terms_and_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS):
+        for aspect in sorted(
+            effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
+        ):
             changed = MODEL_ASPECT_DESCRIPTIONS[aspect]
             what = f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {changed}"
             allowed = ", ".join(words for name, words in MODEL_ASPECT_DESCRIPTIONS.items() if name in able)

@@ -175,7 +175,7 @@ class ArmSurface:
         points = _LOOK.pixel_rays[seen] * depth[seen][:, None]
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
 
-    def is_near_moving_surface(self, points: Array, t: float, within: float) -> BoolArray:
+    def is_near_moving_surface_off_grasps(self, points: Array, t: float, within: float) -> BoolArray:
         """Whether world points are near a moving surface and not near a grasp."""
         q = self.configuration_at(t)
         result = self.robot_surfaces.is_within_surface_distance(points, q, within, moving_only=True)

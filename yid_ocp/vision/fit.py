@@ -37,9 +37,9 @@ from yid_ocp.vision.shape_evidence import (
     TubeLinks,
     assess_shape_against_cloud,
     line_of_sight_residuals,
-    nearest_points_on_tubes,
     nearest_surface_residuals,
     tube_like_node_point_masks,
+    tube_link_projections,
 )
 from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_link_lengths_and_radii
 
@@ -228,7 +228,7 @@ class ShapeFitter:
         if not evidence.is_contested.any() or not self.options.surface_loss_scales:
             return []
         tubes = self.tube_links_at(best.q)
-        touched = nearest_points_on_tubes(tubes.link_ends, tubes.radius, sight.points[evidence.is_contested])[0]
+        touched = tube_link_projections(tubes.link_ends, tubes.radius, sight.points[evidence.is_contested])[0]
         found = []
         for name in dict.fromkeys(self.link_segments[k] for k in sorted(set(touched.tolist()))):
             mine = self._links_of({name})
@@ -255,9 +255,9 @@ class ShapeFitter:
     ) -> _Left:
         """All nodes and points but those on which some links lie."""
         tubes, nodes = self.tube_links_at(best.q), sight.skeleton_nodes
-        link = nearest_points_on_tubes(tubes.link_ends, tubes.radius, sight.points)[0]
+        link = tube_link_projections(tubes.link_ends, tubes.radius, sight.points)[0]
         wrong = links[link] & (evidence.is_own | evidence.is_contested)
-        node_link, _, _, distance = nearest_points_on_tubes(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
+        node_link, _, _, distance = tube_link_projections(tubes.link_ends, tubes.radius, nodes, _NODE_RADIUS_FRACTION)
         return ~(links[node_link] & (distance < 2 * tubes.radius[node_link])), ~wrong
 
     def _attempt(

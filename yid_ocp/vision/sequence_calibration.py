@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.model.system import System
 from yid_ocp.vision.calibration import CameraCalibration
-from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, nearest_points_on_tubes
+from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, tube_link_projections
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 _NOISE_STDS = 3.0  # of a point, within which it is the background's
@@ -76,7 +76,7 @@ class BackgroundPoints:
         points: Array = np.asarray((place[count >= often] + 0.5) * voxel)
         for tubes in shapes or ():
             if len(points):
-                link, _, _, distance = nearest_points_on_tubes(tubes.link_ends, tubes.radius, points)
+                link, _, _, distance = tube_link_projections(tubes.link_ends, tubes.radius, points)
                 points = points[distance > tubes.radius[link] + near]
         return BackgroundPoints(points, _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
 

@@ -47,7 +47,7 @@ class TubeLinks:
     tube_lengths: Array  # (K,), length of the whole tube that a link belongs to [m]
 
 
-def nearest_points_on_tubes(
+def tube_link_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
     """Nearest place on tubes of links (K, 2, 3) and radii (K,) for points (N, 3) that lie at a share of the radius [m].
@@ -151,7 +151,7 @@ class ProcessedFrameCloud:
 
 def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near: float) -> ShapePointClassification:
     """Classify a frame's points by a fitted shape and assess its coverage; points beyond `near` [m] say nothing."""
-    link, along, normal, distance = nearest_points_on_tubes(tubes.link_ends, tubes.radius, seen.points)
+    link, along, normal, distance = tube_link_projections(tubes.link_ends, tubes.radius, seen.points)
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
     size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
     close = size < near
@@ -331,7 +331,7 @@ def nearest_surface_residuals(
     Links are (K, 2, 3), radii (K,), the camera (3,) [m]. A point that only the far side of a tube is near to counts
     from the near side.
     """
-    link, along, normal, distance = nearest_points_on_tubes(corners, radius, points, share)
+    link, along, normal, distance = tube_link_projections(corners, radius, points, share)
     sign = np.where(_faces_away_from_camera(normal, points - camera), -1.0, 1.0)
     error = sign * distance - share * radius[link]
     # e falls as the centre line moves along the normal: de = -n'((1 - t) da + t db)
@@ -347,7 +347,7 @@ def line_of_sight_residuals(corners: Array, radius: Array, points: Array, camera
     sqrt(r^2 - u^2). The nearest way turns with the noise, which does little to where a tube is found, but makes it
     appear thinner by several times noise^2/r. Points near the rim, where depth says little, are not compared.
     """
-    link, along, normal, distance = nearest_points_on_tubes(corners, radius, points)
+    link, along, normal, distance = tube_link_projections(corners, radius, points)
     edge = corners[:, 1] - corners[:, 0]
     axis = (edge / np.linalg.norm(edge, axis=1)[:, None])[link]
     sight = camera - points

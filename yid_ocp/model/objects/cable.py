@@ -361,5 +361,5 @@ model:
         return cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
 
     def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        """Edge length parameters of one recording, where not all recordings share them."""
+        """Values of the edge length parameters of one recording by name; empty where all recordings share them."""
         return edge_length_parameter_values(self.topology(), edge_lengths) if self.lengths_per_recording else {}
