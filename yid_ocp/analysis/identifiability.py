@@ -196,10 +196,9 @@ def identifiability(
     """
     names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
-    for name in wanted:
-        if name not in names:
-            hint = nearest_name_hint(name, names)
-            raise ConfigError(f"'{name}' is not a free parameter", hint=hint, where="intervals")
+    for name in (own for own in wanted if own not in names):
+        hint = nearest_name_hint(name, names)
+        raise ConfigError(f"'{name}' is not a free parameter", hint=hint, where="intervals")
     given = unknowns_from_solution(problem, solution)
     wide = with_nuisance_unknowns(problem, start, grasp_std)
     x = transfer_unknowns_by_name(given, problem.unknown_names, wide)
