@@ -94,7 +94,7 @@ def estimated(system: System, recording: Recording, time_step: float) -> Estimat
     problem = EstimationProblem(step, [recording], FREE, ProblemOptions(feedback="lqr"), TRUTH)
     found = solve(problem, GaussNewton(cost_tolerance=1e-12, max_iterations=15))
     std = np.array([found.std[name] for name in FREE])
-    return Estimate(found.x[: len(FREE)], std, found.chi2_per_dof, found.message)
+    return Estimate(found.x[: len(FREE)], std, found.goodness_of_fit.chi2_per_dof, found.message)
 
 
 def orders(estimates: Mapping[float, Estimate]) -> dict[str, list[float]]:

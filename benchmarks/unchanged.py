@@ -67,9 +67,10 @@ def diagnosed(name: str) -> dict[str, Any]:
         for label in effects
         for key, own in listed[label].items()
     }
-    nominal = finding.nominal
+    nominal = finding.nominal_model
     parameters |= {
-        key: {"value": nominal.values[key], "std": number(nominal.std[key])} for key in nominal.problem.shared
+        key: {"value": nominal.values[key], "std": number(nominal.std[key])}
+        for key in nominal.problem.shared_parameters
     }
     return {"status": said["verdict"], "effects": effects, "parameters": parameters}
 
