@@ -53,17 +53,6 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     )
     trajectory = (case.theta, plain.state, plain.multipliers, plain.torque, names, True)
     assert poor.grants_needed(lambda: kernel.linearize(*trajectory)) == 1
-    given = np.concatenate([case.start[list(case.step.system.driven_coordinate_indices)], case.path[0]])
-    loads = np.ones((sum(model.sizes[key] for key in ("n", "nz", "m")), 1)), np.ones((model.sizes["n"], 1))
-    assert poor.grants_needed(lambda: kernel.state_transition_jacobians(*trajectory[:4], *loads)) == 1
-    unknowns = np.zeros(sum(model.sizes[key] for key in ("n", "nz", "m")) - model.sizes["nc"])
-    assert (
-        poor.grants_needed(
-            lambda: kernel.find_static_equilibrium(case.theta, unknowns, given, case.torque[0], 1e3, 1e-9)
-        )
-        == 1
-    )
-
     poor.grants.value = 100
     again = kernel.rollout(differentiated)
     np.testing.assert_array_equal(again.state, plain.state)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from yid_ocp.integrator.rollout import AdditionalLoadDerivatives, linearized_steps
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.integrator.step_model import SensitivityDirections
 
@@ -190,18 +191,16 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
         np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-6 * scale_of(expected))
 
 
-def test_single_steps_are_differentiated_alike_by_both_kernels(case):
+def test_single_steps_are_those_of_a_rollout_by_both_kernels(case):
     """By state, torque and loads that act on every step alike."""
     sizes, slow = case.step.sizes, compile_step_like(case.step, case.step.system, use_compiler=False)
-    rollout = case.rollout()
+    rollout, rng = case.rollout(), np.random.default_rng(3)
     assert rollout.status.is_converged, rollout.status.message
-    rng = np.random.default_rng(3)
-    rows = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2))
-    momentum = rng.normal(size=(sizes["n"], 2))
-    along = (case.theta, rollout.state, rollout.multipliers, rollout.torque, rows, momentum)
-    made, expected = (step.kernel.state_transition_jacobians(*along) for step in (case.step, slow))
-    assert made[0].shape == (len(case.torque), sizes["nx"], sizes["nx"] + sizes["nu"] + 2)
-    for one, other in zip(made, expected, strict=True):
+    rows, momentum = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2)), rng.normal(size=(sizes["n"], 2))
+    loads = AdditionalLoadDerivatives(rows, momentum)
+    made, expected = (list(linearized_steps(s, case.theta, rollout, loads)) for s in (case.step, slow))
+    for name in vars(made[0]):
+        one, other = (np.stack([getattr(step, name) for step in steps]) for steps in (made, expected))
         # large terms cancel in efforts
         scale = np.maximum(np.max(np.abs(other), axis=(0, 1), initial=0.0), 1e-4 * np.max(np.abs(other), initial=1.0))
         assert np.max(np.abs(one - other) / scale, initial=0.0) < 1e-9
@@ -209,5 +208,10 @@ def test_single_steps_are_differentiated_alike_by_both_kernels(case):
     prescribed = (case.path[0], case.path[1]) if sizes["nc"] else None
     A, B_u, _ = case.step.jacobians(q0[:n], q0[n : 2 * n], case.torque[0], case.theta, prescribed, q0[2 * n :], ())
     free = np.delete(np.arange(sizes["nx"]), list(case.step.system.prescribed_coordinate_indices))
-    np.testing.assert_allclose(made[0][0][free, : sizes["nx"]], A[free], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(made[0][0][free, sizes["nx"] : -2], B_u[free], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(made[0].state_by_state[free], A[free], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(made[0].state_by_torque[free], B_u[free], rtol=1e-9, atol=1e-9)
+    # implicit differentiation of a rollout: the efforts are those of its sensitivities
+    directions = SensitivityDirections((), np.eye(sizes["nx"]))
+    forward = case.rollout(directions=directions).effort_sensitivity
+    scale = scale_of(forward[0])
+    np.testing.assert_allclose(made[0].effort_by_state[:, free], forward[0][:, free], rtol=0, atol=1e-9 * scale)

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.nlp_stage import nlp_stage
+from yid_ocp.integrator.discrete import nlp_stage
 
 
 @pytest.fixture(scope="module")

@@ -109,5 +109,5 @@ def test_equilibria(parts, monkeypatch):
 
     built = slowed(monkeypatch, ca, "jacobian")
     together = at_once(rest(shared), thetas)
-    assert len(built) == 3  # of the residual at rest, and of a step by its unknowns and by all else, once
+    assert len(built) == 2  # of a step by its unknowns and by all else, once
     assert_same(together, [rest(plain)(theta) for theta in thetas])

@@ -17,7 +17,7 @@ from yid_ocp.inference.whitening import (
     problem_whitened_by_sensor_noise,
     problem_without_input_errors,
 )
-from yid_ocp.integrator.nlp_stage import nlp_stage
+from yid_ocp.integrator.discrete import nlp_stage
 from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions

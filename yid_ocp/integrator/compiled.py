@@ -17,7 +17,6 @@ from yid_ocp.errors import ModelError
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
-    EQUILIBRIUM_ITERATION_LIMIT,
     NEWTON_ITERATION_LIMIT,
     CostGradient,
     NewtonStatus,
@@ -213,7 +212,7 @@ class CompiledKernel:
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
         gradient = CostGradient(*(np.zeros(shape) for shape in shapes))
         partials = [_doubles(a) for a in (by_state, by_multipliers, by_effort)]
-        code, _ = self._call(
+        code = self._call(
             "yid_adjoint",
             self._motion(steps, theta, None, None, feedback, self._directions(names, len(names))),
             _along(rollout.state, rollout.multipliers, rollout.torque),
@@ -243,46 +242,12 @@ class CompiledKernel:
         )
         return out
 
-    def state_transition_jacobians(
-        self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
-    ) -> tuple[Array, Array]:
-        """Jacobians of single steps, solved in C."""
-        sizes, loads = self._model.sizes, load_rows.shape[1]
-        width = sizes["nx"] + sizes["nu"] + loads
-        after, effort = (np.zeros((len(torque), sizes[key], width)) for key in ("nx", "nc"))
-        motion = self._motion(len(torque), theta, None, None, None, None)
-        added = [np.ascontiguousarray(x, float) for x in (load_rows, load_momentum)]
-        code, outcome = self._call(
-            "yid_slopes", motion, _along(state, multipliers, torque), loads, *added, after, effort
-        )
-        if code != NewtonStatus.OK:
-            raise np.linalg.LinAlgError(f"the equations of step {outcome.step} are singular")
-        return after, effort
-
-    def find_static_equilibrium(
-        self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
-    ) -> tuple[Array, float, bool]:
-        """Static equilibrium by Newton's iteration in C."""
-        nu, driven = len(held), np.array(self._model.system.driven_coordinate_indices, np.int32)
-        hold = _filled(_Feedback, nu, driven, stiffness * np.eye(nu), _doubles(given[:nu])) if nu else None
-        inputs = (_doubles(theta), _doubles(held), _doubles(given[nu:]))
-        motion = _filled(_Motion, 1, EQUILIBRIUM_ITERATION_LIMIT, self._model.time_step, tolerance, *inputs, hold, None)
-        w = np.array(unknowns, float)
-        code, outcome = self._call("yid_rest", motion, w)
-        return w, outcome.error, code == NewtonStatus.OK
-
-    def _call(self, function: str, *arguments: object) -> tuple[int, Any]:
-        """Status and outcome of a function of the library, which takes structs and arrays by address."""
-
-        def passed(value: object) -> object:
-            if isinstance(value, np.ndarray):
-                return ctypes.c_void_p(value.ctypes.data)
-            return ctypes.byref(value) if isinstance(value, _Struct) else value
-
-        outcome = _Outcome()
-        code = getattr(self._library, function)(*map(passed, arguments), ctypes.byref(outcome))
+    def _call(self, function: str, *structs: _Struct) -> int:
+        """Status of a function of the library, which takes structs by address."""
+        outcome: Any = _Outcome()
+        code: int = getattr(self._library, function)(*map(ctypes.byref, (*structs, outcome)))
         _check(code, outcome)
-        return code, outcome
+        return code
 
     def _motion(
         self,

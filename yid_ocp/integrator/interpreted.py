@@ -15,9 +15,7 @@ import scipy.linalg.lapack
 from numpy.typing import NDArray
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.integrator.discrete import equilibrium_equations
 from yid_ocp.integrator.step_model import (
-    EQUILIBRIUM_ITERATION_LIMIT,
     NEWTON_ITERATION_LIMIT,
     CostGradient,
     NewtonStatus,
@@ -46,7 +44,6 @@ class InterpretedKernel:
     def __init__(self, model: StepModel) -> None:
         self._model = model
         self._functions: CasadiLockedCache[None, list[ca.Function]] = CasadiLockedCache(self._made)
-        self._rest: CasadiLockedCache[None, ca.Function] = CasadiLockedCache(self._rest_made)
         system, sizes = model.system, model.sizes
         names = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
         ends = np.cumsum([0, *(argument.numel() for argument in model.equations.arguments)])
@@ -64,7 +61,7 @@ class InterpretedKernel:
     def with_step_model(self, model: StepModel) -> InterpretedKernel:
         """An interpreted kernel of the same functions with another step model."""
         other = InterpretedKernel(model)
-        other._functions, other._rest = self._functions, self._rest
+        other._functions = self._functions
         return other
 
     def _evaluators(self) -> list[_PointEvaluator]:
@@ -78,10 +75,6 @@ class InterpretedKernel:
         slope = ca.jacobian(outputs[self._residual.tolist()], e.unknowns)
         wanted = (outputs, slope, ca.jacobian(outputs, point))
         return [ca.Function("f", [point], [ca.densify(x)]) for x in wanted]
-
-    def _rest_made(self, _: None) -> ca.Function:
-        e = equilibrium_equations(self._model.equations)
-        return ca.Function("rest", e.inputs, [e.residual, ca.jacobian(e.residual, e.inputs[0])])
 
     def _point(self, theta: Array, before: Array, after: Array, lam: Array, u: Array) -> Array:
         n = self._model.sizes["n"]
@@ -253,96 +246,6 @@ class InterpretedKernel:
                     getattr(out, f"residual_by_{key}")[k] = jacobian[: self._rows, index]
                     getattr(out, f"p1_by_{key}")[k] = jacobian[self._p1, index]
         return out
-
-    def state_transition_jacobians(
-        self, theta: Array, state: Array, multipliers: Array, torque: Array, load_rows: Array, load_momentum: Array
-    ) -> tuple[Array, Array]:
-        """Derivatives of the steps of a finished rollout by (q, p, z), torque and loads (implicit function theorem).
-
-        `load_rows` (nt, e) and `load_momentum` (n, e) are what e additional loads add to the residual and to p_{k+1}.
-        Returns those of the state after the step, shape (N, nx, nx + nu + e), and of the effort, (N, nc, nx + nu + e);
-        `numpy.linalg.LinAlgError` where a step's equations are singular.
-        """
-        sizes = self._model.sizes
-        point = self._point(theta, state[0], state[1], multipliers[0], torque[0])
-        h = float(self._model.functions.row_scale_and_time_step(*(point[index] for index in self._at.values()))[1])
-        n, nz, nx, nu, count = sizes["n"], sizes["nz"], sizes["nx"], sizes["nu"], len(torque)
-        system = self._model.system
-        free, fixed = (
-            np.array(index, int)
-            for index in (system.unprescribed_coordinate_indices, system.prescribed_coordinate_indices)
-        )
-        found = self.linearize(theta, state, multipliers, torque, (), True)
-        width = nx + nu + load_rows.shape[1]
-        top, bottom = np.zeros((count, self._rows, width)), np.zeros((count, n, width))
-        for target, old, push, load in (
-            (top, found.residual_by_old, found.residual_by_input, load_rows),
-            (bottom, found.p1_by_old, found.p1_by_input, load_momentum),
-        ):
-            target[:, :, :n], target[:, :, 2 * n : nx] = old[:, :, :n], old[:, :, n:]
-            target[:, :, nx : nx + nu], target[:, :, nx + nu :] = push, load
-        top[:, np.arange(n), n + np.arange(n)] += 1.0
-        solved = self._residual
-        moved = -np.linalg.solve(found.residual_by_new[:, solved[:, None], solved], top[:, solved])
-        after = np.zeros((count, nx, width))
-        after[:, free] = moved[:, : len(free)]
-        after[:, n : 2 * n] = bottom + found.p1_by_new[:, :, solved] @ moved
-        after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
-        return after, -(top[:, fixed] + found.residual_by_new[:, fixed[:, None], solved] @ moved) / h
-
-    def find_static_equilibrium(
-        self, theta: Array, unknowns: Array, given: Array, held: Array, stiffness: float, tolerance: float
-    ) -> tuple[Array, float, bool]:
-        """Solve `EquilibriumEquations` by `damped_newton`, beginning at `unknowns`, shape (ny,).
-
-        Returns the last point, the largest imbalance [N m] or violation of a constraint [m] there, and whether that
-        counts as rest, being up to `tolerance`.
-        """
-        function, known = self._rest(None), (given, held, stiffness, theta, self._model.time_step)
-        return damped_newton(lambda w: function.call([w, *known]), unknowns, tolerance)
-
-
-def damped_newton(
-    function: Callable[[Array], Sequence[ca.DM]], w: Array, tolerance: float
-) -> tuple[Array, float, bool]:
-    """Root, its error and whether converged, by damped Newton, natural monotonicity test (Deuflhard 2011, 3.3).
-
-    A damped step is also accepted if it reduces the residual; `function` gives the residual and its Jacobian.
-    """
-    if len(w) == 0:
-        return w, 0.0, True
-
-    def evaluate(x: Array) -> tuple[Array, Array]:
-        residual, jacobian = function(x)
-        return np.array(residual).ravel(), np.array(ca.densify(jacobian))
-
-    residual, jacobian = evaluate(w)
-    error = float(np.max(np.abs(residual)))
-    for _ in range(EQUILIBRIUM_ITERATION_LIMIT):
-        if error <= tolerance or not math.isfinite(error):
-            return w, error, error <= tolerance
-        factors = _factorised(jacobian)
-        if factors is None:
-            return w, error, False
-        delta = -_solved(factors, residual)
-        scale = np.maximum(np.abs(w), 1.0)
-        size = float(np.max(np.abs(delta / scale)))
-        if not math.isfinite(size):
-            return w, error, False
-        factor = min(1.0, 0.3 / size) if size else 1.0
-        while True:
-            trial = w + factor * delta
-            new_residual, new_jacobian = evaluate(trial)
-            if np.all(np.isfinite(new_residual)):
-                shrunk = float(np.max(np.abs(_solved(factors, new_residual)) / scale))
-                if shrunk <= (1 - factor / 4) * size or np.max(np.abs(new_residual)) <= (1 - factor / 4) * error:
-                    break
-            factor *= 0.5
-            if factor < 1e-6:
-                return w, error, error < 1e2 * tolerance
-        w, residual, jacobian = trial, new_residual, new_jacobian
-        error = float(np.max(np.abs(residual)))
-    return w, error, False
 
 
 def _evaluator(function: Any) -> _PointEvaluator:

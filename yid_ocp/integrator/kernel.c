@@ -2,14 +2,13 @@
  *
  * The generated part before this text defines the sizes N, NZ, M, NU, NC, NF, NY and NT, counts of nonzeros (NNZ_...),
  * sizes of CasADi's work arrays (SZ_W, SZ_IW), what the system needs (ROW_SCALED, MIDDLE, CLOSED, CLOSED_LEFT,
- * CLOSED_RIGHT),
- * the index tables and the CasADi functions residual, linear, matrix, ending, pull, scales and resting; see codegen.py.
+ * CLOSED_RIGHT), the index tables and the CasADi functions residual, linear, matrix, ending, pull and scales.
  *   N coordinates, NZ internal ones, M constraints, NU inputs, NC prescribed and NF free coordinates,
  *   NT = N + NZ + M rows, NY = NF + NZ + M unknowns of a step, NX = 2 N + NZ state (q, p, z).
  * All matrices are row-major. compiled.py declares the structs of the entry points at the end once more.
  *
  * Everything is compiled for one member, and once more for a batch of `SIMD_WIDTH` members that march together, see simd.c.
- * What only one member can do (damped steps, adjoint, equilibria) is left out of a batch.
+ * What only one member can do (damped steps, adjoint) is left out of a batch.
  */
 #define NX (2 * N + NZ)
 #define NQZ (N + NZ)
@@ -112,6 +111,26 @@ static mask evaluate(Work *k, const Point *a) {
     return is_finite(sum);
 }
 
+/* Add nonzeros by (unknowns, what was before, inputs) to the three matrices; to the first alone without the second. */
+static void split_columns(int count, const real *nz, const int *row, const int *col, real *new, real *old, real *input) {
+    for (int e = 0; e < count; e++) {
+        const int column = col[e];
+        if (column < NT) new[row[e] * ONE(NT) + column] += nz[e];
+        else if (old && column < NT + NQZ) old[row[e] * ONE(NQZ) + column - NT] += nz[e];
+        else if (old) input[row[e] * ONE(NU) + column - NT - NQZ] += nz[e];
+    }
+}
+
+/* Entries of a joint with its ancestors from `first` on: w_i . g + V_i . x of columns of (3, N), (6, N) and (., N). */
+static inline void pair_entries(const real *W, const real *g, const real *V, const real *x, int first, int last,
+                                real *restrict entry) {
+    for (int i = first; i < last; i++) {
+        real sum = W[i] * g[0] + W[N + i] * g[N] + W[2 * N + i] * g[2 * N];
+        for (int c = 0; c < 6; c++) sum += V[c * N + i] * x[c];
+        entry[i] = sum;
+    }
+}
+
 /* Jacobians of the rows and of p1; `everything` adds those with respect to q_k, z_k and u. */
 static void linearise(Work *k, const Point *a, int everything) {
     const real *args[9];
@@ -128,43 +147,28 @@ static void linearise(Work *k, const Point *a, int everything) {
         memset(k->Pu, 0, sizeof k->Pu);
     }
     for (int j = 0; j < N; j++) {
-        real x[6], y[6], g[3], low[ONE(N)], up[ONE(N)], here[ONE(N)], there[ONE(N)];
-        for (int c = 0; c < 6; c++) { x[c] = X[c * N + j]; y[c] = Y[c * N + j]; }
-        for (int c = 0; c < 3; c++) g[c] = G[c * N + j];
+        real x[6], y[6], less_x[6], less_y[6], low[ONE(N)], up[ONE(N)], here[ONE(N)], there[ONE(N)];
+        for (int c = 0; c < 6; c++) {
+            less_x[c] = -(x[c] = X[c * N + j]);
+            less_y[c] = -(y[c] = Y[c * N + j]);
+        }
         for (int run = ancestor_start[j]; run < ancestor_start[j + 1]; run++) {
             const int first = ancestor_run[2 * run], last = ancestor_run[2 * run + 1];
-            for (int i = first; i < last; i++) {
-                real weight = W[i] * g[0] + W[N + i] * g[1] + W[2 * N + i] * g[2];
-                real px = weight, dy = weight;
-                for (int c = 0; c < 6; c++) {
-                    px += P[c * N + i] * x[c];
-                    dy -= D[c * N + i] * y[c];
-                }
-                low[i] = px;
-                up[i] = dy;
-            }
-            if (everything)
-                for (int i = first; i < last; i++) {
-                    real weight = W[i] * g[0] + W[N + i] * g[1] + W[2 * N + i] * g[2];
-                    real dx = weight, py = weight;
-                    for (int c = 0; c < 6; c++) {
-                        dx -= D[c * N + i] * x[c];
-                        py += P[c * N + i] * y[c];
-                    }
-                    here[i] = dx;
-                    there[i] = py;
-                }
+            pair_entries(W, G + j, P, x, first, last, low);
+            pair_entries(W, G + j, D, less_y, first, last, up);
             for (int i = first; i < last; i++) {
                 k->R1[j][i] = low[i];
                 k->R1[i][j] = up[i];
             }
-            if (everything)
-                for (int i = first; i < last; i++) {
-                    k->R0[j][i] = k->R0[i][j] = here[i];
-                    k->P1[j][i] = k->P1[i][j] = there[i];
-                    k->P0[i][j] = low[i];
-                    k->P0[j][i] = up[i];
-                }
+            if (!everything) continue;
+            pair_entries(W, G + j, D, less_x, first, last, here);
+            pair_entries(W, G + j, P, y, first, last, there);
+            for (int i = first; i < last; i++) {
+                k->R0[j][i] = k->R0[i][j] = here[i];
+                k->P1[j][i] = k->P1[i][j] = there[i];
+                k->P0[i][j] = low[i];
+                k->P0[j][i] = up[i];
+            }
         }
     }
     if (CLOSED)
@@ -201,12 +205,7 @@ static void linearise(Work *k, const Point *a, int everything) {
                 k->P1[j][i] *= k->row_scale[j];
                 k->P0[j][i] *= k->row_scale[j];
             }
-    for (int e = 0; e < NNZ_REST; e++) {
-        const int column = rest_col[e];
-        if (column < NT) k->R1[rest_row[e]][column] += k->rest[e];
-        else if (everything && column < NT + NQZ) k->R0[rest_row[e]][column - NT] += k->rest[e];
-        else if (everything) k->Ru[rest_row[e]][column - NT - NQZ] += k->rest[e];
-    }
+    split_columns(NNZ_REST, k->rest, rest_row, rest_col, &k->R1[0][0], everything ? &k->R0[0][0] : NULL, &k->Ru[0][0]);
     for (int e = 0; e < NNZ_CONSTRAINT; e++) k->R1[N + NZ + constraint_row[e]][constraint_col[e]] += k->by_unknown[e];
     for (int c = 0; c < M; c++)
         for (int i = 0; i < N; i++) k->R1[i][N + NZ + c] -= k->row_scale[i] * k->Phi[c][i];
@@ -220,12 +219,7 @@ static void linearise(Work *k, const Point *a, int everything) {
         k->P0[i][j] -= bent;
     }
     if (!everything) return;
-    for (int e = 0; e < NNZ_REST_P; e++) {
-        const int column = rest_p_col[e];
-        if (column < NT) k->P1[rest_p_row[e]][column] += k->rest_p[e];
-        else if (column < NT + NQZ) k->P0[rest_p_row[e]][column - NT] += k->rest_p[e];
-        else k->Pu[rest_p_row[e]][column - NT - NQZ] += k->rest_p[e];
-    }
+    split_columns(NNZ_REST_P, k->rest_p, rest_p_row, rest_p_col, &k->P1[0][0], &k->P0[0][0], &k->Pu[0][0]);
     for (int e = 0; MIDDLE && e < NNZ_MATRIX; e++) {
         const int i = matrix_col[e];
         k->P1[i][N + NZ + matrix_row[e]] -= k->row_scale[i] * k->right_nz[e];
@@ -554,7 +548,7 @@ typedef struct {
 } Feedback;
 
 /* What the entry points are asked about; feedback and directions may be NULL. The nominal torque (steps, NU), the path
- * (steps + 1, NC) and Newton's tolerance and limit matter to a rollout and, as those of one node, to a rest. */
+ * (steps + 1, NC) and Newton's tolerance and limit matter to a rollout. */
 typedef struct {
     int steps, limit;
     double time_step, tolerance;
@@ -627,14 +621,12 @@ static void theta_columns(const Motion *motion, const Point *a, int entry) {
 }
 
 /* Columns of one step, each (rows, d): of the state before (NX) and after, the input (NU) or NULL, the prescribed
- * coordinates after (NC) or NULL, multipliers and effort or NULL; then room for rows (NT), joined (NT), Y (NY), input
- * (NU) and start (NQZ). The last `loads` columns get more of the rows (NT, loads) and of p1 (N, loads). */
+ * coordinates after (NC) or NULL, multipliers and effort; then room for rows (NT), joined (NT), Y (NY), input (NU) and
+ * start (NQZ). */
 typedef struct {
     const real *before, *input, *path;
     real *after, *multipliers, *effort;
     real *rows, *joined, *Y, *input_room, *start;
-    int loads;
-    const real *load_rows, *load_p1;
 } Columns;
 
 /* Forward sensitivities of one converged step in d directions, for so many members. */
@@ -657,11 +649,6 @@ static void sensitivity_step(Work *k, const Point *a, int d, int members, const 
         add_sparse(dir->rows_nz, dir->rows_pattern, rows, d, entry);
         add_sparse(dir->p1_nz, dir->p1_pattern, p1, d, entry);
     }
-    const int loads = columns->loads, loaded = d - loads;
-    for (int r = 0; r < NT; r++)
-        for (int c = 0; c < loads; c++) rows[(size_t)r * d + loaded + c] += columns->load_rows[(size_t)r * loads + c];
-    for (int r = 0; r < N; r++)
-        for (int c = 0; c < loads; c++) p1[(size_t)r * d + loaded + c] += columns->load_p1[(size_t)r * loads + c];
     if (input)
         /* internal coordinates may follow an input too, as play behind a servo does */
         for (int r = 0; r < N + NZ; r++)
@@ -691,27 +678,24 @@ static void sensitivity_step(Work *k, const Point *a, int d, int members, const 
         memcpy(joined + (size_t)unknown_row[order[b]] * d, Y + (size_t)b * d, sizeof(real) * d);
     memcpy(X1, joined, sizeof(real) * N * d);
     memcpy(X1 + (size_t)2 * N * d, joined + (size_t)N * d, sizeof(real) * NZ * d);
-    if (columns->multipliers) memcpy(columns->multipliers, joined + (size_t)(N + NZ) * d, sizeof(real) * M * d);
+    memcpy(columns->multipliers, joined + (size_t)(N + NZ) * d, sizeof(real) * M * d);
     multiply_rows(&k->P0[0][0], ONE(NQZ), p1_old_start, p1_old_col, N, start, d, p1);
     multiply_rows(&k->P1[0][0], ONE(NT), p1_new_start, p1_new_col, N, joined, d, p1);
-    if (effort) {
-        memset(effort, 0, sizeof(real) * NC * d);
-        for (int entry = 0; entry < members; entry++) {
-            const Directions *dir = motion[entry].directions;
-            if (dir && dir->theta_count) add_sparse(dir->effort_nz, dir->effort_pattern, effort, d, entry);
-        }
-        for (int j = 0; j < NC; j++) {
-            const int at = prescribed_index[j];
-            real *target = effort + (size_t)j * d;
-            for (int c = 0; c < d; c++) {
-                real sum = X0[(size_t)(N + at) * d + c];
-                for (int i = 0; i < NQZ; i++) sum += k->R0[at][i] * start[(size_t)i * d + c];
-                for (int i = 0; i < NT; i++) sum += k->R1[at][i] * joined[(size_t)i * d + c];
-                if (input)
-                    for (int i = 0; i < NU; i++) sum += k->Ru[at][i] * input[(size_t)i * d + c];
-                if (c >= loaded) sum += columns->load_rows[(size_t)at * loads + c - loaded];
-                target[c] -= sum / k->h;
-            }
+    memset(effort, 0, sizeof(real) * NC * d);
+    for (int entry = 0; entry < members; entry++) {
+        const Directions *dir = motion[entry].directions;
+        if (dir && dir->theta_count) add_sparse(dir->effort_nz, dir->effort_pattern, effort, d, entry);
+    }
+    for (int j = 0; j < NC; j++) {
+        const int at = prescribed_index[j];
+        real *target = effort + (size_t)j * d;
+        for (int c = 0; c < d; c++) {
+            real sum = X0[(size_t)(N + at) * d + c];
+            for (int i = 0; i < NQZ; i++) sum += k->R0[at][i] * start[(size_t)i * d + c];
+            for (int i = 0; i < NT; i++) sum += k->R1[at][i] * joined[(size_t)i * d + c];
+            if (input)
+                for (int i = 0; i < NU; i++) sum += k->Ru[at][i] * input[(size_t)i * d + c];
+            target[c] -= sum / k->h;
         }
     }
 }
@@ -1005,14 +989,19 @@ typedef struct {
     double q1[ONE(N)], z1[ONE(NZ)], lam[ONE(M)], none[ONE(NU)];
 } Ends;
 
-/* One step of a trajectory that is given. */
-static Point recorded_step(const Motion *motion, const Trajectory *along, int step, Ends *ends) {
+/* One step of a trajectory that is given, and what pulls at its first node; with `whole` its rows and p1 as well. */
+static Point recorded_step(Work *k, const Motion *motion, const Trajectory *along, int step, Ends *ends, int whole) {
     const double *x = along->state + (size_t)step * NX, *next = x + NX;
     const double *u = NU ? along->applied + (size_t)step * NU : ends->none;
     memcpy(ends->q1, next, sizeof(double) * N);
     memcpy(ends->z1, next + 2 * N, sizeof(double) * NZ);
     memcpy(ends->lam, along->multipliers + (size_t)step * M, sizeof(double) * M);
     const Point a = {x, x + N, x + 2 * N, u, motion->theta, &motion->time_step, ends->q1, ends->z1, ends->lam};
+    constraint_matrix(k, &a);
+    if (whole) {
+        evaluate(k, &a);
+        finish(k, &a);
+    }
     return a;
 }
 
@@ -1031,12 +1020,7 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
     memcpy(costate, by->state + (size_t)steps * NX, sizeof(double) * NX);
     int status = OK, step = steps - 1;
     for (; step >= 0; step--) {
-        const Point a = recorded_step(motion, rollout, step, &ends);
-        constraint_matrix(k, &a);
-        if (MIDDLE) {
-            evaluate(k, &a);
-            finish(k, &a);
-        }
+        const Point a = recorded_step(k, motion, rollout, step, &ends, MIDDLE);
         linearise(k, &a, 1);
         if (NY && !factorise(k, EVERY, EVERY)) {
             status = SINGULAR;
@@ -1109,10 +1093,7 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
     prepare(k, motion->theta, &motion->time_step);
     Ends ends = {0};
     for (int step = 0; step < motion->steps; step++) {
-        const Point a = recorded_step(motion, along, step, &ends);
-        constraint_matrix(k, &a);
-        evaluate(k, &a);
-        finish(k, &a);
+        const Point a = recorded_step(k, motion, along, step, &ends, 1);
         double *r = out->rows + (size_t)step * NT;
         memcpy(r, k->balance, sizeof(double) * N);
         memcpy(r + N, k->internal, sizeof(double) * NZ);
@@ -1137,213 +1118,5 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
     }
     work_free(k);
     return OK;
-}
-
-/* State (steps, NX, d) and effort (steps, NC, d) after single steps of a finished rollout by the state before, the torque
- * and further loads, d = NX + NU + loads columns; the loads add to the rows (NT, loads) and to p1 (N, loads) of every step
- * alike. A status. */
-int yid_slopes(const Motion *motion, const Trajectory *along, int loads, const double *load_rows, const double *load_p1,
-               double *state, double *effort, Outcome *outcome) {
-    const size_t d = NX + NU + (size_t)loads;
-    Work *k = work_new(d * (2 * ONE(NT) + ONE(NY) + ONE(NU) + ONE(NQZ) + ONE(NX)) + BLOCK, outcome);
-    if (!k) return OUT_OF_MEMORY;
-    prepare(k, motion->theta, &motion->time_step);
-    double *before = k->room, *input = before + d * ONE(NX);
-    Columns columns = {.before = before, .input = NU ? input : NULL, .loads = loads};
-    columns.load_rows = load_rows;
-    columns.load_p1 = load_p1;
-    columns.rows = input + d * ONE(NU);
-    columns.joined = columns.rows + d * ONE(NT);
-    columns.Y = columns.joined + d * ONE(NT);
-    columns.start = columns.Y + d * ONE(NY);
-    for (int i = 0; i < NX; i++) before[i * d + i] = 1.0;
-    for (int i = 0; i < NU; i++) input[i * d + NX + i] = 1.0;
-    Ends ends = {0};
-    int status = OK, step = 0;
-    for (; step < motion->steps; step++) {
-        const Point a = recorded_step(motion, along, step, &ends);
-        constraint_matrix(k, &a);
-        evaluate(k, &a);
-        finish(k, &a);
-        linearise(k, &a, 1);
-        if (NY && !factorise(k, EVERY, EVERY)) {
-            status = SINGULAR;
-            break;
-        }
-        columns.after = state + (size_t)step * NX * d;
-        columns.effort = effort + (size_t)step * NC * d;
-        sensitivity_step(k, &a, (int)d, 1, motion, &columns);
-    }
-    outcome->step = step;
-    work_free(k);
-    return status;
-}
-
-/* What a rest works on: its equations are those of a step from q to q, with p such that it comes out again. */
-typedef struct {
-    double x[ONE(NX)], q[ONE(N)], z[ONE(NZ)], lam[ONE(M)], u[ONE(NU)];
-    double inner[ONE(NZ)], slopes_nz[ONE(NNZ_RESTING)], full[ONE(NT)][ONE(NT)];
-    int pivot[ONE(NY)];
-} Resting;
-
-/* Put unknowns (free coordinates, internal ones, forces of the constraints) in their places; a point of the step. */
-static Point rest_point(const Work *k, Resting *s, const Motion *motion, const double *w) {
-    for (int i = 0; i < NF; i++) s->q[free_index[i]] = w[i];
-    for (int i = 0; i < NC; i++) s->q[prescribed_index[i]] = motion->path[i];
-    for (int i = 0; i < NZ; i++) s->z[i] = w[NF + i];
-    for (int i = 0; i < M; i++) s->lam[i] = k->h * w[NF + NZ + i];
-    memcpy(s->x, s->q, sizeof(double) * N);
-    memset(s->x + N, 0, sizeof(double) * N);
-    if (NU) {
-        memcpy(s->u, motion->torque, sizeof(double) * NU);
-        const Feedback *f = motion->feedback;
-        if (f) apply_feedback(f->count, f->index, f->gain, f->reference, s->x, motion->torque, s->u);
-    }
-    const Point a = {s->x, s->x + N, s->z, s->u, motion->theta, &motion->time_step, s->q, s->z, s->lam};
-    return a;
-}
-
-/* Imbalance of the free coordinates [N m], internal equations at rest, constraints; returns the largest, or NaN. */
-static double rest_rows(Work *k, Resting *s, const Point *a, double *r) {
-    const double *args[9];
-    double *res[2] = {s->inner, s->slopes_nz};
-    double largest = 0;
-    constraint_matrix(k, a);
-    evaluate(k, a);
-    finish(k, a);
-    for (int i = 0; i < NF; i++) r[i] = (k->balance[free_index[i]] + k->p1[free_index[i]]) / k->h;
-    for (int i = 0; i < M; i++) r[NF + NZ + i] = k->constraint[i];
-    if (NZ) {
-        arguments(a, args);
-        resting(args, res, k->iw, k->w, 0);
-        memcpy(r + NF, s->inner, sizeof(double) * NZ);
-    }
-    for (int i = 0; i < NY; i++) {
-        if (!isfinite(r[i])) return NAN;
-        largest = fmax(largest, fabs(r[i]));
-    }
-    return largest;
-}
-
-/* Slopes of `rest_rows` at the point of its last call, into k->factors.A. */
-static void rest_slopes(Work *k, Resting *s, const Point *a, const Feedback *hold) {
-    linearise(k, a, 1);
-    for (int i = 0; i < NT; i++) {
-        double *row = s->full[i];
-        const int inner = i >= N && i < N + NZ;
-        memset(row, 0, sizeof(double) * NT);
-        if (inner) continue;
-        for (int j = 0; j < NT; j++) row[j] = k->R1[i][j];
-        for (int j = 0; j < NQZ; j++) row[j] += k->R0[i][j];
-        if (i < N) {
-            for (int j = 0; j < NT; j++) row[j] += k->P1[i][j];
-            for (int j = 0; j < NQZ; j++) row[j] += k->P0[i][j];
-            for (int v = 0; hold && v < NU; v++)
-                for (int c = 0; c < hold->count; c++)
-                    row[hold->index[c]] -= (k->Ru[i][v] + k->Pu[i][v]) * hold->gain[v * hold->count + c];
-            for (int j = 0; j < NQZ; j++) row[j] /= k->h;
-        } else
-            for (int j = NQZ; j < NT; j++) row[j] *= k->h;
-    }
-    for (int e = 0; e < NNZ_RESTING; e++) {
-        double *row = s->full[N + resting_row[e]];
-        const int column = resting_col[e], input = column - NT;
-        if (column < NT) row[column] += s->slopes_nz[e] * (column < NQZ ? 1.0 : k->h);
-        for (int c = 0; hold && input >= 0 && c < hold->count; c++)
-            row[hold->index[c]] -= s->slopes_nz[e] * hold->gain[input * hold->count + c];
-    }
-    for (int b = 0; b < NY; b++)
-        for (int c = 0; c < NY; c++) k->factors.A[b][c] = s->full[unknown_row[b]][unknown_row[c]];
-}
-
-/* LU of k->factors.A with partial pivoting: forces of constraints have no diagonal, and an equilibrium may be unstable. */
-static int factorise_pivoted(Work *k, int *pivot) {
-    for (int p = 0; p < NY; p++) {
-        int best = p;
-        for (int i = p + 1; i < NY; i++)
-            if (fabs(k->factors.A[i][p]) > fabs(k->factors.A[best][p])) best = i;
-        pivot[p] = best;
-        if (!(fabs(k->factors.A[best][p]) > 0) || !isfinite(k->factors.A[best][p])) return SINGULAR;
-        for (int c = 0; best != p && c < NY; c++) {
-            const double kept = k->factors.A[p][c];
-            k->factors.A[p][c] = k->factors.A[best][c];
-            k->factors.A[best][c] = kept;
-        }
-        const double inverse = k->factors.inverse[p] = 1.0 / k->factors.A[p][p];
-        const double *source = k->factors.A[p];
-        for (int i = p + 1; i < NY; i++) {
-            double *target = k->factors.A[i];
-            const double factor = target[p] *= inverse;
-            if (factor == 0.0) continue;
-            SIMD
-            for (int c = p + 1; c < NY; c++) target[c] -= factor * source[c];
-        }
-    }
-    return OK;
-}
-
-/* x = -A^-1 b; the largest of x in parts of max(|w|, 1), or NaN. */
-static double rest_change(const Work *k, const int *pivot, const double *b, const double *w, double *x) {
-    double size = 0;
-    for (int i = 0; i < NY; i++) x[i] = -b[i];
-    for (int p = 0; p < NY; p++) {
-        const double value = x[pivot[p]];
-        x[pivot[p]] = x[p];
-        x[p] = value;
-    }
-    for (int p = 0; p < NY; p++)
-        for (int i = p + 1; i < NY; i++) x[i] -= k->factors.A[i][p] * x[p];
-    for (int p = NY - 1; p >= 0; p--) {
-        double sum = x[p];
-        for (int c = p + 1; c < NY; c++) sum -= k->factors.A[p][c] * x[c];
-        x[p] = sum * k->factors.inverse[p];
-    }
-    for (int i = 0; i < NY; i++) {
-        if (!isfinite(x[i])) return NAN;
-        size = fmax(size, fabs(x[i]) / fmax(fabs(w[i]), 1.0));
-    }
-    return size;
-}
-
-static int rest_search(Work *k, Resting *s, const Motion *motion, double *w, double *error) {
-    const double tolerance = motion->tolerance;
-    double r[ONE(NY)], delta[ONE(NY)], trial[ONE(NY)], further[ONE(NY)];
-    Point a = rest_point(k, s, motion, w);
-    *error = rest_rows(k, s, &a, r);
-    for (int it = 0; it < motion->limit; it++) {
-        if (isnan(*error)) return NOT_FINITE;
-        if (*error <= tolerance) return OK;
-        k->iterations++;
-        rest_slopes(k, s, &a, motion->feedback);
-        if (factorise_pivoted(k, s->pivot)) return SINGULAR;
-        const double size = rest_change(k, s->pivot, r, w, delta);
-        if (isnan(size)) return NOT_FINITE;
-        for (double factor = fmin(1.0, 0.3 / size);; factor *= 0.5) {
-            if (factor < 1e-6) return *error < 1e2 * tolerance ? OK : NOT_CONVERGED;
-            for (int i = 0; i < NY; i++) trial[i] = w[i] + factor * delta[i];
-            a = rest_point(k, s, motion, trial);
-            const double left = rest_rows(k, s, &a, r);
-            if (isnan(left)) continue;
-            const double enough = 1.0 - factor / 4;
-            if (left > enough * *error && !(rest_change(k, s->pivot, r, w, further) <= enough * size)) continue;
-            *error = left;
-            break;
-        }
-        memcpy(w, trial, sizeof trial);
-    }
-    return *error <= tolerance ? OK : NOT_CONVERGED;
-}
-
-/* Search a static equilibrium from the unknowns w, which are overwritten, where prescribed coordinates are at the path's
- * first node, and torques follow the first step's feedback; a status. Newton with step control: the natural monotonicity
- * test (Deuflhard 2011, section 3.3) or a smaller residual. */
-int yid_rest(const Motion *motion, double *w, Outcome *outcome) {
-    Work *k = work_new((sizeof(Resting) + sizeof(double) - 1) / sizeof(double), outcome);
-    if (!k) return OUT_OF_MEMORY;
-    prepare(k, motion->theta, &motion->time_step);
-    const int status = rest_search(k, (Resting *)k->room, motion, w, &outcome->error);
-    outcome->iterations = k->iterations;
-    work_free(k);
-    return status;
 }
 #endif

@@ -224,11 +224,29 @@ def linearized_steps(
 def _chunk(
     step: Step, theta: Array, rollout: Rollout, loads: AdditionalLoadDerivatives, span: slice
 ) -> list[LinearizedStep]:
-    nx, nu = step.sizes["nx"], step.sizes["nu"]
-    state = rollout.state[span.start : span.stop + 1]
-    along = (theta, state, rollout.multipliers[span], rollout.torque[span])
-    after, effort = step.kernel.state_transition_jacobians(*along, loads.residual, loads.next_momentum)
-    parts = (slice(0, nx), slice(nx, nx + nu), slice(nx + nu, after.shape[2]))
+    """Some steps by the implicit function theorem; `numpy.linalg.LinAlgError` where their equations are singular."""
+    n, nz, nx, nu = (step.sizes[key] for key in ("n", "nz", "nx", "nu"))
+    system, state = step.system, rollout.state[span.start : span.stop + 1]
+    free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
+    found = step.kernel.linearize(theta, state, rollout.multipliers[span], rollout.torque[span], (), True)
+    loaded, count = loads.residual.shape[1], len(found.p1)
+    top, bottom = (np.zeros((count, rows, nx + nu + loaded)) for rows in (found.residual.shape[1], n))
+    for target, old, push, load in (
+        (top, found.residual_by_old, found.residual_by_input, loads.residual),
+        (bottom, found.p1_by_old, found.p1_by_input, loads.next_momentum),
+    ):
+        target[:, :, :n], target[:, :, 2 * n : nx] = old[:, :, :n], old[:, :, n:]
+        target[:, :, nx : nx + nu], target[:, :, nx + nu :] = push, load
+    top[:, np.arange(n), n + np.arange(n)] += 1.0
+    solved = step.model.index_tables.unknown_rows
+    moved = -np.linalg.solve(found.residual_by_new[:, solved[:, None], solved], top[:, solved])
+    after = np.zeros((count, nx, top.shape[2]))
+    after[:, free] = moved[:, : len(free)]
+    after[:, n : 2 * n] = bottom + found.p1_by_new[:, :, solved] @ moved
+    after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
+    effort = top[:, fixed] + found.residual_by_new[:, np.array(fixed, int)[:, None], solved] @ moved
+    effort /= -step.equation_time_step(theta)
+    parts = (slice(0, nx), slice(nx, nx + nu), slice(nx + nu, None))
     return [
         LinearizedStep(*(a[:, part] for part in parts), *(e[:, part] for part in parts))
         for a, e in zip(after, effort, strict=True)

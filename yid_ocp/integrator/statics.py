@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,6 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.integrator.codegen import nonzero_indices
 from yid_ocp.integrator.discrete import EquilibriumEquations, equilibrium_equations
-from yid_ocp.integrator.interpreted import damped_newton
 from yid_ocp.integrator.step import Step, checked_float_array
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
@@ -60,6 +60,7 @@ _HOLD_STIFFNESS_WITH_TORQUE = 1e3
 # derivatives by the command are those by the posture over it.
 _HOLD_STIFFNESS_WITH_COMMAND = 1e-9
 
+_NEWTON_ITERATION_LIMIT = 100
 _REST_TOLERANCE = 1e-10  # imbalance [N m] and constraint violation [m] up to which all is at rest
 _ENERGY_ITERATION_LIMIT = 300  # of the search for the lowest energy
 _MIN_RECIPROCAL_CONDITION = 1e-14  # reciprocal of the condition beyond which equations have no solution of their own
@@ -77,6 +78,8 @@ class EquilibriumSolver:
         system, e = step.system, step.equations
         self.known_coordinates = (*system.driven_coordinate_indices, *system.prescribed_coordinate_indices)
         self.free_coordinates = system.unprescribed_coordinate_indices
+        rows = system.n_coordinates + e.z0.numel() + e.lam.numel()
+        self._sought = [*self.free_coordinates, *range(system.n_coordinates, rows)]
         self._equations = CasadiLockedCache[None, EquilibriumEquations](lambda _: equilibrium_equations(e))
         self._inner_slopes: CasadiLockedCache[None, ca.Function] = CasadiLockedCache(
             lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_residual_at_rest, e.theta)])
@@ -123,12 +126,15 @@ class EquilibriumSolver:
         nu, nz = step.sizes["nu"], step.sizes["nz"]
         held = np.zeros(nu) if torque is None else checked_float_array("torque", torque, (nu,))
         hold = _Hold(given, held, stiffness)
-        count = len(self.free_coordinates) + nz
+        count, h = len(self.free_coordinates) + nz, step.equation_time_step(theta)
+
+        def equations(w: Array) -> tuple[Array, Array]:
+            (value, by_point, *_), _ = self._rest_equations(w, theta, hold, h)
+            return value[self._sought], by_point[np.ix_(self._sought, self._sought)]
+
         best: tuple[bool, float, float, Array] | None = None
         for start in self._guesses(given, guess):
-            w, error, converged = step.kernel.find_static_equilibrium(
-                theta, start, given, held, stiffness, _REST_TOLERANCE
-            )
+            w, error, converged = _damped_newton(equations, start, _REST_TOLERANCE)
             inner = w[count - nz : count]
             energy = float(self._energy(ca.DM(self._configuration(w, given)), inner, hold, theta))
             found = (not converged, energy if converged else error, error, w)
@@ -144,7 +150,7 @@ class EquilibriumSolver:
                 return self.solve(posture, theta, torque, lowest, names)
         q = self._configuration(w, given)
         give = hold.give(q, system)
-        state, by_theta, by_posture = self._differentiate(w, q, theta, hold, tuple(names))
+        state, by_theta, by_posture = self._differentiate(w, theta, hold, h, tuple(names))
         message = self._explain(state, theta, error) if failed else "at rest"
         by_itself = bool(system.servos) and torque is not None
         if not failed and not by_itself and np.max(np.abs(give), initial=0.0) > _MAX_HOLD_DEFLECTION:
@@ -227,23 +233,21 @@ class EquilibriumSolver:
                 return self._configuration(found, given)
         return None
 
-    def _differentiate(
-        self, w: Array, q: Array, theta: Array, hold: _Hold, names: tuple[str, ...]
-    ) -> tuple[Array, Array, Array]:
-        """State (q, p, z) at rest, and its derivatives by named parameters and by the known coordinates.
+    def _rest_equations(
+        self, w: Array, theta: Array, hold: _Hold, h: float, names: tuple[str, ...] = ()
+    ) -> tuple[list[Array], list[Array]]:
+        """Equations of rest at unknowns `w`, as in `EquilibriumEquations`, and the momentum of a step that rests.
 
-        At rest the equations are those of a step from a configuration to itself, with p such that it comes out again.
+        Each with its derivatives by (q, z, forces of constraints), by torques and by named parameters. At rest the
+        equations are those of a step from a configuration to itself, with p such that it comes out again.
         """
-        step = self.step
+        step, system, free = self.step, self.step.system, len(self.free_coordinates)
         n, nz, m, nu = (step.sizes[key] for key in ("n", "nz", "m", "nu"))
-        free, system = len(self.free_coordinates), step.system
-        driven, fixed = list(system.driven_coordinate_indices), list(system.prescribed_coordinate_indices)
-        z, u = w[free : free + nz], hold.held + hold.stiffness * hold.give(q, step.system)
-        none = np.zeros(n)
-        h = float(step.functions.row_scale_and_time_step(q, q, none, z, z, np.zeros(m), u, theta, step.time_step)[1])
-        lam = h * w[free + nz :]
-        before = np.concatenate([q, none, z])
-        found = step.kernel.linearize(theta, np.stack([before, before]), lam[None], u[None], names, True)
+        q, z, lam = self._configuration(w, hold.given), w[free : free + nz], h * w[free + nz :]
+        none, u = np.zeros(n), hold.held + hold.stiffness * hold.give(q, system)
+        driven = list(system.driven_coordinate_indices)
+        state = np.tile(np.concatenate([q, none, z]), (2, 1))
+        found = step.kernel.linearize(theta, state, lam[None], u[None], names, True)
 
         def by_point(new: Array, old: Array, push: Array) -> Array:
             """By (q, z, lam), both nodes together and torques as they follow the angles."""
@@ -252,36 +256,44 @@ class EquilibriumSolver:
             whole[:, driven] -= hold.stiffness * push[0]
             return whole
 
-        rows = by_point(found.residual_by_new, found.residual_by_old, found.residual_by_input)
-        p = by_point(found.p1_by_new, found.p1_by_old, found.p1_by_input)
-        push, push_p = found.residual_by_input[0].copy(), found.p1_by_input[0]
-        others, others_p = found.residual_by_theta[0].copy(), found.p1_by_theta[0]
-        rows[:n] += p
-        push[:n] += push_p
-        others[:n] += others_p
+        by_rows = by_point(found.residual_by_new, found.residual_by_old, found.residual_by_input)
+        by_p = by_point(found.p1_by_new, found.p1_by_old, found.p1_by_input)
+        rows = [found.residual[0], by_rows, found.residual_by_input[0], found.residual_by_theta[0]]
+        momentum = [found.p1[0], by_p, found.p1_by_input[0], found.p1_by_theta[0]]
+        for part, of_p in zip(rows, momentum, strict=True):
+            part[:n] += of_p
         if nz:
-            inner = slice(n, n + nz)
-            at = (q, q, none, z, z, lam, u, theta, step.time_step)
+            inner, at = slice(n, n + nz), (q, q, none, z, z, lam, u, theta, step.time_step)
+            residual, nonzeros = (np.array(x).ravel() for x in step.functions.internal_residual_at_rest(*at))
             slopes = np.zeros((nz, n + nz + m + nu))
-            row, column = nonzero_indices(step.functions.sparsity_patterns["resting"])
-            slopes[row, column] = np.array(step.functions.internal_residual_at_rest(*at)[1]).ravel()
-            rows[inner], push[inner] = slopes[:, : n + nz + m], slopes[:, n + nz + m :]
-            rows[inner, driven] -= hold.stiffness * push[inner]
-            chosen = [system.parameters.index(name) for name in names]
-            others[inner] = np.array(ca.densify(self._inner_slopes(None)(*at)))[:, chosen]
-        rows[:n] /= h
-        push[:n] /= h
-        others[:n] /= h
-        rows[:, n + nz :] *= h
-        p[:, n + nz :] *= h
-        sought = [*self.free_coordinates, *range(n, n + nz + m)]
-        by_other = np.hstack([others, hold.stiffness * push, rows[:, fixed]])[sought]
-        change = -_solved(rows[np.ix_(sought, sought)], by_other)
-        state = np.concatenate([q, found.p1[0], z])
+            slopes[nonzero_indices(step.functions.sparsity_patterns["resting"])] = nonzeros
+            rows[0][inner], by_rows[inner], rows[2][inner] = residual, slopes[:, : n + nz + m], slopes[:, n + nz + m :]
+            by_rows[inner, driven] -= hold.stiffness * rows[2][inner]
+            if names:
+                chosen = [system.parameters.index(name) for name in names]
+                rows[3][inner] = np.array(ca.densify(self._inner_slopes(None)(*at)))[:, chosen]
+        for part in rows:
+            part[:n] /= h
+        for slopes in (by_rows, by_p):
+            slopes[:, n + nz :] *= h
+        return rows, momentum
+
+    def _differentiate(
+        self, w: Array, theta: Array, hold: _Hold, h: float, names: tuple[str, ...]
+    ) -> tuple[Array, Array, Array]:
+        """State (q, p, z) at rest, and its derivatives by named parameters and by the known coordinates."""
+        n, nz, nu = (self.step.sizes[key] for key in ("n", "nz", "nu"))
+        free, fixed = len(self.free_coordinates), list(self.step.system.prescribed_coordinate_indices)
+        (_, rows, push, others), (p, by_p, push_p, others_p) = self._rest_equations(w, theta, hold, h, names)
+        by_other = np.hstack([others, hold.stiffness * push, rows[:, fixed]])[self._sought]
+        change = -_solved(rows[np.ix_(self._sought, self._sought)], by_other)
+        state = np.concatenate([self._configuration(w, hold.given), p, w[free : free + nz]])
         total = np.zeros((len(state), by_other.shape[1]))
         total[list(self.free_coordinates)] = change[:free]
         total[fixed, len(names) + nu + np.arange(len(fixed))] = 1.0
-        total[n : 2 * n] = p[:, sought] @ change + np.hstack([others_p, hold.stiffness * push_p, p[:, fixed]])
+        total[n : 2 * n] = by_p[:, self._sought] @ change + np.hstack(
+            [others_p, hold.stiffness * push_p, by_p[:, fixed]]
+        )
         total[2 * n :] = change[free : free + nz]
         return state, total[:, : len(names)], total[:, len(names) :]
 
@@ -327,6 +339,45 @@ class _Hold:
         return self.given[: len(self.held)] - q[list(system.driven_coordinate_indices)]
 
 
+def _damped_newton(
+    function: Callable[[Array], tuple[Array, Array]], w: Array, tolerance: float
+) -> tuple[Array, float, bool]:
+    """Root, largest residual there and whether that is up to the tolerance, of a function with its Jacobian.
+
+    Newton's iteration, damped until it meets the natural monotonicity test (Deuflhard 2011, section 3.3) or reduces the
+    residual.
+    """
+    if len(w) == 0:
+        return w, 0.0, True
+    residual, jacobian = function(w)
+    error = float(np.max(np.abs(residual)))
+    for _ in range(_NEWTON_ITERATION_LIMIT):
+        if error <= tolerance or not math.isfinite(error):
+            break
+        factors, pivots, singular = scipy.linalg.lapack.dgetrf(jacobian)
+        if singular:
+            return w, error, False
+        delta = -scipy.linalg.lapack.dgetrs(factors, pivots, residual)[0]
+        scale = np.maximum(np.abs(w), 1.0)
+        size = float(np.max(np.abs(delta / scale)))
+        if not math.isfinite(size):
+            return w, error, False
+        factor = min(1.0, 0.3 / size) if size else 1.0
+        while True:
+            trial = w + factor * delta
+            left, slopes = function(trial)
+            if np.all(np.isfinite(left)):
+                shrunk = float(np.max(np.abs(scipy.linalg.lapack.dgetrs(factors, pivots, left)[0]) / scale))
+                if shrunk <= (1 - factor / 4) * size or np.max(np.abs(left)) <= (1 - factor / 4) * error:
+                    break
+            factor *= 0.5
+            if factor < 1e-6:
+                return w, error, error < 1e2 * tolerance
+        w, residual, jacobian = trial, left, slopes
+        error = float(np.max(np.abs(residual)))
+    return w, error, error <= tolerance
+
+
 def _solved(matrix: Array, right: Array) -> Array:
     """The solution; of least squares where redundant grasps leave forces open."""
     if not right.size:
@@ -351,4 +402,9 @@ def relaxed_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> 
         residual = ca.substitute(e.internal_residual_at_rest, old, still)
         function = ca.Function("relaxed", [z, at, e.theta, e.time_step], [residual, ca.jacobian(residual, z)])
     arguments = (np.asarray(q, float), np.asarray(theta, float), step.time_step)
-    return damped_newton(lambda x: function(x, *arguments), np.zeros(nz), 1e-12)[0]
+
+    def equations(x: Array) -> tuple[Array, Array]:
+        value, slope = function(x, *arguments)
+        return np.array(value).ravel(), np.array(ca.densify(slope))
+
+    return _damped_newton(equations, np.zeros(nz), 1e-12)[0]

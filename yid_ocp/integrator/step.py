@@ -50,6 +50,12 @@ class Step(ReprMixin):
         """Time step h [s]."""
         return self.model.time_step
 
+    def equation_time_step(self, theta: Array) -> float:
+        """Time step in the equations at a theta [s]: the recorded one times `System.recorded_time_scale`."""
+        s = self.sizes
+        none = [np.zeros(s[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
+        return float(self.functions.row_scale_and_time_step(*none, theta, self.time_step)[1])
+
     @property
     def force_split(self) -> ForceSplit:
         """Distribution of the force of a step between its ends, `symmetric` or `left`."""

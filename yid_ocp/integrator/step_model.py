@@ -19,8 +19,6 @@ from yid_ocp.model.system import System
 
 NEWTON_ITERATION_LIMIT = 60
 """Newton iterations of one step before it is given up."""
-EQUILIBRIUM_ITERATION_LIMIT = 100
-"""Newton iterations of a static equilibrium before it is given up."""
 
 # Newton stops when a correction of the coordinates is below TOLERANCE [rad or m], with short time steps below
 # RATE_TOLERANCE times the step: what is left undone is momentum lost in every step, mass times correction over step.

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.nlp_stage import NlpStage, nlp_stage
+from yid_ocp.integrator.discrete import NlpStage, nlp_stage
 from yid_ocp.integrator.statics import holding_spring_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episodes import Episode
