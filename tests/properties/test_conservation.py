@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
 from yid_ocp.model.kinematics import mass_matrix
-from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.urdf import read_urdf
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -41,15 +40,12 @@ def cases(urdf_folder):
     def read(name, **options):
         return System.build(read_urdf(urdf_folder / f"{name}.urdf"), **options)
 
-    arm = [f"left_{joint}" for joint in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")]
     cable = flexible_object([Segment("C", 0.6, 0.3, 0.02, links=3, bend=2.0, twist=1.0)])
     return {
         "mixed_joints": case(read("mixed_joints"), 2e-3),
         "turntable": case(read("turntable"), 5e-3),
         "double_pendulum": case(read("double_pendulum"), 2e-3),
-        "arm": case(System.build(read_urdf("package:baxter", joints=arm)), 5e-3),
         "cable": case(System.build(objects=[(cable, None, None)]), 1e-3),
-        "foam_y": case(System.build(objects=[(foam_y_object(), None, None)]), 1e-3),
     }
 
 
@@ -64,7 +60,7 @@ def test_angular_momentum_about_a_free_axis(cases, roll, momentum, seed):
     assert np.ptp(rollout.state[:, table.n + 1]) > 1e-3
 
 
-@pytest.mark.parametrize("name", ["mixed_joints", "turntable", "arm", "cable", "foam_y"])
+@pytest.mark.parametrize("name", ["mixed_joints", "turntable", "cable"])
 @given(seed=SEEDS)
 def test_reversible(cases, momentum, name, seed):
     """With F = 0 the step is its own inverse after the momenta are turned round."""
@@ -80,7 +76,7 @@ def test_reversible(cases, momentum, name, seed):
     np.testing.assert_allclose(-p2, p0, rtol=0, atol=1e-9 * max(1.0, np.max(np.abs(p0))))
 
 
-@pytest.mark.parametrize("name", ["mixed_joints", "turntable", "double_pendulum", "arm", "cable", "foam_y"])
+@pytest.mark.parametrize("name", ["mixed_joints", "double_pendulum", "cable"])
 @given(seed=SEEDS)
 def test_symplectic(cases, momentum, name, seed):
     one = cases[name]
@@ -108,15 +104,3 @@ def test_energy_shows_no_drift_over_a_hundred_thousand_steps(cases, roll, moment
     assert 0 < np.max(error) < 1e-4  # [J], of about two that swing to and fro
     assert np.max(error[-tenth:]) < 1.5 * np.max(error[:tenth])
     assert abs(np.mean(values[-tenth:]) - np.mean(values[:tenth])) < 0.1 * np.max(error)
-
-
-@pytest.mark.parametrize("name", ["single", "dual"])
-def test_constraints_do_not_drift(golden, theta_golden, paper_systems, single_step, dual_step, roll, violation, name):
-    """Along the golden torques; with the other force split the motion, unstable as it is, soon becomes another one."""
-    trep, theta = golden(name), theta_golden(name)
-    left = {"single": single_step, "dual": dual_step}[name]
-    for step, steps in ((left, 300), (compile_step(paper_systems[name], 0.01), 100)):
-        rollout = roll(step, theta, trep.q[0], trep.p[0], steps, torque=trep.u[:steps])
-        assert rollout.status.is_converged, rollout.status.message
-        worst = max(np.max(np.abs(violation(step, x[: trep.q.shape[1]], theta))) for x in rollout.state[1::7])
-        assert worst < 1e-10
