@@ -12,7 +12,6 @@ import scipy.stats
 from made_series import samples, series
 
 from yid_ocp.inference.null_test import (
-    ExcessResidualCriteria,
     NullTestResult,
     channel_noise_levels,
     residuals_exceed_noise,
@@ -75,12 +74,6 @@ def test_more_than_noise_is_sure_among_all_tests_and_worth_a_word(tests, said):
     assert residuals_exceed_noise(made) is said
 
 
-def test_the_limits_of_the_gap_are_those_given():
-    found = [NullTestResult(1.5, 10.0, 0.02, {}, {}, ())]
-    assert residuals_exceed_noise(found, ExcessResidualCriteria(significance_level=0.05))
-    assert not residuals_exceed_noise(found, ExcessResidualCriteria(significance_level=0.05, min_excess_chi2=0.5))
-
-
 # -- beside what else has moved it ------------------------------------------------------------------------------------
 
 
@@ -101,22 +94,6 @@ def test_a_column_that_overflowed_says_nothing():
     spread = np.array([[2.0, math.inf], [0.0, 1.0]])
     np.testing.assert_allclose(whiten_with_extra_errors(np.array([3.0, 5.0]), spread), [3.0 / math.sqrt(5.0), 5.0])
     np.testing.assert_array_equal(whiten_with_extra_errors(np.array([3.0]), np.array([[math.nan]])), [3.0])
-
-
-def test_predictions_by_what_was_estimated_are_noise_in_units_of_their_own():
-    """Straight lines through a few points, and points far beyond them: the plain residual is twenty times noise."""
-    rng, near, far = np.random.default_rng(1), np.linspace(0.0, 1.0, 12), np.linspace(4.0, 6.0, 40)
-    fitted, held = (np.column_stack([np.ones_like(t), t]) for t in (near, far))
-    factor = np.linalg.cholesky(np.linalg.inv(fitted.T @ fitted))
-    plain, judged = [], []
-    for _ in range(400):
-        line = np.linalg.lstsq(fitted, rng.standard_normal(len(near)), rcond=None)[0]
-        residual = held @ line - rng.standard_normal(len(far))
-        plain.append(run_null_test([series(range(40))], residual, 0).p_value)
-        judged.append(run_null_test([series(range(40))], whiten_with_extra_errors(residual, held @ factor), 0).p_value)
-    assert np.mean(np.array(plain) < 0.01) > 0.5
-    assert 0.001 < np.mean(np.array(judged) < 0.01) < 0.03
-    assert 0.4 < np.median(judged) < 0.6
 
 
 # -- is it white ------------------------------------------------------------------------------------------------------
@@ -226,15 +203,6 @@ def test_windows_are_as_long_as_wanted_and_reach_the_last_sample():
     for length, expected in ((0.5, [(0.0, 0.5), (0.5, 1.0), (1.0, 1.0)]), (2.0, [(0.0, 1.0)])):
         found = run_null_test(parts, np.ones(5), 0, window=length).windows
         assert [(w.start_time, w.end_time) for w in found] == expected
-
-
-def test_a_coloured_window_is_less_sure():
-    residual = np.full(20, 1.3)
-    white = run_null_test([series(range(20))], residual, 0, level=0.05).windows[0]
-    coloured = run_null_test([series(range(20), colour=(1.0, 0.7))], residual, 0, level=0.05).windows[0]
-    assert white.is_flagged
-    assert not coloured.is_flagged
-    assert white.z_score == pytest.approx(coloured.z_score * math.sqrt(1 + 2 * 0.49))
 
 
 # -- noise floor ------------------------------------------------------------------------------------------------------

@@ -158,31 +158,6 @@ def smoothed(monkeypatch, models, **limits):
 NOTHING = dict.fromkeys(SOURCES, 0.0)
 
 
-@pytest.mark.parametrize("variance", [(0.0, 0.0, 0.0), (0.8, 0.0, 0.0), (0.5, 1.5, 0.2)])
-def test_the_evidence_has_parameters_and_all_recordings_in_it(variance):
-    models = [made(1), made(2)]
-    at = dict(zip(SOURCES, variance, strict=True))
-    state, reference = smoother._run(models, at), Dense(models, at)
-    assert state.log_evidence == pytest.approx(reference.log_evidence, rel=1e-9)
-    np.testing.assert_allclose(state.shift, reference.theta, rtol=1e-8)
-    np.testing.assert_allclose(
-        state.spread,
-        np.linalg.inv(
-            reference.by_theta.T @ np.linalg.solve(reference.conditional, reference.by_theta) + np.eye(2) / 9.0
-        ),
-        rtol=1e-8,
-    )
-
-
-def test_scores_leave_to_parameters_what_they_explain():
-    models = [made(1), made(2)]
-    at = dict(zip(SOURCES, (0.5, 0.0, 0.2), strict=True))
-    found, reference = smoother._scores(models, smoother._run(models, at)), Dense(models, at)
-    for column, source in enumerate(SOURCES):
-        both = [reference.scores(i, column) for i in range(2)]
-        assert found[source] == pytest.approx(tuple(map(sum, zip(*both, strict=True))), rel=1e-8)
-
-
 def test_variances_so_large_that_rounding_shows_are_never_the_best():
     assert smoother._run([made(1, loose=1e12)], NOTHING).log_evidence == -math.inf
 

@@ -14,7 +14,6 @@ from yid_ocp.diagnosis.localise import (
     GapLocation,
     attribute_gap_to_effects,
     localise_gap,
-    merge_time_intervals,
     smoothed_unknown_z_scores,
 )
 from yid_ocp.inference import smoother_model
@@ -190,10 +189,6 @@ def test_effects_take_the_share_that_they_close():
     assert found[0].time_windows == ((0.5, 1.0),)
 
 
-def test_touching_spans_are_one():
-    assert merge_time_intervals([(1.0, 1.5), (0.0, 0.5), (0.5, 1.0), (3.0, 4.0)]) == ((0.0, 1.5), (3.0, 4.0))
-
-
 # -- pushes on segments ------------------------------------------------------------------------------------------------
 
 SYSTEM = baxter_foam_y_system(1)
@@ -220,12 +215,3 @@ def test_a_push_is_what_virtual_work_says():
 def test_pushes_are_measured_by_the_weight_of_their_segment():
     found = _segment_weights(SYSTEM, THETA)
     assert found == pytest.approx({"T1": 9.81 * 0.064, "T2": 9.81 * 0.015, "T3": 9.81 * 0.016})
-
-
-def test_what_cannot_be_pushed_is_not():
-    assert _segment_weights(replace(SYSTEM, segment_layouts=()), THETA) == {}
-    assert _generalized_forces_per_newton(SYSTEM, THETA, np.zeros((4, SYSTEM.n_coordinates)), ()).shape == (
-        4,
-        SYSTEM.n_coordinates,
-        0,
-    )

@@ -272,14 +272,11 @@ def closed_loop(urdf_folder, effects=()) -> tuple[System, np.ndarray]:
 
 BUILDERS = {
     "closed_loop": lambda f: make_case(*closed_loop(f)),
-    "closed_loop_node": lambda f: make_case(*closed_loop(f), rule=("symmetric", "node")),
     "closed_loop_left": lambda f: make_case(*closed_loop(f), rule=("left", "node")),
-    "closed_loop_left_midpoint": lambda f: make_case(*closed_loop(f), rule=("left", "midpoint")),
     "welded_cable": lambda f: make_case(*clamped_cable("weld"), strength=0.05),
     "aligned_cable": lambda f: make_case(*clamped_cable("axis"), strength=0.05),
-    "creeping_cable": lambda f: make_case(*soft_clamp(), time_step=5e-4, strength=0.05),
-    "relaxing_cable": lambda f: make_case(*soft_clamp(2e-3), time_step=5e-4, strength=0.05),
-    "relaxing_cable_node": lambda f: make_case(*soft_clamp(2e-3), time_step=5e-4, strength=0.05, rule=("left", "node")),
+    "creeping_cable": lambda f: make_case(*soft_clamp(), time_step=5e-4, strength=0.05, rule=("symmetric", "node")),
+    "relaxing_cable": lambda f: make_case(*soft_clamp(2e-3), time_step=5e-4, strength=0.05, rule=("left", "midpoint")),
     "thick_air": lambda f: make_case(*closed_loop(f, [thick_air("nod", 0.05, 0.2, 0.4)]), rule=("left", "node")),
     "thick_air_symmetric": lambda f: make_case(*closed_loop(f, [thick_air("slide", 0.05, 0.2, -0.4)])),
     "soft_cable": lambda f: make_case(

@@ -127,22 +127,6 @@ def scale_of(array):
     return max(1.0, np.max(np.abs(array), initial=0.0))
 
 
-def test_a_rollout_is_its_steps(case):
-    n, s = case.step.system.n_coordinates, case.step.sizes
-    rollout = case.rollout()
-    for k, u in enumerate(case.torque):
-        x = rollout.state[k]
-        pair = (case.path[k], case.path[k + 1]) if s["nc"] else None
-        q1, p1, lam, status = case.step(x[:n], x[n : 2 * n], u, case.theta, pair, x[2 * n :])
-        assert status.is_converged, status.message
-        after = np.concatenate([q1, p1, status.internal_coordinates])
-        np.testing.assert_allclose(after, rollout.state[k + 1], rtol=0, atol=1e-9 * scale_of(after))
-        np.testing.assert_allclose(lam, rollout.multipliers[k], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(
-            status.prescribed_effort, rollout.effort[k], rtol=0, atol=1e-7 * scale_of(status.prescribed_effort)
-        )
-
-
 def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     s, step, names = case.step.sizes, case.step, case.step.system.parameters.names[::3]
     n, h = s["n"], step.time_step

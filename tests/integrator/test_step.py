@@ -225,12 +225,6 @@ class TestFailures:
         assert np.all(np.isnan(rollout.state[9:]))
         assert np.all(np.isnan(rollout.multipliers[7:]))
 
-    def test_derivatives_of_a_step_that_failed_are_not_numbers(self, urdf_folder, use_compiler):
-        system = System.build(read_urdf(urdf_folder / "double_pendulum.urdf"), driven=["elbow"])
-        step = compile_step(system, 0.01, use_compiler=use_compiler)
-        for matrix in step.jacobians([0.1, 0.2], [0.0, 0.0], [math.nan], system.parameters.vector()):
-            assert np.all(np.isnan(matrix))
-
     def test_a_system_without_unknowns(self, urdf_folder, use_compiler):
         """Everything prescribed: a step is an evaluation."""
         robot = read_urdf(urdf_folder / "double_pendulum.urdf")

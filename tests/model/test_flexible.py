@@ -65,13 +65,6 @@ def test_rigidity_becomes_stiffness_by_the_lengths_about_a_joint():
     assert set(plain.values()) == {(2.0, 0.1), (1.5, 0.1)}
 
 
-def test_units_say_whether_a_rigidity_is_meant():
-    stiff = flexible_object([Segment("A", 1.0, 1.0, 0.1)]).mechanism.parameters
-    rigid = flexible_object([Segment("A", 1.0, 1.0, 0.1, stiffness_per_curvature=True)]).mechanism.parameters
-    assert (stiff["A.bend"].unit, stiff["A.damping"].unit) == ("N m/rad", "N m s/rad")
-    assert (rigid["A.bend"].unit, rigid["A.damping"].unit) == ("N m^2", "N m^2 s")
-
-
 def test_branches_at_inner_links():
     trunk = Segment("P", 0.6, 0.3, 0.01, links=3)
     turn = rotation_from_rpy(math.pi / 2, 0.0, 0.0)
@@ -81,12 +74,6 @@ def test_branches_at_inner_links():
     joint = item.mechanism.joints[item.mechanism.joint_index("a_0_x")]
     assert item.mechanism.joint_names[joint.parent_index] == "P_0_z"
     np.testing.assert_allclose(positions(item, ["w_a", "w_P"]), [[0, -0.2, 0.2], [0, 0, 0.6]], atol=1e-15)
-
-
-def test_another_order_of_turns():
-    item = flexible_object([Segment("A", 1.0, 1.0, 0.1, links=1, joint_axes="zyx")])
-    assert item.mechanism.joint_names == ("A_0_z", "A_0_y", "A_0_x")
-    assert [bool(joint.bodies) for joint in item.mechanism.joints] == [False, False, True]
 
 
 def test_a_flat_beam_that_bends_one_way():

@@ -55,12 +55,6 @@ def test_inside_a_link_it_lies_on_the_straight_line_and_turns_with_it(percent, b
     np.testing.assert_allclose(point[:3, :3], far[:3, :3], atol=1e-12)
 
 
-def test_it_follows_the_length():
-    tree = branched().mechanism
-    [point] = places(tree, ["T1:40%"], values={"T1.length": 1.6})
-    assert point[2, 3] == pytest.approx(0.3 + 0.64)
-
-
 def test_unequal_links_are_counted_by_their_lengths():
     tree = flexible_object([Segment("T1", 0.0, 0.1, 0.01, link_lengths=[0.1, 0.5, 0.2])]).mechanism
     heights = [pose[2, 3] for pose in places(tree, [f"T1:{p}%" for p in (5, 12.5, 50, 90)])]

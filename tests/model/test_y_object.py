@@ -13,24 +13,6 @@ from yid_ocp.model.rotations import homogeneous_transform
 from yid_ocp.model.urdf import mechanism_to_urdf
 
 
-def test_the_paper_y():
-    item = foam_y_object()
-    names = item.mechanism.joint_names
-    assert len(names) == 36
-    assert names[:4] == ("T1_0_x", "T1_0_y", "T1_0_z", "T1_1_x")
-    assert names[12:15] == ("T2_0_x", "T2_0_y", "T2_0_z")
-    assert names[-1] == "T3_3_z"
-    assert item.mechanism.parent_indices[12] == item.mechanism.parent_indices[24] == 11
-    assert {s.deformation for s in item.elastic_joints if s.axis == "z"} == {"twist"}
-    assert {s.deformation for s in item.elastic_joints if s.axis != "z"} == {"bend"}
-    expected = {"T1": (0.813, 0.064, 0.032), "T2": (0.610, 0.015, 0.025), "T3": (0.737, 0.016, 0.019)}
-    for name, numbers_ in expected.items():
-        values = [item.mechanism.parameters[f"{name}.{key}"].value for key in ("length", "mass", "radius")]
-        assert tuple(values) == numbers_
-        assert item.mechanism.parameters[f"{name}.bend"].value == 3.0
-        assert item.mechanism.parameters[f"{name}.damping"].value == 0.05
-
-
 def test_the_paper_y_stands_where_it_should():
     item = foam_y_object()
     foot, junction, left, right = positions(item, ["object_root", "w_T1", "w_T2", "w_T3"])

@@ -26,7 +26,6 @@ ROBOTS = {
     # its second finger follows the first, which Pinocchio does not know of: both locked, and one kept
     "panda": ("package:panda", [*(f"panda_joint{i}" for i in range(1, 8)), "panda_finger_joint1"], {}),
     "ur5": ("package:ur5", None, {}),
-    "y_object": ("y_object.urdf", None, {}),
     "y_generated": (None, None, {}),
     "mixed_joints": ("mixed_joints.urdf", None, {}),
     "mixed_joints_locked": ("mixed_joints.urdf", ["extend", "hinge", "spin", "swing"], LOCKED),
@@ -86,7 +85,7 @@ def twin(request, urdf_folder):
 
 
 def make_twin(urdf_folder, file, joints, locked):
-    if file is None or file == "y_object.urdf":
+    if file is None:
         path = urdf_folder / "y_object.urdf"
     elif file.startswith("package:"):
         path = _example_robot_urdf(file.removeprefix("package:"))
@@ -115,11 +114,6 @@ def states(twin, count, seed):
 
 def close(actual, expected, scale=1.0):
     assert np.max(np.abs(actual - expected), initial=0.0) <= TOLERANCE * max(1.0, scale)
-
-
-def test_the_same_coordinates(twin):
-    assert sorted(twin.mechanism.joint_names) == sorted(twin.model.names[1:])
-    assert sorted(twin.columns) == list(range(twin.model.nv))
 
 
 def test_frames_and_their_jacobians(twin):
@@ -158,11 +152,6 @@ def test_mass_matrix_gravity_and_inverse_dynamics(twin):
         close(kinetic, energy, abs(energy))
         height = pin.computePotentialEnergy(twin.model, data, at)
         close(potential, height, abs(height))
-
-
-def test_generated_object_has_the_frames_of_its_urdf(urdf_folder):
-    model = pin.buildModelFromUrdf(str(urdf_folder / "y_object.urdf"))
-    assert all(model.existFrame(name) for name in foam_y_object().mechanism.frames)
 
 
 @pytest.mark.parametrize("file", ["mixed_joints.urdf", "turntable.urdf"])

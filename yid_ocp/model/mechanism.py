@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -39,10 +39,6 @@ class Placement:
     def __matmul__(self, other: Placement) -> Placement:
         return Placement(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
-    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Placement:
-        """The transform with `change` applied to both expressions."""
-        return Placement(change(self.rotation), change(self.translation))
-
     def homogeneous_matrix(self) -> ca.SX:
         """The 4x4 homogeneous matrix."""
         return ca.vertcat(ca.horzcat(self.rotation, self.translation), ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]])))
@@ -74,11 +70,6 @@ class Inertia:
         rotation = placement.rotation
         com = rotation @ self.center_of_mass + placement.translation
         return replace(self, center_of_mass=com, inertia_about_com=rotation @ self.inertia_about_com @ rotation.T)
-
-    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Inertia:
-        """The inertia with `change` applied to every expression."""
-        fraction = None if self.gravity_fraction is None else change(self.gravity_fraction)
-        return Inertia(change(self.mass), change(self.center_of_mass), change(self.inertia_about_com), fraction)
 
 
 @dataclass(frozen=True)
@@ -264,17 +255,8 @@ class Mechanism(ReprMixin):
         def number(expression: ca.SX) -> ca.SX:
             return ca.SX(ca.densify(ca.Function("number", [symbols], [expression])(theta)))
 
-        return replace(self.map_expressions(number), parameters=Parameters())
-
-    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Mechanism:
-        """The mechanism with `change` applied to every expression of its placements and inertias."""
-        moved = [(joint, joint.placement.map_expressions(change)) for joint in self.joints]
-        joints = tuple(
-            replace(joint, placement=placement, bodies=tuple(b.map_expressions(change) for b in joint.bodies))
-            for joint, placement in moved
-        )
-        frames = {name: Frame(f.joint_index, f.placement.map_expressions(change)) for name, f in self.frames.items()}
-        return replace(self, joints=joints, frames=frames)
+        mapped: Mechanism = map_expressions(self, number)
+        return replace(mapped, parameters=Parameters())
 
     def with_inserted_joints(self, index: int, chain: Sequence[Joint]) -> Mechanism:
         """The mechanism with a chain of joints inserted from an index on, to which nothing is attached yet.
@@ -292,6 +274,20 @@ class Mechanism(ReprMixin):
         ]
         frames = {name: Frame(moved(frame.joint_index), frame.placement) for name, frame in self.frames.items()}
         return replace(self, joints=tuple(joints), frames=frames)
+
+
+def map_expressions(description: Any, change: Callable[[ca.SX], ca.SX]) -> Any:
+    """A description, or several, with `change` applied to every expression; parameters are left as they are."""
+    if isinstance(description, ca.SX):
+        return change(description)
+    if isinstance(description, tuple):
+        return tuple(map_expressions(part, change) for part in description)
+    if isinstance(description, Mapping):
+        return {name: map_expressions(part, change) for name, part in description.items()}
+    if not is_dataclass(description) or isinstance(description, type):
+        return description
+    parts = {own.name: map_expressions(getattr(description, own.name), change) for own in fields(description)}
+    return replace(description, **parts)
 
 
 def _fraction(name: str, said: str) -> float:

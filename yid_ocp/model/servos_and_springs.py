@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -70,11 +70,6 @@ class PositionServo:
     def coefficients(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         """Gain, damping, command delay and torque limit tightness (limit^-p)."""
         return self.gain, self.damping, self.command_delay, self.torque_limit_tightness
-
-    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> PositionServo:
-        """The servo with `change` applied to every expression."""
-        gain, damping, delay, tightness = map(change, self.coefficients)
-        return PositionServo(gain, damping, delay, tightness, self.command_interpolation)
 
 
 def joint_damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:

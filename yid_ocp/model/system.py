@@ -15,7 +15,7 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ModelError
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout, find_segment_layout
 from yid_ocp.model.kinematics import Kinematics
-from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement
+from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, map_expressions
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.servos_and_springs import (
     PositionServo,
@@ -78,17 +78,6 @@ class Grasp:
     def constraint_equation_names(self) -> tuple[str, ...]:
         """Names of the equations: `left.x`, ..., then tilts or rotations."""
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
-
-    def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> Grasp:
-        """The grasp with `change` applied to every expression."""
-        return replace(
-            self,
-            held_orientation=change(self.held_orientation),
-            holder_offset=change(self.holder_offset),
-            axial_slip=change(self.axial_slip),
-            compliance=change(self.compliance),
-            relaxation_time=None if self.relaxation_time is None else change(self.relaxation_time),
-        )
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Constraint residual phi(q), shape (equations, 1): positions [m], then direction or orientation [rad]."""
@@ -454,27 +443,9 @@ class System(ReprMixin):
         return find_segment_layout(self.segment_layouts, name)
 
     def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> System:
-        """The system with `change` applied to every expression of its description."""
-        elastic = tuple(
-            replace(e, stiffness=change(e.stiffness), damping=change(e.damping), rest_angle=change(e.rest_angle))
-            for e in self.elastic_joints
-        )
-        segments = tuple(
-            replace(s, link_lengths=tuple(map(change, s.link_lengths)), radius=change(s.radius), mass=change(s.mass))
-            for s in self.segment_layouts
-        )
-        return replace(
-            self,
-            mechanism=self.mechanism.map_expressions(change),
-            elastic_joints=elastic,
-            joint_damping={joint: change(value) for joint, value in self.joint_damping.items()},
-            servos={joint: servo.map_expressions(change) for joint, servo in self.servos.items()},
-            grasps=tuple(grasp.map_expressions(change) for grasp in self.grasps),
-            gravity=change(self.gravity),
-            recorded_time_scale=change(self.recorded_time_scale),
-            joint_compliances={joint: change(value) for joint, value in self.joint_compliances.items()},
-            segment_layouts=segments,
-        )
+        """The system with `change` applied to every expression of its description, effects left as they are."""
+        mapped: System = map_expressions(replace(self, effects=()), change)
+        return replace(mapped, effects=self.effects)
 
     def elastic_energy(self, q: ca.SX) -> ca.SX:
         """Elastic energy, the sum of 1/2 stiffness (q - rest)^2 over the elastic joints [J]."""
