@@ -19,8 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from yid_ocp.integrator.discrete import discrete_equations
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import Segment, System, flexible_object
 
 TIME_STEP = 0.01

@@ -11,8 +11,7 @@ import pytest
 
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step import Step, compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions

@@ -9,8 +9,7 @@ import numpy as np
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.servos_and_springs import RobotJointSpring

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from yid_ocp.diagnosis import DiagnosisResult as DiagnosisResult
     from yid_ocp.diagnosis import diagnose as diagnose
     from yid_ocp.errors import YidError as YidError
-    from yid_ocp.integrator.rollout import simulate as simulate
     from yid_ocp.integrator.step import compile_step as compile_step
+    from yid_ocp.integrator.step import simulate as simulate
     from yid_ocp.model import FlexibleObject as FlexibleObject
     from yid_ocp.model import Grasp as Grasp
     from yid_ocp.model import Mechanism as Mechanism
@@ -55,8 +55,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "data": ("Recording", "read_any", "read_recording", "write_recording"),
     "diagnosis": ("DiagnosisResult", "diagnose"),
     "errors": ("YidError",),
-    "integrator.rollout": ("simulate",),
-    "integrator.step": ("compile_step",),
+    "integrator.step": ("compile_step", "simulate"),
     "model": ("FlexibleObject", "Grasp", "Mechanism", "Segment", "System", "flexible_object"),
     "problem": ("EstimationProblem", "ProblemOptions", "SensorOptions"),
     "solvers.nonlinear_program": ("NonlinearProgram",),

@@ -19,9 +19,8 @@ from yid_ocp.analysis.discretisation import (
     largest_alternating_error_growth,
 )
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.urdf import read_urdf

@@ -13,8 +13,7 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.diagnosis import diagnose, hypotheses
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, TruncatedHeldOutRecording
 from yid_ocp.effects import make_effect
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf

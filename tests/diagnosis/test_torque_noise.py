@@ -26,8 +26,7 @@ from yid_ocp.inference.whitening import (
     problem_with_relinearized_held_out,
     problem_without_input_errors,
 )
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step import Step, compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.servos_and_springs import RobotJointSpring

@@ -13,9 +13,8 @@ import pytest
 from yid_ocp.data.channel_checks import median_point_pair_distances
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.effects import _SENSOR_KINDS, EffectBase, candidate_kinds_and_locations, make_effect
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step import Step, compile_step, simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.compiler import _compiler_path
-from yid_ocp.integrator.rollout import adjoint_gradient
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import adjoint_gradient, compile_step
 from yid_ocp.sensors import sensor_reading_function
 
 STEPS = 4

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import make_effect
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy

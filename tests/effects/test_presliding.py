@@ -10,8 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from yid_ocp.effects import make_effect
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.problem import ProblemOptions

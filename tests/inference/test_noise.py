@@ -25,7 +25,7 @@ TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
 def problem_of(folder, *, encoders, period=1, feedback=TRACKED, effects=(), size=1.0, angle=ANGLE, **more):
     """A pendulum whose shoulder is driven by wrong torques, `period` steps a sample, errors `size` times as large."""
     step = pendulum_step(folder, effects, driven=("shoulder",))
-    made = taken(step, 3, steps=16)
+    made = taken(step, 3, steps=24)
     group = made.joints
     assert group is not None
     group = replace(group, effort_std=size * TORQUE, effort_bias_std=size * BIAS, effort_kind="command")

@@ -25,8 +25,7 @@ from yid_ocp.inference.smoother_model import (
     _segment_weights,
     linear_residual_models,
 )
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf

@@ -11,8 +11,7 @@ import pytest
 from yid_ocp.errors import InsufficientMemoryError, ModelError
 from yid_ocp.integrator import codegen, compiled, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf

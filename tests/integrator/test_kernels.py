@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.rollout import AdditionalLoadDerivatives, linearized_steps
-from yid_ocp.integrator.step import compile_step_like
+from yid_ocp.integrator.step import AdditionalLoadDerivatives, compile_step_like, linearized_steps
 from yid_ocp.integrator.step_model import SensitivityDirections
 
 

@@ -8,8 +8,7 @@ import pytest
 import scipy.linalg
 
 from yid_ocp.errors import ModelError
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.tracking_feedback import lqr_feedback, proportional_feedback
 from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.kinematics import mass_matrix, rigid_body_lagrangian_derivatives

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import make_effect
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.tracking_feedback import DrivenJointMotion, EffectMomentumShift, lqr_feedback
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf

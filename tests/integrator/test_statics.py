@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.discrete import equilibrium_equations
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import (
     _HOLD_STIFFNESS,
     _HOLD_STIFFNESS_WITH_TORQUE,
     EquilibriumSolver,
     relaxed_internal_coordinates,
 )
-from yid_ocp.integrator.step import compile_step, compile_step_like
+from yid_ocp.integrator.step import compile_step, compile_step_like, simulate
 from yid_ocp.model import Grasp, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring

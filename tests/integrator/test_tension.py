@@ -8,8 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import Grasp, System
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.system import floating_clamp

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.errors import ConfigError, ModelError, YidError
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanLimits, PlanOptions, SplinePath
 from yid_ocp.planning.motion_plan import ParameterCovariance, plan_motion_to_target
 from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShootingProblem

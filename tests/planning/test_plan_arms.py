@@ -10,7 +10,7 @@ import pytest
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.errors import ConfigError
-from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.step import simulate
 from yid_ocp.planning.joint_paths import FramePositionFunction
 from yid_ocp.workflow.plan import run_plan
 from yid_ocp.workflow.run_inputs import resolve_recording_path

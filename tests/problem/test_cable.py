@@ -8,9 +8,8 @@ from yid_ocp.data.channel_checks import _measured_positions, median_point_pair_d
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import DataError, ModelError
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.objects.cable import (

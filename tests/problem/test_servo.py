@@ -12,9 +12,8 @@ from small_problems import PENDULUM, H, joints, pendulum_step, recording
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import _SENSOR_KINDS, candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.rollout import applied_joint_torque, simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import applied_joint_torque, compile_step, simulate
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, PositionServoOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid

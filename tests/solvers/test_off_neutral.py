@@ -7,8 +7,7 @@ import pytest
 
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.integrator.rollout import simulate
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf

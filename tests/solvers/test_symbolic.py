@@ -18,8 +18,8 @@ from yid_ocp.inference.whitening import (
     problem_without_input_errors,
 )
 from yid_ocp.integrator.discrete import nlp_stage
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import EquilibriumSolver
+from yid_ocp.integrator.step import simulate
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram, _VectorBlock

@@ -15,9 +15,8 @@ from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_st
 from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
 from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
-from yid_ocp.integrator.step import Step, compile_step
+from yid_ocp.integrator.step import Step, compile_step, simulate
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System

@@ -20,7 +20,7 @@ import scipy.linalg
 from yid_ocp.arrays import Array
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory
-from yid_ocp.integrator.rollout import linearized_steps
+from yid_ocp.integrator.step import linearized_steps
 from yid_ocp.integrator.tracking_feedback import applied_torque_error_feedthrough
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel

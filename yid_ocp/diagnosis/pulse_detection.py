@@ -26,8 +26,7 @@ import scipy.sparse
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from yid_ocp.integrator.rollout import applied_joint_torque
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step import Step, applied_joint_torque
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.system import MidpointState, System

@@ -27,7 +27,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualDerivativesAtNodes, nominal_trajectory
-from yid_ocp.integrator.rollout import (
+from yid_ocp.integrator.step import (
     AdditionalLoadDerivatives,
     active_state_mask,
     applied_joint_torque,

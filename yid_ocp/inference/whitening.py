@@ -40,7 +40,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.inference.kalman import FilterStateTransition, KalmanStep, kalman_step_and_covariance
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualDerivativesAtNodes, nominal_trajectory
-from yid_ocp.integrator.rollout import LinearizedStep, active_state_mask, linearized_steps
+from yid_ocp.integrator.step import LinearizedStep, active_state_mask, linearized_steps
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import applied_torque_error_feedthrough
 from yid_ocp.parallel import map_in_threads

@@ -15,9 +15,8 @@ from scipy.optimize import least_squares
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import ConfigError, ModelError, nearest_name_hint
-from yid_ocp.integrator.rollout import simulate
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step import Step, simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System

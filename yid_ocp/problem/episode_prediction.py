@@ -10,9 +10,8 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.rollout import adjoint_gradient, checked_rollout_inputs, simulate_batch
 from yid_ocp.integrator.statics import Equilibrium
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step import Step, adjoint_gradient, checked_rollout_inputs, simulate_batch
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
 from yid_ocp.integrator.tracking_feedback import DrivenJointMotion
 from yid_ocp.model.system import System

@@ -13,9 +13,8 @@ import numpy as np
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.rollout import generalized_momentum
 from yid_ocp.integrator.statics import Equilibrium
-from yid_ocp.integrator.step import Step, checked_float_array
+from yid_ocp.integrator.step import Step, checked_float_array, generalized_momentum
 from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import lqr_feedback, proportional_feedback
 from yid_ocp.model.system import System

@@ -11,9 +11,8 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError
-from yid_ocp.integrator.rollout import generalized_momentum
 from yid_ocp.integrator.statics import relaxed_internal_coordinates
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step import Step, generalized_momentum
 from yid_ocp.least_squares import levenberg_marquardt
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.objects.cable import START_ANGLE_AND_LOAD_SUFFIXES, START_SPEED_PARAMETER_NAME

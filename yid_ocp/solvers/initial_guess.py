@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects import EffectBase
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction
-from yid_ocp.integrator.rollout import generalized_momentum, simulate
+from yid_ocp.integrator.step import generalized_momentum, simulate
 from yid_ocp.integrator.tracking_feedback import lqr_feedback
 from yid_ocp.problem.episodes import Episode, InitialState
 from yid_ocp.problem.estimation_problem import EstimationProblem

@@ -14,7 +14,7 @@ from annotated_types import Ge, Gt
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction
-from yid_ocp.integrator.rollout import simulate
+from yid_ocp.integrator.step import simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
 from yid_ocp.options import OptionInfo, check_option_bounds
 from yid_ocp.problem.episodes import InitialState
