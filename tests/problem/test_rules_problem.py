@@ -273,7 +273,8 @@ def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
 
 @pytest.mark.filterwarnings("ignore:overflow")
 def test_a_cost_that_is_not_finite_is_a_failure(make):
-    failing = make(free=("elbow.damping",)).evaluate([1e308])
+    problem = make(free=("elbow.rest",), prior_stds={"elbow.rest": 1e-200})
+    failing = problem.evaluate(problem.initial_unknowns + 0.01)
     assert (failing.ok, failing.cost, failing.jacobian) == (False, math.inf, None)
     assert failing.message == "the cost is not finite"
 
