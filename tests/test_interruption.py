@@ -57,6 +57,12 @@ def test_what_was_swallowed_is_raised_again(tmp_path):
     assert ended(tmp_path, swallowing, signal.SIGINT) == (130, "ENDED SIGINT", True)
 
 
+def test_what_was_swallowed_is_raised_where_it_is_looked_for(tmp_path):
+    swallowing = f"try:\n    {READY}\n    time.sleep(20)\nexcept BaseException:\n    pass\n"
+    asking = "interruption.raise_if_requested()\nprint('LOST')"
+    assert ended(tmp_path, swallowing + asking, signal.SIGTERM) == (143, "ENDED SIGTERM", True)
+
+
 def test_a_call_that_does_not_come_back_is_ended_by_force(tmp_path):
     stuck = f"while True:\n    try:\n        {READY}\n        time.sleep(20)\n    except BaseException:\n        pass"
     code, out, there = ended(tmp_path, stuck, signal.SIGTERM, last=0.8)
@@ -75,7 +81,7 @@ def test_handlers_are_put_back_and_a_second_use_is_new():
     for _ in range(2):
         with pytest.raises(interruption.InterruptedBySignal), interruption.raise_on_signals():
             signal.raise_signal(signal.SIGTERM)
-        assert interruption.received_signal_number() == signal.SIGTERM
+        assert interruption.received_signal_number() is None
     assert {number: signal.getsignal(number) for number in before} == before
     assert signal.set_wakeup_fd(-1) == -1
 

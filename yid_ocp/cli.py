@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import json
 import logging
 import os
@@ -18,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO, cast
 
 from yid_ocp import interruption
 from yid_ocp.errors import ConfigError, InsufficientMemoryError, OutputError, YidError, unknown_name_details
@@ -323,6 +324,44 @@ def build_argument_parser() -> argparse.ArgumentParser:
     return top
 
 
+class _LossyStream:
+    """Standard error that discards what it cannot write: a full disk is no reason to stop."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write text as far as that is possible; returns its length."""
+        try:
+            self._stream.write(text)
+            self._stream.flush()
+        except OSError:
+            _discard_what_follows(self._stream)
+        return len(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _discard_what_follows(stream: TextIO) -> None:
+    """Lead a stream that cannot be written to nowhere, or Python fails again when it ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+@contextlib.contextmanager
+def _reliable_streams() -> Iterator[None]:
+    """Context manager in which standard output and error exist, show every letter, and error never fails."""
+    with contextlib.ExitStack() as held:
+        for name in ("stdout", "stderr"):
+            if getattr(sys, name) is None:  # closed by who started the program
+                setattr(sys, name, held.enter_context(open(os.devnull, "w", encoding="utf-8")))
+                held.callback(setattr, sys, name, None)
+            if isinstance(stream := getattr(sys, name), io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
+        held.enter_context(contextlib.redirect_stderr(cast(TextIO, _LossyStream(sys.stderr))))
+        yield
+
+
 def _wrong(error: YidError, as_json: bool) -> int:
     print(f"error: {error}", file=sys.stderr)
     parts = {"where": error.where, "allowed": error.allowed, "hint": error.hint}
@@ -332,7 +371,7 @@ def _wrong(error: YidError, as_json: bool) -> int:
 
 def _told(as_json: bool, kind: str, what: str, code: int, **parts: str) -> None:
     """Print an error as JSON on standard output, where `--json` is set."""
-    if as_json and sys.stdout is not None:
+    if as_json:
         print(json.dumps({"format": _ERROR_FORMAT, "kind": kind, "what": what, **parts, "exit_code": code}, indent=1))
 
 
@@ -371,6 +410,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "_ARGCOMPLETE" in os.environ:
         import_module("yid_ocp.workflow.editor_support").print_shell_completions(build_argument_parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)
+    with _reliable_streams():
+        return _parsed_and_carried_out(argv, as_json)
+
+
+def _parsed_and_carried_out(argv: Sequence[str] | None, as_json: bool) -> int:
     try:
         arguments = build_argument_parser().parse_args(argv)
     except SystemExit as error:
@@ -390,8 +434,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     """Run a command; returns its exit code."""
-    if sys.stdout is None:  # closed by who started the program
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     try:
         os.getcwd()
     except OSError as error:
@@ -400,6 +442,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     try:
         code = int(import_module(f"yid_ocp.workflow.{arguments.module}").run(arguments))
         sys.stdout.flush()
+        interruption.raise_if_requested()
         return code
     except Exception as error:
         number = interruption.received_signal_number()
@@ -413,7 +456,7 @@ def _failed(error: Exception, as_json: bool) -> int:
     if isinstance(error, YidError):
         return _wrong(error, as_json)
     if isinstance(error, BrokenPipeError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python fails again when it ends
+        _discard_what_follows(sys.stdout)
         what = "standard output was closed before all was printed"
         return _wrong(OutputError(what, hint="read it to its end"), False)
     if isinstance(error, OSError):

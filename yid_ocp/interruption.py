@@ -46,6 +46,12 @@ def received_signal_number() -> int | None:
     return _STATE.asked
 
 
+def raise_if_requested() -> None:
+    """Raise `InterruptedBySignal` if a signal requested the command's end, for libraries that suppressed it."""
+    if _STATE.asked is not None:
+        raise InterruptedBySignal(_STATE.asked)
+
+
 @contextlib.contextmanager
 def defer_interruption() -> Iterator[None]:
     """Context manager that delays the handling of termination signals until its short block has ended."""
@@ -97,6 +103,7 @@ def raise_on_signals() -> Iterator[None]:
         yield
     finally:
         ended.set()
+        _STATE.asked = None
         for number, handler in taken.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(wakeup)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import stat
+import subprocess
+import time
 
 import casadi as ca
 import numpy as np
@@ -100,7 +103,7 @@ def test_a_cache_that_others_may_write_is_refused(cache, mode):
     cache.chmod(mode)
     with pytest.raises(OutputError) as caught:
         compiler._cache_folder()
-    for word in (str(cache), "chmod 700", "YID_OCP_CACHE"):
+    for word in (str(cache), "empty it", "chmod 700", "YID_OCP_CACHE"):
         assert word in str(caught.value)
 
 
@@ -143,6 +146,74 @@ def test_a_damaged_library_is_made_again(cache, caplog, damage):
     assert "damaged" in caplog.text
 
 
+PLANTED = """
+#include <stdio.h>
+__attribute__((constructor)) static void run(void) {{ FILE *f = fopen("{trace}", "w"); if (f) fclose(f); }}
+int yid_compiled(void) {{ return 1; }}
+int yid_answer(void) {{ return 666; }}
+"""
+
+
+@needs_compiler
+@pytest.mark.parametrize("how", ["writable by all", "link", "pipe", "without its symbols"])
+def test_a_planted_library_is_not_run_but_made_again(cache, tmp_path, how):
+    """Its name holds the hash of its content, as anybody can work out."""
+    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
+    (own,) = cache.iterdir()
+    key, made = own.stem.partition("-")[0], tmp_path / "made.so"
+    own.unlink()
+    text = "int nothing;" if how == "without its symbols" else PLANTED.format(trace=tmp_path / "trace")
+    subprocess.run([compiler._compiler_path(), "-shared", "-fPIC", "-x", "c", "-", "-o", made], input=text, text=True)
+    planted = cache / f"{key}-{hashlib.sha256(made.read_bytes()).hexdigest()[:32]}.so"
+    if how == "link":
+        planted.symlink_to(made)
+    elif how == "pipe":
+        os.mkfifo(planted)
+    else:
+        made.rename(planted)
+        planted.chmod(0o777 if how == "writable by all" else 0o755)
+    assert compiler.compiled_shared_library(SOURCE % 42).yid_answer() == 42
+    assert not (tmp_path / "trace").exists()
+    assert [path.is_symlink() or path.stat().st_mode & 0o022 for path in cache.iterdir()] == [0]
+
+
+@needs_compiler
+def test_what_a_killed_compilation_left_is_removed(cache):
+    cache.mkdir(mode=0o700)
+    for name, age in (("build-old", 1e5), ("build-new", 0.0)):
+        (cache / name).mkdir()
+        os.utime(cache / name, (time.time() - age,) * 2)
+    assert compiler.compiled_shared_library(SOURCE % 1).yid_answer() == 1
+    assert [path.name for path in cache.iterdir() if path.is_dir()] == ["build-new"]
+
+
+@needs_compiler
+def test_a_home_that_cannot_be_written_to_has_a_cache_for_the_command(cache, tmp_path, monkeypatch, caplog):
+    (tmp_path / "home").write_text("a file, so that no folder can be made below it")
+    monkeypatch.delenv("YID_OCP_CACHE")
+    monkeypatch.setattr(compiler.platformdirs, "user_cache_dir", lambda name: str(tmp_path / "home" / name))
+    compiler._temporary_cache_folder.cache_clear()
+    assert compiler.compiled_shared_library(SOURCE % 7).yid_answer() == 7
+    assert "set YID_OCP_CACHE" in caplog.text
+    folder = compiler._temporary_cache_folder(tmp_path / "home" / "yid_ocp")
+    assert (folder.stat().st_mode & 0o777, len(list(folder.glob("*.so")))) == (0o700, 1)
+
+
+def test_a_compiler_that_hangs_is_spoken_of_and_waited_for_once(cache, tmp_path, monkeypatch, caplog):
+    slow = tmp_path / "slow_cc"
+    slow.write_text(f'#!/bin/sh\n[ "$1" = --version ] && exit\necho x >> {tmp_path}/calls\nexec sleep 60\n')
+    slow.chmod(0o755)
+    monkeypatch.setenv("CC", str(slow))
+    monkeypatch.setattr(compiler, "_COMPILE_TIMEOUT", 0.5)
+    monkeypatch.setattr(compiler, "_NOTICE_DELAY", 0.1)
+    monkeypatch.setattr(compiler, "_HUNG_COMPILERS", set())
+    compiler._compiler_path.cache_clear()
+    compiler._machine.cache_clear()
+    assert [compiler.compiled_shared_library(SOURCE % i) for i in range(3)] == [None] * 3
+    assert (tmp_path / "calls").read_text().split() == ["x"]
+    assert "has been at work for" in caplog.text
+
+
 @needs_compiler
 @pytest.mark.parametrize(
     "text",
@@ -150,7 +221,6 @@ def test_a_damaged_library_is_made_again(cache, caplog, damage):
         "echo no space left >&2; exit 1",
         "exit 0",
         'while [ "$1" != -o ]; do shift; done; echo nothing > "$2"',
-        "sleep 60",
     ],
 )
 def test_a_compiler_that_makes_no_library_leaves_the_interpreter(cache, tmp_path, monkeypatch, caplog, pendulum, text):

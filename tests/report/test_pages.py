@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from yid_ocp.report import terminal
-from yid_ocp.report.html import _script_name, write_shared_plotly_script
+from yid_ocp.report.html import _script_name, _shared_script, write_shared_plotly_script
 from yid_ocp.report.summaries import SUMMARY_BY_FORMAT
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -133,6 +133,15 @@ def test_a_page_finds_the_script_that_its_folder_shares(solved_page, tmp_path):
     page.write_text(told)
     assert len(told) < 0.6e6
     check_in_browser(page, 1400, "light", tmp_path)
+
+
+def test_a_page_takes_no_script_of_somebody_else(tmp_path):
+    page = tmp_path / "runs" / "one" / "report.html"
+    page.parent.mkdir(parents=True)
+    (tmp_path / _script_name()).write_text("steal()")
+    assert _shared_script(page) == ""
+    write_shared_plotly_script(tmp_path)
+    assert _shared_script(page) == f"../../{_script_name()}"
 
 
 @pytest.mark.slow

@@ -115,7 +115,7 @@ def test_a_result_is_not_lost_because_its_name_was_taken(settings, tmp_path, cap
 def test_what_a_killed_run_left_is_cleared_away_and_what_lives_stays(settings, tmp_path):
     left = tmp_path / ".left.partial"
     left.mkdir()
-    (left / "lock").touch()
+    (left / "yid-ocp.lock").touch()
     (left / "big").write_text("x")
     foreign = tmp_path / ".foreign.partial"
     foreign.mkdir()
@@ -125,6 +125,33 @@ def test_what_a_killed_run_left_is_cleared_away_and_what_lives_stays(settings, t
             assert (alive.path / "a.txt").is_file()
     assert {path.name for path in tmp_path.iterdir() if path.is_dir()} >= {"lives", "other", ".foreign.partial"}
     assert not left.exists()
+
+
+@pytest.mark.parametrize("kind", ["link", "folder", "linked lock"])
+def test_a_hidden_folder_that_no_run_made_is_not_emptied(settings, tmp_path, kind):
+    theirs = tmp_path / ("theirs" if kind == "link" else ".run.partial")
+    theirs.mkdir()
+    (theirs / "data").write_text("precious")
+    if kind == "link":
+        (tmp_path / ".run.partial").symlink_to(theirs)
+    elif kind == "linked lock":
+        (tmp_path / "lock").touch()
+        (theirs / "yid-ocp.lock").symlink_to(tmp_path / "lock")
+    with atomic_run_folder(settings, tmp_path / "other"):  # which clears away what killed runs left
+        assert (theirs / "data").read_text() == "precious"
+    with pytest.raises(OutputError, match="not a run's"), atomic_run_folder(settings, tmp_path / "run"):
+        pytest.fail("went on")
+    assert (theirs / "data").read_text() == "precious"
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("aim", ["empty", "nowhere"])
+def test_a_link_is_no_name_of_a_run(settings, tmp_path, aim):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / aim)
+    with pytest.raises(OutputError, match="that of a link"), atomic_run_folder(settings, tmp_path / "run"):
+        pytest.fail("went on")
+    assert sorted(path.name for path in tmp_path.glob("*run*")) == ["run"]
 
 
 @pytest.mark.parametrize("name", ["", "  ", "x" * 300, "a\0b", "~nobody_of_this_name/run"])

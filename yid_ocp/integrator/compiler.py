@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import functools
@@ -13,6 +14,8 @@ import shutil
 import stat
 import subprocess
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -42,6 +45,10 @@ _NO_OPTIMIZATION_FLAG = "-O0"
 
 # Ten times what the longest of our functions takes; a compiler that hangs would hang the run.
 _COMPILE_TIMEOUT, _VERSION_TIMEOUT = 900.0, 30.0  # [s]
+_NOTICE_DELAY = 60.0  # time after which a compiler that is still at work is spoken of [s]
+_BUILD_PREFIX, _BUILD_AGE_LIMIT = "build-", 2 * _COMPILE_TIMEOUT  # of folders in the cache that a killed process left
+_HUNG_COMPILERS: set[str] = set()
+"""Compilers that did not end in time: they are waited for once."""
 _MARKER_SYMBOL = "yid_compiled"
 _NOT_LOADED = "compiled code cannot be loaded (%s); going on without it"
 
@@ -63,19 +70,42 @@ def _compiler_path() -> str | None:
 
 def _cache_folder() -> Path:
     """Path of the private folder of compiled code, created if absent; YID_OCP_CACHE overrides it."""
-    folder = Path(os.environ.get("YID_OCP_CACHE") or platformdirs.user_cache_dir("yid_ocp"))
+    wanted = os.environ.get("YID_OCP_CACHE")
+    folder = Path(wanted or platformdirs.user_cache_dir("yid_ocp"))
+    allowed = "a folder that you own, writable by you alone"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        writable = os.access(folder, os.W_OK)
     except OSError as error:
-        what = f"the cache of compiled code cannot be made: {error.strerror}"
-        hint = "set YID_OCP_CACHE to a folder of your own, or CC=none to do without compiled code"
-        raise OutputError(what, where=str(folder), hint=hint) from error
-    info = folder.stat()
-    if hasattr(os, "getuid") and (info.st_uid != os.getuid() or info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)):
+        if wanted:
+            what = f"the cache of compiled code cannot be made: {error.strerror}"
+            hint = "set YID_OCP_CACHE to a folder of your own, or CC=none to do without compiled code"
+            raise OutputError(what, where=str(folder), allowed=allowed, hint=hint) from error
+        writable = False
+    if not writable and not wanted:  # as in containers
+        return _temporary_cache_folder(folder)
+    if not _is_mine_alone(folder.stat()):
         what = "the cache of compiled code belongs to, or is writable by, somebody else"
-        hint = f"chmod 700 it, or set YID_OCP_CACHE to another folder ({folder.name})"
-        raise OutputError(what, where=str(folder), allowed="a folder that you own, writable by you alone", hint=hint)
+        hint = f"empty it and chmod 700 it, or set YID_OCP_CACHE to another folder ({folder.name})"
+        raise OutputError(what, where=str(folder), allowed=allowed, hint=hint)
     return folder
+
+
+@functools.cache
+def _temporary_cache_folder(instead_of: Path) -> Path:
+    """Path of a cache of this process alone, removed when it ends."""
+    folder = Path(tempfile.mkdtemp(prefix="yid-ocp-cache-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    message = "the cache of compiled code %s cannot be written to; compiled code is made for this command alone: %s"
+    _LOG.warning(message, instead_of, "set YID_OCP_CACHE to a folder of your own")
+    return folder
+
+
+def _is_mine_alone(info: os.stat_result) -> bool:
+    """Whether a file or folder belongs to this user and nobody else can write to it."""
+    return not hasattr(os, "getuid") or (
+        info.st_uid == os.getuid() and not info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    )
 
 
 @functools.cache
@@ -133,7 +163,7 @@ def compiled_casadi_function(function: ca.Function) -> ca.Function:
 def _library_file(source: str, level: str, make: Callable[[], str] | None = None) -> Path | None:
     """The library in the cache, compiled if it is not there yet; None where nothing can compile it."""
     path = _compiler_path()
-    if path is None:
+    if path is None or path in _HUNG_COMPILERS:
         return None
     flags = _flags(path)
     told = [source, level, *flags, *_NATIVE_FLAGS, _machine(), ca.CasadiMeta.version()]
@@ -142,11 +172,17 @@ def _library_file(source: str, level: str, make: Callable[[], str] | None = None
         return kept
     said = ""
     try:
-        with tempfile.TemporaryDirectory(dir=folder) as work:
+        for left in folder.glob(f"{_BUILD_PREFIX}*"):
+            with contextlib.suppress(OSError):
+                if left.lstat().st_mtime < time.time() - _BUILD_AGE_LIMIT:
+                    shutil.rmtree(left)
+        with tempfile.TemporaryDirectory(prefix=_BUILD_PREFIX, dir=folder) as work:
             text, built = Path(work) / "source.c", Path(work) / "library.so"
             code = source if make is None else make()
             text.write_text(f"{code}\nint {_MARKER_SYMBOL}(void) {{ return 1; }}\n", encoding="utf-8")
             for own in ((*flags, *_NATIVE_FLAGS), flags):
+                if path in _HUNG_COMPILERS:
+                    break
                 good, said = _said([path, level, *own, str(text), "-o", str(built), "-lm"], _COMPILE_TIMEOUT)
                 if good and _is_ours(built):
                     target = folder / f"{key}-{file_sha256(built)[:32]}.so"
@@ -161,12 +197,17 @@ def _library_file(source: str, level: str, make: Callable[[], str] | None = None
 
 
 def _kept(folder: Path, key: str) -> Path | None:
-    """The whole library of a key; what was damaged since it was made would end the process, and is removed."""
+    """The whole library of a key; damaged ones would end the process, others' would run: they are removed.
+
+    The name, which holds the content's hash, tells damage but not the author: that is the owner of a regular file.
+    """
     for path in sorted(folder.glob(f"{key}-*.so")):
         with contextlib.suppress(OSError, DataError):
-            if path.stem.partition("-")[2] == file_sha256(path)[:32]:
+            info = path.lstat()
+            own = stat.S_ISREG(info.st_mode) and _is_mine_alone(info)
+            if own and path.stem.partition("-")[2] == file_sha256(path)[:32] and _is_ours(path):
                 return path
-        _LOG.warning("compiled code in the cache is damaged or cannot be read, and is made again: %s", path)
+        _LOG.warning("compiled code in the cache is damaged or not your own, and is made again: %s", path)
         with contextlib.suppress(OSError):
             path.unlink()
     return None
@@ -174,14 +215,21 @@ def _kept(folder: Path, key: str) -> Path | None:
 
 def _said(command: list[str], patience: float) -> tuple[bool, str]:
     """Whether a program ended well, and what it said."""
+    notice = "the C compiler %s has been at work for %g s; it is given %g s, and CC=none does without it"
+    timer = threading.Timer(_NOTICE_DELAY, _LOG.warning, (notice, command[0], _NOTICE_DELAY, patience))
+    timer.daemon = True
     try:
+        timer.start()
         options: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace"}
         options["stdin"] = subprocess.DEVNULL
         run = subprocess.run(command, check=False, timeout=patience, **options)
     except subprocess.TimeoutExpired:
+        _HUNG_COMPILERS.add(command[0])
         return False, f"it did not end within {patience:g} s"
     except OSError as error:
         return False, str(error)
+    finally:
+        timer.cancel()
     return run.returncode == 0, run.stdout + run.stderr
 
 

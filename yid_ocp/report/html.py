@@ -69,7 +69,7 @@ def write_shared_plotly_script(folder: Path) -> None:
     ------
     OutputError
     """
-    if _installed() and not (folder / _script_name()).exists():
+    if _installed() and not _is_plotly_script(folder / _script_name()):
         import plotly.offline
 
         write_text(folder / _script_name(), plotly.offline.get_plotlyjs())
@@ -88,8 +88,16 @@ def _script_name() -> str:
 def _shared_script(path: Path) -> str:
     """Where a page finds a script that it shares, relative to itself; empty where there is none."""
     folders = [path.parent, *path.parent.parents][: _SHARED_SCRIPT_LEVELS + 1]
-    found = next((folder / _script_name() for folder in folders if (folder / _script_name()).is_file()), None)
+    found = next((script for folder in folders if _is_plotly_script(script := folder / _script_name())), None)
     return "" if found is None else Path(os.path.relpath(found, path.parent)).as_posix()
+
+
+def _is_plotly_script(path: Path) -> bool:
+    """Whether a file is plotly's script to the last byte: anybody may leave a file of that name beside pages."""
+    import plotly.offline
+
+    own = plotly.offline.get_plotlyjs().encode()
+    return path.is_file() and path.stat().st_size == len(own) and path.read_bytes() == own
 
 
 def _packed_script() -> str:

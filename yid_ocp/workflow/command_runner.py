@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from yid_ocp import interruption
 from yid_ocp.config.reader import load_config
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
@@ -149,6 +150,7 @@ class StderrLineProgress:
 
     def begin_stage(self, text: str) -> None:
         """See `Progress`."""
+        interruption.raise_if_requested()
         self._tenths, self._last, self._left = 0, time.monotonic(), _RemainingTime()
         print(f"{text} ...", file=sys.stderr, flush=True)
 
@@ -174,6 +176,7 @@ class _BarProgress:
         self._text, self._left, self._begun = "", _RemainingTime(), 0.0
 
     def begin_stage(self, text: str) -> None:
+        interruption.raise_if_requested()
         self.finish_stage()
         self._text, self._left, self._begun = text, _RemainingTime(), time.monotonic()
         self._task = self._bars.add_task(text, total=None)

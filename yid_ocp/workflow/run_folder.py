@@ -9,6 +9,7 @@ import logging
 import os
 import shlex
 import shutil
+import stat
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -29,7 +30,7 @@ from yid_ocp.version import installed_versions
 from yid_ocp.workflow.run_inputs import input_files, plugin_versions
 
 log = logging.getLogger(__name__)
-_UNFINISHED, _LOCK, _NAMES = ".partial", "lock", 1000
+_UNFINISHED, _LOCK, _NAMES = ".partial", "yid-ocp.lock", 1000
 _FULL_HINT = "choose a folder on a disk with room, with --out"
 
 
@@ -163,6 +164,7 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
         try:
             with _logged(folder):
                 yield folder
+            interruption.raise_if_requested()
             with interruption.defer_interruption():
                 _publish(folder, lock)
         except BaseException as error:
@@ -203,8 +205,8 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
     """The first name that no other run has or makes, and the lock that keeps it; it stands in the unfinished folder."""
     parent = targets[0].parent
     for temporary in parent.glob(f".*{_UNFINISHED}") if parent.is_dir() else ():  # left by killed runs
-        if (temporary / _LOCK).is_file():  # else not ours, or complete but for its name
-            with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):
+            if (temporary / _LOCK).exists() and _is_of_a_run(temporary):  # without a lock: complete but for its name
                 lock = _locked(temporary)
                 if lock is not None:
                     _clear(temporary, [])
@@ -214,6 +216,12 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
             continue
         temporary = target.parent / f".{target.name}{_UNFINISHED}"
         temporary.mkdir(parents=True, exist_ok=True)
+        if not _is_of_a_run(temporary):
+            what, allowed = (
+                "a hidden folder of this run's name is not a run's",
+                "no such folder, or one that a run left",
+            )
+            raise OutputError(what, where=str(temporary), allowed=allowed, hint="move it away, or choose another --out")
         lock = _locked(temporary)
         if lock is None:
             continue
@@ -221,12 +229,28 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
             _clear(temporary, [])
             lock.release()
             continue
-        for entry in temporary.iterdir():
-            if entry.name != _LOCK:
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        _remove_all_but_lock(temporary)
         return target, lock
     hint, allowed = "choose another name with --out, or wait for the other run", "a name of its own for every run"
     raise OutputError("another run is making this folder", where=str(targets[0]), allowed=allowed, hint=hint)
+
+
+def _is_of_a_run(temporary: Path) -> bool:
+    """Whether a hidden folder may be emptied: no link, of this user, with nothing or a run's lock in it."""
+    lock = temporary / _LOCK
+    try:
+        info = temporary.lstat()
+        if not stat.S_ISDIR(info.st_mode) or (hasattr(os, "getuid") and info.st_uid != os.getuid()):
+            return False
+        return (lock.is_file() and not lock.is_symlink()) or not any(temporary.iterdir())
+    except FileNotFoundError:  # its run ends just now: there is no lock to be had
+        return True
+
+
+def _remove_all_but_lock(temporary: Path) -> None:
+    for entry in temporary.iterdir():
+        if entry.name != _LOCK:
+            shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
 
 
 def _locked(temporary: Path) -> FileLock | None:
@@ -275,6 +299,7 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
         raise OutputError("this is no name of a folder", where="--out", allowed=allowed)
     try:
         target = Path(out).expanduser().absolute()
+        is_link = target.is_symlink()
         is_folder = target.is_dir()
         filled = is_folder and any(target.iterdir())
         is_file = not is_folder and target.exists()
@@ -284,6 +309,9 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
     if filled:
         hint = "choose another name with --out, or leave it out for a numbered one"
         raise OutputError("the run folder exists and is not empty", where=str(target), allowed=allowed, hint=hint)
+    if is_link:
+        hint = "name the folder that it leads to, or choose another --out"
+        raise OutputError("the run folder's name is that of a link", where=str(target), allowed=allowed, hint=hint)
     if is_file:
         raise OutputError("the run folder's name is that of a file", where=str(target), hint="choose another --out")
     return [target]
@@ -292,6 +320,8 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
 def _clear(temporary: Path | None, made: Sequence[Path]) -> None:
     with interruption.defer_interruption():
         if temporary is not None:
+            with contextlib.suppress(OSError):  # the lock last: without it the rest is nobody's
+                _remove_all_but_lock(temporary)
             shutil.rmtree(temporary, ignore_errors=True)
         for parent in made:
             with contextlib.suppress(OSError):
