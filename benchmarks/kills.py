@@ -6,9 +6,9 @@ Commands run on a double pendulum, whose runs take seconds (solve, compare, diag
 of two cases), and on three frames of a camera (track); they take turns. A run is ended by a random signal at a random
 moment; two runs share one second or one `--out`; files cannot grow beyond a random size, as on a full disk; compiled
 code in the cache is damaged. Afterwards every folder that bears a name has to be whole, only a killed process may leave
-its hidden folder, no process may go on, no exit code may say that it was our mistake, and running again has to give the
-numbers of an undisturbed run. A blind proof goes on in the folder that it left, until it ends with the numbers of an
-undisturbed one. Exit code 1 where something does not hold.
+its hidden folder, no process may go on, no run that was asked to end may go on to its end, no exit code may say that it
+was our mistake, and running again has to give the numbers of an undisturbed run. A blind proof goes on in the folder
+that it left, until it ends with the numbers of an undisturbed one. Exit code 1 where something does not hold.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ PROOF = "blind"
 """The command that goes on in the folder it finds, instead of taking a hidden one."""
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 FULL = (50_000.0, 3_000.0)  # geometric mean and least of the sizes of a file on a full disk [bytes]
+ENDING = 0.5  # [s] time within which a process that has done its work may be past listening to a signal
 LINGER = 20.0
 """How long what a run started may go on when it has ended [s]."""
 TRACK = """\
@@ -200,6 +201,7 @@ def killed(room: Room, rng: Random, command: str) -> str:
     delay = float(rng.uniform(0.0, 1.1 * room.usual[command][1]))
     process = room.start(command)
     time.sleep(delay)
+    asked = time.monotonic() if process.poll() is None else None
     process.send_signal(number)
     what = f"{command} and {number.name} after {delay:.2f} s"
     try:
@@ -209,6 +211,8 @@ def killed(room: Room, rng: Random, command: str) -> str:
         process.wait()
         room.wrong.append(f"{what}: no end within 30 s")
         return what
+    if asked is not None and code in (0, 1) and time.monotonic() - asked > ENDING:
+        room.wrong.append(f"{what}: went on to its end with {code}")
     if code not in (0, 1, -number, 128 + number):
         room.wrong.append(f"{what}: ended with {code}: {room.said()}")
     room.alone(process, what)
