@@ -53,7 +53,10 @@ model:
   object: {{kind: foam_y}}
   grasp: {{left: {{holder_frame: left_gripper, held_frame: w_T2}}}}
 recordings: {{estimate: [{data}/joints.h5]}}
-track: {{frames_path: {data}/frames, n_drawn_frames: 1}}
+track:
+  frames_path: {data}/frames
+  n_drawn_frames: 1
+  options: {{calibration: {{fix_pose: true}}, clock: {{search_half_width: 0}}}}
 """
 Random = np.random.Generator
 
