@@ -59,6 +59,25 @@ def test_commands_exist(page, repository, name):
         assert name == "tutorial" or (repository / said.config).is_file()
 
 
+def test_names_in_the_pages_exist(repository):
+    """What stands in backticks with an underscore is a name of the code, of a setting or of a file."""
+    # attributes of a group are its quantity and an ending, and one page makes an effect of its own
+    known = {"current_bias_std", "joint_churning", *(file.stem for file in repository.glob("docs/*"))}
+    for pattern in ("yid_ocp/**/*.py", "yid_ocp/**/*.html", "configs/*.yaml", "benchmarks/**/*.py", "tests/**/*.py"):
+        for file in repository.glob(pattern):
+            known |= {file.stem, *re.findall(r"\w+", file.read_text(encoding="utf-8"))}
+    pages = [*repository.glob("*.md"), *repository.glob("docs/**/*.md")]
+    absent = {}
+    for file in pages:
+        if file.name != "CHANGELOG.md":
+            spans = re.findall(
+                r"`([^`]+)`", re.sub(r"```.*?```", "", file.read_text(encoding="utf-8"), flags=re.DOTALL)
+            )
+            words = {word for span in spans for word in re.findall(r"(?<![\w$])[a-z]+_[a-z_]+(?!\w)", span)}
+            absent |= {file.name: sorted(words - known)} if words - known else {}
+    assert not absent
+
+
 def test_the_tutorial_runs(page, run_script, repository):
     run_script("\n".join(blocks(page("tutorial"), "python")), repository)
 
