@@ -4,13 +4,25 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from yid_ocp.errors import DataError, OutputError
-from yid_ocp.files import atomic_write, file_sha256, is_file, json_sha256, to_json_types, write_json
+from yid_ocp.config.reader import load_config
+from yid_ocp.data.readers import preview_file, read_any
+from yid_ocp.errors import ConfigError, DataError, ModelError, OutputError
+from yid_ocp.files import (
+    atomic_write,
+    file_sha256,
+    is_file,
+    json_sha256,
+    read_input_json,
+    to_json_types,
+    write_json,
+)
+from yid_ocp.model.urdf import read_urdf
 from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences, source_hash
 
 
@@ -118,3 +130,80 @@ def test_where_two_processes_differ_is_said():
     ]
     del here["numpy"]
     assert software_fingerprint_differences({**here, "numpy": "2"}, here) == ["numpy unknown instead of 2"]
+
+
+# -- files from outside -----------------------------------------------------------------------------------------------
+
+OPENERS = re.compile(
+    r"\.read_text\(|\.read_bytes\(|(?<![\w.])open\(|\.open\(|np\.load|h5py\.File\(|read_table|ParquetFile|ElementTree\.parse|"
+    r"YAML\(|json\.load\(|ezc3d\.c3d\(|AnyReader\(|o3d\.io\.read|URDF\.load|trimesh\.load|pin\.build\w*Model\("
+)
+"""What opens a file in one of the libraries that the package uses."""
+OWN = {
+    "files.py": "the door, and temporary files of writers",
+    "version.py": "the package's own sources",
+    "cli.py": "where standard output leads",
+    "config/settings.py": "writes YAML",
+    "analysis/compare.py": "/proc, and a table that comes with the package",
+    "integrator/codegen.py": "sources in C that come with the package",
+    "integrator/compiler.py": "/proc",
+    "solvers/nonlinear_program.py": "what IPOPT said in a temporary file",
+    "report/html.py": "a script that is compared with its original",
+    "report/sections/results.py": "pictures that the run drew",
+    "export/signals.py": "writes",
+    "workflow/run_folder.py": "writes",
+}
+"""Files of the package that open what did not come from outside."""
+
+
+def test_every_file_from_outside_comes_through_the_door(repository):
+    package = repository / "yid_ocp"
+    openers = {}
+    for file in package.rglob("*.py"):
+        text = file.read_text(encoding="utf-8")
+        if OPENERS.search(text):
+            openers[str(file.relative_to(package))] = text
+    assert set(OWN) <= set(openers), "a file that opens nothing needs no mention"
+    without = {name for name, text in openers.items() if name not in OWN and not re.search(r"check_\w+\(|_yaml", text)}
+    assert not without
+    for name in set(openers) - set(OWN):
+        assert re.search(r"check_input_file|check_readable_in_fork|read_input_text", openers[name]), name
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
+@pytest.mark.parametrize("name", ["a.csv", "a.h5", "a.c3d", "a.mcap", "a.bag", "a.db3"])
+@pytest.mark.parametrize("kind", ["pipe", "endless"])
+def test_a_recording_that_is_no_regular_file_is_refused_at_once(tmp_path, name, kind):
+    path = tmp_path / name
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    with pytest.raises(DataError, match="a pipe or a device"):
+        read_any(path)
+    with pytest.raises(DataError, match="a pipe or a device"):
+        preview_file(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
+def test_a_configuration_or_robot_that_is_no_regular_file_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "a.yaml")
+    with pytest.raises(ConfigError, match="a pipe or a device"):
+        load_config(tmp_path / "a.yaml")
+    (tmp_path / "a.urdf").symlink_to("/dev/zero")
+    with pytest.raises(ModelError):
+        read_urdf(tmp_path / "a.urdf")
+
+
+@pytest.mark.parametrize("text", [b"\xff", b"{", b"[" * 100_000])
+def test_json_that_is_none_is_refused(tmp_path, text):
+    (tmp_path / "a.json").write_bytes(text)
+    with pytest.raises(DataError):
+        read_input_json(tmp_path / "a.json")
+
+
+def test_a_text_that_is_too_long_is_refused_before_it_is_read(tmp_path):
+    with (tmp_path / "a.json").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(DataError, match="more than can be meant"):
+        read_input_json(tmp_path / "a.json")

@@ -364,8 +364,7 @@ def _reliable_streams() -> Iterator[None]:
 
 def _wrong(error: YidError, as_json: bool) -> int:
     print(f"error: {error}", file=sys.stderr)
-    parts = {"where": error.where, "allowed": error.allowed, "hint": error.hint}
-    _told(as_json, type(error).__name__, error.what, _EXIT_WRONG_INPUT, **parts)
+    _told(as_json, type(error).__name__, code=_EXIT_WRONG_INPUT, **error.four_parts())
     return _EXIT_WRONG_INPUT
 
 
@@ -463,6 +462,9 @@ def _failed(error: Exception, as_json: bool) -> int:
         what = f"the system refused: {error.strerror or error}"
         hint = "see whether disk and rights allow it"
         return _wrong(OutputError(what, where=str(error.filename or ""), hint=hint), as_json)
+    if isinstance(error, ValueError) and "embedded null" in str(error):  # what Python says of a NUL in a path
+        what, allowed = "a path holds a NUL", "names without control characters"
+        return _wrong(ConfigError(what, allowed=allowed, hint="write the path anew"), as_json)
     if isinstance(error, MemoryError):
         what = f"there is not enough memory: {error}"
         return _wrong(InsufficientMemoryError(what, hint="shorten the run, or take fewer links"), as_json)

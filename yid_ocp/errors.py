@@ -10,6 +10,8 @@ from typing import TypedDict
 class YidError(Exception):
     """An error that the user can correct.
 
+    As text it has all four parts, at most 600 characters together, with control characters as escapes.
+
     Parameters
     ----------
     what : str
@@ -22,38 +24,93 @@ class YidError(Exception):
         What to do next.
     """
 
+    _usual_allowed = "what the documents describe"
+    _usual_hint = "correct it and run the command again"
+
     def __init__(self, what: str, *, where: str = "", allowed: str = "", hint: str = "") -> None:
         self.what, self.where, self.allowed, self.hint = what, where, allowed, hint
-        parts = (("where", where), ("allowed", allowed), ("try", hint))
-        super().__init__("\n".join([what, *(f"  {label}: {text}" for label, text in parts if text)]))
+        super().__init__(what)
+
+    def four_parts(self) -> dict[str, str]:
+        """What, where, allowed and hint as they are shown; what was not said is said in general."""
+        said = {
+            "what": self.what,
+            "where": self.where or "the command as it was given",
+            "allowed": self.allowed or self._usual_allowed,
+            "hint": self.hint or self._usual_hint,
+        }
+        shown = {key: _printable(text) for key, text in said.items()}
+        room, parts = _MAX_MESSAGE_LENGTH, len(shown)
+        for key, text in sorted(shown.items(), key=lambda item: len(item[1])):  # short ones leave room to long ones
+            shown[key] = _shortened(text, room // parts)
+            room, parts = room - len(shown[key]), parts - 1
+        return shown
+
+    def __str__(self) -> str:
+        shown = self.four_parts()
+        return f"{shown['what']}\n  where: {shown['where']}\n  allowed: {shown['allowed']}\n  try: {shown['hint']}"
 
 
 class ConfigError(YidError):
     """The configuration file, or a value set on top of it, is invalid."""
 
+    _usual_allowed = "keys and values as docs/settings.md lists them"
+
 
 class DataError(YidError):
     """A recording or another input file is missing, malformed or does not fit the model."""
+
+    _usual_allowed = "a whole file as docs/recordings.md describes it"
+    _usual_hint = "correct the file, or record it again"
 
 
 class ModelError(YidError):
     """The mechanical model cannot be built as described."""
 
+    _usual_allowed = "a model as docs/choosing.md describes it"
+    _usual_hint = "correct the robot's file, or the section `model`"
+
 
 class SolverError(YidError):
     """A solver does not support what was requested."""
+
+    _usual_allowed = "solvers and options as docs/settings.md lists them"
+    _usual_hint = "choose another solver or option"
 
 
 class OutputError(YidError):
     """A result cannot be written to its destination."""
 
+    _usual_allowed = "a place of your own on a disk with room"
+    _usual_hint = "choose another place with --out"
+
 
 class WorkerError(YidError):
     """Workers cannot be reached, or cannot do their tasks."""
 
+    _usual_allowed = "workers that can be reached, as docs/workers.md describes them"
+    _usual_hint = "leave --workers and --scheduler out"
+
 
 class InsufficientMemoryError(YidError):
     """The machine has too little memory."""
+
+    _usual_allowed = "a run that fits into this machine's memory"
+    _usual_hint = "shorten the run, or take fewer links"
+
+
+_MAX_MESSAGE_LENGTH = 560  # of the four parts together, without their labels
+
+
+def _printable(text: str) -> str:
+    """A text on one line whose control characters, which a terminal would obey, are escapes."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def _shortened(text: str, length: int) -> str:
+    """A text whose middle is left out where it is longer than allowed."""
+    half = (length - 5) // 2
+    return text if len(text) <= length else f"{text[:half]} ... {text[-half:]}"
 
 
 _MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none is similar, and listed otherwise

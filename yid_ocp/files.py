@@ -1,4 +1,4 @@
-"""Atomic file writing, hashes of files and data, conversion to JSON and back."""
+"""Reading of files from outside, atomic file writing, hashes of files and data, conversion to JSON and back."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import json
 import math
 import os
 import secrets
+import stat
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -21,6 +22,68 @@ import numpy as np
 from yid_ocp.errors import DataError, OutputError
 
 _DataclassType = TypeVar("_DataclassType")
+
+
+MAX_INPUT_NUMBERS = 1 << 26
+"""Largest count of numbers of one file from outside: as float64 with copies, 32 bytes each, they are 2 GiB."""
+MAX_TEXT_BYTES = 1 << 26  # of a file that is read as one text
+
+
+def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
+    """Check that a file from outside is a regular file, behind links as well, of at most `max_bytes`; returns it.
+
+    Pipes, devices and what never ends are refused before anything is read. Every file that the package did not write or
+    ship is opened after this check.
+
+    Raises
+    ------
+    DataError
+    """
+    allowed = "a regular file"
+    try:
+        info = path.stat()
+    except FileNotFoundError as error:
+        raise DataError("there is no such file", where=str(path), allowed=allowed, hint="check the path") from error
+    except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
+        what = f"the file cannot be read ({os_error_reason(error)})"
+        raise DataError(what, where=str(path), allowed=allowed, hint="check the path and your rights") from error
+    if not stat.S_ISREG(info.st_mode):
+        what = "this is a folder" if stat.S_ISDIR(info.st_mode) else "this is a pipe or a device"
+        raise DataError(what, where=str(path), allowed=allowed, hint="copy what it gives into a file")
+    if max_bytes is not None and info.st_size > max_bytes:
+        what = f"the file has {info.st_size / 2**20:.0f} MiB, more than can be meant"
+        allowed = f"at most {max_bytes / 2**20:.0f} MiB"
+        raise DataError(what, where=str(path), allowed=allowed, hint="see whether it is the right file")
+    return path
+
+
+def check_number_count(count: int, where: str) -> None:
+    """Raise `DataError` where a file from outside holds, or declares, more numbers than can be meant."""
+    if count > MAX_INPUT_NUMBERS:
+        allowed = f"at most {MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
+        what = f"the file holds {count / 1e6:.0f} million numbers, more than can be meant"
+        raise DataError(what, where=where, allowed=allowed, hint="cut it into several shorter recordings")
+
+
+def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """Text of a UTF-8 file from outside; errors as `check_input_file`, and `DataError` where it is no such text."""
+    check_input_file(path, max_bytes)
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = os_error_reason(error) if isinstance(error, OSError) else "it is not UTF-8 text"
+        what = f"the file cannot be read ({reason})"
+        raise DataError(what, where=str(path), allowed="text in UTF-8", hint="save it as UTF-8") from error
+
+
+def read_input_json(path: Path) -> Any:
+    """Data of a JSON file from outside; errors as `read_input_text`, and `DataError` where it is no JSON."""
+    text = read_input_text(path)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        what = f"the file is not JSON ({error})"
+        raise DataError(what, where=str(path), allowed="a JSON file", hint="make or download it again") from error
 
 
 @contextlib.contextmanager
@@ -87,11 +150,9 @@ def file_sha256(path: Path) -> str:
     digest = hashlib.sha256()
     try:
         for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
-            with entry.open("rb") as file:
+            with check_input_file(entry).open("rb") as file:
                 while block := file.read(1 << 20):
                     digest.update(block)
-    except FileNotFoundError as error:
-        raise DataError("there is no such file", where=str(path), hint="check the path") from error
     except OSError as error:
         raise DataError(f"the file cannot be read ({os_error_reason(error)})", where=str(path)) from error
     return digest.hexdigest()

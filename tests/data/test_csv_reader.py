@@ -126,10 +126,45 @@ def test_csv_that_is_no_text(tmp_path: Path) -> None:
     path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
     with pytest.raises(DataError, match="not a table of text"):
         read_csv(path)
-    with pytest.raises(DataError, match="not a table of text"):
+    with pytest.raises(DataError, match="this is a folder"):
         read_csv(tmp_path)
     with pytest.raises(DataError, match="no such file"):
         read_csv(tmp_path / "absent.csv")
+
+
+def test_a_line_for_excel_is_skipped(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("sep=,\nt,q_a\n0,1\n1,2\n")
+    assert np.array_equal(joints_of(read_csv(path)).position[:, 0], [1, 2])
+
+
+def test_too_many_columns_are_refused_before_the_work(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(",".join(["t", *(f"q_{i}" for i in range(20_000))]) + "\n" + ",".join(["0"] * 20_001) + "\n")
+    for read in (read_csv, preview_file):
+        with pytest.raises(DataError, match="20001 columns"):
+            read(path)
+    path.write_text(",".join(["t", *(f"q_{i}" for i in range(4_999))]) + "\n" + ",".join(["0"] * 5_000) + "\n")
+    assert len(read_csv(path).joint_names) == 4_999
+
+
+def test_a_line_without_end_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("t,q_a\n" + "0," * 2_000_000)
+    with pytest.raises(DataError, match="more than 1048576 characters"):
+        read_csv(path)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"t,q_a\n", b"t\n1\n2\n", b"<!DOCTYPE html>\n<html>\n", b'{"t": [1], "q": 3}', b"PK\x03\x04\xff", b"sep=,\n"],
+)
+def test_a_preview_of_what_is_no_table_is_refused_as_reading_it_is(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_bytes(content)
+    for read in (read_csv, preview_file):
+        with pytest.raises(DataError):
+            read(path)
 
 
 # ------------------------------------------------------------------------------- no header, patterns, bad lines

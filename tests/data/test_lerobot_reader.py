@@ -106,8 +106,8 @@ def test_the_preview_proposes_degrees(tmp_path: Path) -> None:
         ({}, {"episode": -1}, "there is no episode -1"),
         ({"total_episodes": 9}, {"episode": 5}, "no table has the episode"),
         ({"codebase_version": "v1.6"}, {}, "of version v1.6"),
-        ({"fps": 0}, {}, "0 frames a second"),
-        ({"fps": "fast"}, {}, "is not understood"),
+        ({"fps": 0}, {}, "fps .* greater than 0"),
+        ({"fps": "fast"}, {}, "fps .* a valid number"),
         ({"features": {"action": {}}}, {}, "no observation.state"),
         ({}, {"joints": ["elbow"]}, "no joint 'elbow'"),
         ({}, {"episode": 1}, "reaches 132 rad"),
@@ -119,6 +119,52 @@ def test_datasets_that_are_refused(more: Any, options: Any, message: str, tmp_pa
     with pytest.raises(DataError, match=message) as caught:
         read_lerobot(path, **options)
     assert "arm" in caught.value.where
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"data_path": "{episode_index.foo}"},
+        {"data_path": "{episode_index:>9999999999}"},
+        {"data_path": "{episode_index!r}{episode_index"},
+        {"data_path": "../{episode_index:06d}.parquet"},
+        {"chunks_size": 0.5},
+        {"chunks_size": math.inf},
+        {"features": "text"},
+        {"features": None},
+        {"features": {"observation.state": ["a"]}},
+        {"fps": math.nan},
+        {"total_episodes": "many"},
+    ],
+    ids=lambda more: str(*more.values())[:30],
+)
+def test_metadata_of_other_types_is_refused(more: Any, tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "arm", "v2.1", **more)
+    for read in (read_lerobot, preview_file):
+        with pytest.raises(DataError) as caught:
+            read(path)
+        assert "info.json" in caught.value.where
+
+
+@pytest.mark.parametrize("column", [["a", "b"], [None, None], [[1], [1, 2]]], ids=["text", "nothing", "lists"])
+def test_frame_numbers_that_are_none_are_refused(column: list[Any], tmp_path: Path) -> None:
+    path = write_dataset(tmp_path / "arm", "v2.1")
+    import pyarrow
+    from pyarrow import parquet
+
+    table = {"observation.state": [[1.0, 2, 3]] * 2, "action": [[1.0, 2, 3]] * 2, "episode_index": [0, 0]}
+    parquet.write_table(
+        pyarrow.table({**table, "frame_index": column}), path / "data" / "chunk-000" / "episode_000000.parquet"
+    )
+    with pytest.raises(DataError):
+        read_lerobot(path)
+
+
+def test_a_table_that_unpacks_to_more_than_fits_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_dataset(tmp_path / "arm", "v2.1")
+    monkeypatch.setattr("yid_ocp.files.MAX_INPUT_NUMBERS", 30)  # four frames of eight numbers and three lists
+    with pytest.raises(DataError, match="more than can be meant"):
+        read_lerobot(path)
 
 
 def test_a_damaged_table_and_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,7 +81,25 @@ def test_an_error_has_its_parts_on_lines_of_their_own():
     assert str(error) == "it broke\n  where: here\n  allowed: this\n  try: that"
     assert isinstance(error, YidError)
     assert (error.what, error.where, error.allowed, error.hint) == ("it broke", "here", "this", "that")
-    assert str(ModelError("it broke")) == "it broke"
+
+
+def test_an_error_that_says_little_has_four_parts_as_well():
+    assert [line.split(":")[0] for line in str(ModelError("it broke")).splitlines()] == [
+        "it broke",
+        "  where",
+        "  allowed",
+        "  try",
+    ]
+
+
+def test_a_long_error_is_shortened_where_it_is_long_and_obeyed_by_no_terminal():
+    error = ModelError("what \x1b[2J\n  where: elsewhere", where="here", allowed="a" * 100_000, hint="h" * 300)
+    assert len(str(error)) <= 600
+    assert str(error).isprintable() == (str(error).count("\n") == 0)
+    what, where, allowed, hint = str(error).split("\n")
+    assert (what, where) == (r"what \x1b[2J\n  where: elsewhere", "  where: here")
+    assert " ... " in allowed
+    assert len(hint) > 200
 
 
 def test_nearest_name():

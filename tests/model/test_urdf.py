@@ -173,7 +173,10 @@ def with_tip(mass="1", moments=(1, 1, 1), tensor=TENSOR, change=("", "")):
 BROKEN = {
     "floating": ((link("a"), link("b"), joint("j", "a", "b", "floating")), ["'j'", "'floating'", "prismatic"]),
     "planar": ((link("a"), link("b"), joint("j", "a", "b", "planar")), ["'j'", "'planar'"]),
-    "zero_axis": ((link("a"), link("b"), joint("j", "a", "b", axis="0 0 0")), ["'j'", "zero axis"]),
+    "zero_axis": (
+        (link("a"), link("b"), joint("j", "a", "b", axis="0 0 0")),
+        ["'j'", "zero axis", "allowed: an axis other than 0 0 0", "try: leave"],
+    ),
     "two_roots": ((link("a"), link("b")), ["2 root links", "exactly one"]),
     "no_root": ((link("a"), link("b"), joint("j", "a", "b"), joint("k", "b", "a")), ["0 root links"]),
     "unknown_link": ((link("base"), link("b"), joint("j", "bas", "b")), ["'j'", "'bas'", "'base'"]),
@@ -195,7 +198,8 @@ BROKEN = {
     "infinite_moment": (with_tip(moments=(1, "inf", 1)), ["inertia iyy is 'inf'"]),
     "huge_moment": (with_tip(moments=("1e308", 1, 1)), ["inertia ixx is '1e308'"]),
     "missing_moment": (with_tip(tensor='ixx="1" iyy="1"'), ["inertia ixy is ''"]),
-    "negative_mass": (with_tip(mass="-1"), ["negative mass"]),
+    "negative_mass": (with_tip(mass="-1"), ["a mass of -1 kg", "a mass of zero"]),
+    "vanishing_mass": (with_tip(mass="1e-320"), ["a mass of 9.99989e-321 kg", "1e-09 kg and more"]),
     "mass_with_unit": (with_tip(mass="1 kg"), ["mass is '1 kg'"]),
     "no_mass": (with_tip(change=('<mass value="1"/>', "")), ["without a mass"]),
     "two_inertials": (with_tip(change=("</link>", "<inertial/></link>")), ["2 inertials"]),

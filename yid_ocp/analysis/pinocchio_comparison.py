@@ -18,6 +18,7 @@ import pinocchio as pin
 
 from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.arrays import Array
+from yid_ocp.files import MAX_TEXT_BYTES, check_input_file
 from yid_ocp.model.kinematics import (
     forward_kinematics,
     lagrangian_second_derivatives,
@@ -100,7 +101,7 @@ def compare_urdf_with_pinocchio(
 
 def _without(path: Path, links: Sequence[str]) -> str:
     """Text of a URDF file without some links and all that hangs on them."""
-    root = ElementTree.parse(path).getroot()
+    root = ElementTree.parse(check_input_file(path, MAX_TEXT_BYTES)).getroot()
     dropped, joints = set(links), root.findall("joint")
     for _ in joints:
         dropped |= {_link(joint, "child") for joint in joints if _link(joint, "parent") in dropped}

@@ -19,6 +19,8 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, ScalarEvent
+from ruamel.yaml.parser import Parser
+from ruamel.yaml.scanner import Scanner
 
 from yid_ocp.config.schema import (
     SectionVariants,
@@ -27,7 +29,8 @@ from yid_ocp.config.schema import (
     unknown_key_error,
 )
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
+from yid_ocp.files import read_input_text
 from yid_ocp.options import (
     OptionInfo,
     dataclass_options,
@@ -42,7 +45,8 @@ _KeyPath = tuple[str | int, ...]
 DEFAULT_CONFIG = "dual_arm_vision.yaml"
 DEFAULT_DIAGNOSIS_CONFIG = "diagnosis.yaml"
 
-_MAX_DEPTH, _MAX_ENTRIES = 40, 100_000  # levels and entries of a configuration, far beyond what any needs
+_MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
+_ALLOWED = "keys with numbers, text, true or false, [lists] and sections"
 
 
 def load_config(
@@ -92,16 +96,14 @@ def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> li
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        hint = "check the path"
-        if path.parent.is_dir():
-            hint = nearest_name_hint(path.name, (entry.name for entry in path.parent.glob("*.yaml")))
-        raise ConfigError("there is no such configuration file", where=str(path), hint=hint) from error
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        what = f"the configuration cannot be read: {reason}"
-        raise ConfigError(what, where=str(path), allowed="a YAML file in UTF-8") from error
+        return read_input_text(path, _MAX_BYTES)
+    except DataError as error:
+        what, hint = f"the configuration cannot be read: {error.what}", error.hint
+        if isinstance(error.__cause__, FileNotFoundError):
+            what = "there is no such configuration file"
+            if path.parent.is_dir():
+                hint = nearest_name_hint(path.name, (entry.name for entry in path.parent.glob("*.yaml")))
+        raise ConfigError(what, where=str(path), allowed="a YAML file in UTF-8 of at most 1 MiB", hint=hint) from error
 
 
 def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]:
@@ -118,30 +120,41 @@ def _loaded(text: str, origin: str) -> Any:
     """What the YAML reader makes of a text that is not too deep and asks for no types of its own."""
     try:
         depth = 0
-        for event in YAML(typ="rt").parse(io.StringIO(text)):
+        for count, event in enumerate(_yaml().parse(io.StringIO(text))):
+            if count > _MAX_ENTRIES:
+                raise _odd(f"there are more than {_MAX_ENTRIES} entries", origin, event)
             depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
             if depth > _MAX_DEPTH:
                 raise _odd(f"more than {_MAX_DEPTH} levels stand in one another", origin, event)
             if isinstance(event, (ScalarEvent, CollectionStartEvent)) and event.tag is not None:
                 raise _odd(f"the tag '{event.tag}' asks for a type", origin, event)
-        return YAML(typ="rt").load(text)
+        return _yaml().load(text)
     except MarkedYAMLError as error:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark is not None else ""
         problem = str(error.problem or error.context).split("\n")[0]
         twice = re.match(r'found duplicate key "(.*?)"', problem)
         what = f"the key '{twice[1]}' is duplicated" if twice else f"the file is not valid YAML: {problem}"
         hint = "check indentation, brackets, colons and duplicated keys"
-        raise ConfigError(what, where=f"{origin}{line}", hint=hint) from error
+        raise ConfigError(what, where=f"{origin}{line}", allowed=_ALLOWED, hint=hint) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
         # the reader's own mistakes on odd text: numbers of thousands of digits, keys that are lists
         problem = next(iter(str(error).splitlines()), type(error).__name__)
-        raise ConfigError(f"the file is not valid YAML: {problem}", where=origin) from error
+        hint = "look for very long numbers and for keys that are lists"
+        raise ConfigError(
+            f"the file is not valid YAML: {problem}", where=origin, allowed=_ALLOWED, hint=hint
+        ) from error
+
+
+def _yaml() -> YAML:
+    """A reader that keeps lines and does without comments, whose places it does not always understand."""
+    yaml = YAML(typ="rt")
+    yaml.Scanner, yaml.Parser = Scanner, Parser
+    return yaml
 
 
 def _odd(what: str, origin: str, event: Any) -> ConfigError:
-    allowed = "keys with numbers, text, true or false, [lists] and sections"
     where = f"{origin}, line {event.start_mark.line + 1}"
-    return ConfigError(what, where=where, allowed=allowed, hint="write it without")
+    return ConfigError(what, where=where, allowed=_ALLOWED, hint="write it without")
 
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:

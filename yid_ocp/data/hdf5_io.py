@@ -19,10 +19,12 @@ from pathlib import Path
 import h5py
 
 from yid_ocp.errors import DataError
-from yid_ocp.files import atomic_write, os_error_reason
+from yid_ocp.files import MAX_INPUT_NUMBERS, atomic_write, check_input_file, os_error_reason
 
 _READ_TIMEOUT = 10.0
 """Time limit for reading a whole file [s]."""
+_TRIAL_MEMORY = 3 << 30
+"""Address space that the trial of a file may take beside what the process has [bytes]."""
 
 
 def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
@@ -40,8 +42,9 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
     Raises
     ------
     DataError
-        What the trial said, or how it ended.
+        The file is no regular one, what the trial said, or how it ended.
     """
+    check_input_file(path)
     if not hasattr(os, "fork"):
         return
     here, there = os.pipe()
@@ -50,6 +53,7 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
         child = os.fork()
     if child == 0:
         try:
+            _limit_memory()
             faulthandler.disable()
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
             os.write(there, f".{complaint(path)}".encode(errors="replace")[:2000])
@@ -76,11 +80,17 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
         raise DataError(what, where=str(path), hint="copy or record it again, as one file of its own")
 
 
+def _limit_memory() -> None:
+    """Limit the address space of this process to what it has and `_TRIAL_MEMORY`, where the system can."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (held + _TRIAL_MEMORY,) * 2)
+
+
 _MAX_GROUP_DEPTH = 10
 """Largest nesting depth of groups."""
-
-_MAX_UNPACKED_BYTES = 1 << 30
-"""Largest total size of a file's unpacked datasets [bytes]."""
 
 
 @contextlib.contextmanager
@@ -107,7 +117,7 @@ def open_checked_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     Raises
     ------
     DataError
-        The file is damaged, holds more than `_MAX_UNPACKED_BYTES`, takes too long to read, or refers to other
+        The file is damaged, holds more than `MAX_INPUT_NUMBERS`, takes too long to read, or refers to other
         files, whose contents no hash of this one covers; errors of the library in the block, too.
     """
     check_readable_in_fork(Path(path), _complaint, "HDF5")
@@ -159,15 +169,14 @@ def _foreign(group: h5py.Group, depth: int = 0) -> str:
 
 
 def _excess(file: h5py.File) -> str:
-    """Whether a file declares more than can be meant."""
-    size = 0
+    """Whether a file declares more than can be meant, whatever its types and its compression make of it in the file."""
+    numbers = 0.0
 
     def count(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        nonlocal size
+        nonlocal numbers
         if isinstance(item, h5py.Dataset) and item.shape is not None:
-            size += item.dtype.itemsize * item.size
+            numbers += max(1.0, item.dtype.itemsize / 8) * item.size
 
     file.visititems(count)
-    return (
-        f"the HDF5 file declares {size / 2**30:.1f} GiB, more than can be meant" if size > _MAX_UNPACKED_BYTES else ""
-    )
+    meant = f"{MAX_INPUT_NUMBERS / 1e6:.0f} million are the most that can be meant"
+    return f"the HDF5 file declares {numbers / 1e6:.0f} million numbers; {meant}" if numbers > MAX_INPUT_NUMBERS else ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numbers
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, get_args
@@ -32,6 +33,7 @@ JOINT_STD_FIELD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_b
 """Standard deviations that a joint group may have, in the units of their channels."""
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""
+_CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # what terminals obey and HDF5 cannot store
 
 _LARGEST = {"rad": 50.0, "rad/s": 1e6, "N m": 1e9}
 """What no joint does: eight turns, which a posture in degrees nearly always exceeds, or beyond any machine."""
@@ -531,17 +533,16 @@ def _close(array: Array, expected: Array) -> bool:
 
 
 def _check_names_and_clock(group: JointGroup | PointGroup | ChannelGroup, where: str) -> None:
-    raise_data_error_unless(bool(group.names), "the group has no names", where)
-    raise_data_error_unless(group.t.size > 0, "the group has no samples", where)
-    for name in group.names:
-        place = f"{where}, names"
-        raise_data_error_unless(
-            isinstance(name, str) and bool(name), f"the name {name!r} cannot be used", place, "text, not empty"
-        )
-        _check_text(place, name)
-        raise_data_error_unless(
-            group.names.count(name) == 1, f"the name '{name}' occurs {group.names.count(name)} times", place
-        )
+    place, allowed = f"{where}, names", "one for every column, each once"
+    raise_data_error_unless(bool(group.names), "the group has no names", where, allowed, "write the attribute `names`")
+    allowed, hint = "one sample or more", "record again, or leave the group out"
+    raise_data_error_unless(group.t.size > 0, "the group has no samples", where, allowed, hint)
+    for name, count in Counter(group.names).items():
+        usable = isinstance(name, str) and bool(name) and not _CONTROL_CHARACTER.search(name)
+        what, allowed = f"the name {name!r} cannot be used", "text without control characters, not empty"
+        raise_data_error_unless(usable, what, place, allowed, "rename it")
+        what = f"the name '{name}' occurs {count} times"
+        raise_data_error_unless(count == 1, what, place, "every name once", "rename all but one")
     clocks = get_args(ClockKind)
     raise_data_error_unless(
         group.clock in clocks, f"the clock is '{group.clock}'", f"{where}, attribute clock", ", ".join(clocks)

@@ -222,7 +222,8 @@ def _json(text: str, where: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DataError(f"the text is not JSON ({error})", where=where) from error
+        what, hint = f"the text is not JSON ({error})", "write the recording again"
+        raise DataError(what, where=where, allowed="a list in JSON", hint=hint) from error
 
 
 def _notes(text: str, where: str) -> tuple[str, ...]:

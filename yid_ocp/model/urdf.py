@@ -19,8 +19,8 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ModelError, nearest_name_hint
-from yid_ocp.files import is_file
+from yid_ocp.errors import DataError, ModelError, nearest_name_hint
+from yid_ocp.files import MAX_TEXT_BYTES, check_input_file, is_file
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import (
@@ -31,6 +31,7 @@ from yid_ocp.model.rotations import (
 )
 
 _UNLIMITED_VALUE = 1e9  # stands for no limit where URDF asks for a number
+_MIN_MASS = 1e-9  # [kg]; dividing by less would not be finite for long
 _MAX_NUMBER = 1e12  # of m, rad, kg and kg m^2; squares of more would not be finite for long
 _PRINCIPAL_MOMENT_RTOL = (
     1e-2  # how far, for want of digits in the file, principal moments may miss what they have to be
@@ -163,14 +164,17 @@ def _parsed(file: Path) -> Any:
     import yourdfpy
 
     try:
-        _check_numbers(ElementTree.parse(file).getroot(), str(file))  # yourdfpy reads what it can and says nothing
+        tree = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES))
+        _check_numbers(tree.getroot(), str(file))  # yourdfpy reads what it can and says nothing
         with contextlib.redirect_stderr(io.StringIO()):
             options = dict.fromkeys(("build_scene_graph", "load_meshes", "load_collision_meshes"), False)
             return yourdfpy.URDF.load(str(file), **options).robot
     except ModelError:
         raise
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
-        raise ModelError(f"the URDF cannot be read: {error}", where=str(file)) from error
+        what = f"the URDF cannot be read: {error.what if isinstance(error, DataError) else error}"
+        allowed, hint = "a file of URDF with links and joints", "look at it with check_urdf, or export it again"
+        raise ModelError(what, where=str(file), allowed=allowed, hint=hint) from error
 
 
 def _check_numbers(robot: ElementTree.Element, where: str) -> None:
@@ -190,9 +194,14 @@ def _check_numbers(robot: ElementTree.Element, where: str) -> None:
                 _numbers(text, 1, f"{name}: limit {key}", where, infinite=True)
         for inertial in inertials:
             mass, tensor = inertial.find("mass"), inertial.find("inertia")
-            if mass is None or _numbers(mass.get("value", ""), 1, f"{name}: mass", where)[0] < 0:
-                what = "has an inertial without a mass" if mass is None else "has a negative mass"
-                raise ModelError(f"{name} {what}", where=where, allowed="a mass of zero or more [kg]")
+            value = 0.0 if mass is None else _numbers(mass.get("value", ""), 1, f"{name}: mass", where)[0]
+            if mass is None or value < 0 or 0 < value < _MIN_MASS:
+                what = "an inertial without a mass" if mass is None else f"a mass of {value:g} kg"
+                allowed, hint = (
+                    f"a mass of zero, or of {_MIN_MASS:g} kg and more",
+                    "correct it, or leave the inertial out",
+                )
+                raise ModelError(f"{name} has {what}", where=where, allowed=allowed, hint=hint)
             if tensor is not None:
                 for key in _TENSOR_KEYS:
                     _numbers(tensor.get(key, ""), 1, f"{name}: inertia {key}", where)
@@ -254,7 +263,8 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
             allowed = "revolute, continuous, prismatic, fixed"
             raise ModelError(f"joint '{joint.name}' has type '{joint.type}'", where=where, allowed=allowed)
         if joint.type in _MOVABLE_JOINT_TYPES and joint.axis is not None and np.linalg.norm(joint.axis) < 1e-9:
-            raise ModelError(f"joint '{joint.name}' has a zero axis", where=where)
+            allowed, hint = "an axis other than 0 0 0", "leave the axis out where it is x, or make the joint fixed"
+            raise ModelError(f"joint '{joint.name}' has a zero axis", where=where, allowed=allowed, hint=hint)
     known = [joint.name for joint in robot.joints if joint.type in _MOVABLE_JOINT_TYPES]
     for name in wanted:
         if name not in known:

@@ -25,8 +25,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.errors import ConfigError, OutputError, WorkerError, YidError
-from yid_ocp.files import file_sha256, json_sha256, make_folder, write_json
+from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError, YidError
+from yid_ocp.files import file_sha256, json_sha256, make_folder, read_input_json, write_json
 from yid_ocp.parallel.dask_cluster import dask_executor, version_mismatch_message
 from yid_ocp.parallel.threads_and_processes import InlineExecutor, available_processor_count, process_pool
 from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences
@@ -242,8 +242,8 @@ class _Job:
 
     def kept(self) -> TaskResult | None:
         """The result stored in the file; None where there is no complete result of this task."""
-        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-            held = json.loads(self.file.read_text(encoding="utf-8"))
+        with contextlib.suppress(DataError, LookupError, TypeError):
+            held = read_input_json(self.file)
             if held["format"] == _TASK_FORMAT and json_sha256(held["input"]) == self.key:
                 return TaskResult(self.task.name, held["value"], seconds=float(held["seconds"]))
         return None

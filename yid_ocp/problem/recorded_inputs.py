@@ -212,9 +212,9 @@ def prescribed_path(
     remaining = tuple(name for name in system.prescribed if name not in course)
     if remaining:
         if recording.joints is None:
-            raise DataError(
-                f"joint '{remaining[0]}' is prescribed but the recording has no joints", where=recording.name
-            )
+            what = f"joint '{remaining[0]}' is prescribed but the recording has no joints"
+            allowed, hint = "a recording with the group `joints`", "record the joints too, or give another recording"
+            raise DataError(what, where=recording.name, allowed=allowed, hint=hint)
         joints = recording.joints
         sampled = smoothed_joint_angles(joints, remaining, grid, recording.name, low_pass)
         course.update({name: sampled[:, i] for i, name in enumerate(remaining)})

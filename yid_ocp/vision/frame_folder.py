@@ -22,7 +22,15 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, OutputError, unknown_name_details
-from yid_ocp.files import atomic_write, is_file, write_text
+from yid_ocp.files import (
+    atomic_write,
+    check_input_file,
+    check_number_count,
+    is_file,
+    read_input_json,
+    read_input_text,
+    write_text,
+)
 from yid_ocp.vision.frames import CameraIntrinsics, ColourArray, FrameSequence, import_open3d, validated_camera_pose
 
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
@@ -32,6 +40,7 @@ _POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"
 
 _PCD_HEADER_BYTES = 10_000  # [bytes]; where a PCD file says how many points it has
 _COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
+_MAX_FRAME_BYTES = 1 << 28  # of one cloud or image
 _LARGEST_DEPTH = 65.535  # [m]; what sixteen bits of millimetres hold
 _AGAIN = "copy or record it again"
 
@@ -40,6 +49,7 @@ def _read_cloud(path: Path, coloured: bool = False) -> tuple[Array, ColourArray 
     """Points of a cloud in the file's unit, and their red, green and blue where asked for and there, both (N, 3)."""
     if not is_file(path):
         raise DataError("the file of the cloud is missing", where=str(path))
+    check_input_file(path, _MAX_FRAME_BYTES)
     if path.suffix.lower() == ".ply":
         return _read_ply(path, coloured)
     readers = {".npz": _read_npz, ".xyz": _read_xyz, ".pcd": _read_pcd}
@@ -53,6 +63,8 @@ def _read_npz(path: Path) -> tuple[Array, ColourArray | None]:
     allowed = f"the array `{_POINTS_ARRAY}` of numbers, shape (N, 3), and `{_COLOURS_ARRAY}` of whole numbers"
     allowed += " from 0 to 255 if wanted"
     try:
+        with zipfile.ZipFile(path) as packed:
+            check_number_count(sum(entry.file_size for entry in packed.infolist()), str(path))
         with np.load(path, allow_pickle=False) as held:
             arrays: dict[str, Any] = {name: held[name] for name in (_POINTS_ARRAY, _COLOURS_ARRAY) if name in held}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
@@ -102,6 +114,9 @@ def _read_depth_image(path: Path) -> Array:
     o3d = import_open3d()
     if not is_file(path):
         raise DataError("the file of the depth image is missing", where=str(path))
+    with check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
+        head = file.read(24)  # whose last eight bytes are a PNG's width and height
+    check_number_count(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
@@ -302,12 +317,9 @@ def write_frame_folder(
 
 
 def _read_camera(path: Path) -> dict[str, Any]:
-    try:
-        head = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         return {}
-    except (OSError, ValueError, RecursionError) as error:  # not UTF-8, not JSON, numbers of thousands of digits
-        raise DataError(f"the camera's file cannot be read ({error})", where=str(path), allowed="JSON") from error
+    head = read_input_json(path)
     if not isinstance(head, dict):
         raise DataError("the camera's file is not an object", where=str(path), allowed='{"pose": ..., ...}')
     for key in head:
@@ -354,12 +366,11 @@ def _number(value: object, name: str, where: str) -> float:
 
 def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
     allowed = "CSV with the columns file, t [s]"
+    if not path.exists():
+        raise DataError("the frames have no time stamps", where=str(path), allowed=allowed)
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-    except FileNotFoundError as error:
-        raise DataError("the frames have no time stamps", where=str(path), allowed=allowed) from error
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        rows = list(csv.DictReader(read_input_text(path).splitlines()))
+    except csv.Error as error:
         raise DataError(f"the time stamps cannot be read ({error})", where=str(path), allowed=allowed) from error
     if not rows:
         raise DataError("there is no frame", where=str(path), allowed=allowed)

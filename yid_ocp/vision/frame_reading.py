@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers.bags import JOINT_STATE_MESSAGE_TYPE, BagMessage, OpenBag, relative_message_time_function
 from yid_ocp.errors import DataError, unknown_name_details
+from yid_ocp.files import check_input_file
 from yid_ocp.vision.frame_folder import METRES_PER_LENGTH_UNIT, STAMP_FILE, read_frame_folder
 from yid_ocp.vision.frames import CameraIntrinsics, ColourArray, FrameSequence, import_open3d, validated_camera_pose
 
@@ -270,7 +271,7 @@ class _Film:
         if self.reader is not None:
             self.reader.close()
         self.reader = self._kind()
-        self.reader.open(str(self.path))
+        self.reader.open(str(check_input_file(self.path)))
         self._index, self._last = -1, None
 
     def count(self) -> int:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
-from yid_ocp.files import is_file
+from yid_ocp.files import check_input_file, is_file
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
@@ -315,7 +315,9 @@ def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind
     if not is_file(path):
         raise ModelError(f"there is no URDF file '{path}'", hint="give a path, or package:NAME")
     try:
-        robot = yourdfpy.URDF.load(str(path), build_scene_graph=False, load_meshes=False, load_collision_meshes=False)
+        robot = yourdfpy.URDF.load(
+            str(check_input_file(path)), build_scene_graph=False, load_meshes=False, load_collision_meshes=False
+        )
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
         raise ModelError(f"the URDF cannot be read: {error}", where=str(path)) from error
     parts: dict[int, list[TriangleMesh]] = {}
@@ -386,12 +388,15 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
     return made
 
 
+_MAX_MESH_BYTES = 1 << 28
+
+
 @lru_cache(maxsize=64)
 def _load_mesh_file(file: Path) -> TriangleMesh:
     import trimesh
 
     try:
-        return TriangleMesh._of(trimesh.load(file, force="mesh"))
+        return TriangleMesh._of(trimesh.load(check_input_file(file, _MAX_MESH_BYTES), force="mesh"))
     except Exception as error:  # trimesh's readers raise many kinds
         raise ModelError(f"the mesh cannot be read: {error}", where=str(file)) from error
 

@@ -27,7 +27,7 @@ from yid_ocp.diagnosis import blind
 from yid_ocp.diagnosis.blind.ensemble import MAX_CASE_DRAWS
 from yid_ocp.diagnosis.diagnosis_result import statistics_compared_with_thresholds
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
-from yid_ocp.files import to_json_types, write_json, write_text
+from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
@@ -113,7 +113,7 @@ def run_blind(
         commitment, cases = proof.commit()
         progress.begin_stage(f"diagnosing {count} cases")
         answers = proof.done(diagnose_case_task, cases, "answers")
-        sealed = (proof.folder / "sealed/labels.json").read_text("utf-8")
+        sealed = read_input_text(proof.folder / "sealed/labels.json")
         labels = blind.open_sealed_labels(sealed, commitment["sha256"])
         progress.begin_stage("scoring")
         best = proof.best_closures(cases, labels, answers)
@@ -182,14 +182,14 @@ class _Proof:
         configs = {entry.name: dump_config(entry) for entry in self.runs}
         if not file.exists():
             self._draw(file, configs)
-        said = json.loads(file.read_text("utf-8"))
+        said = read_input_json(file)
         asked = {"cases": self.count, "seed": self.seed, "purpose": self.purpose, "configs": configs}
         if {key: said[key] for key in asked} != asked:
             holds = f"{said['cases']} cases, seed {said['seed']}, for {said['purpose']}"
             hint = "choose another folder, or the same configurations, --cases, --seed and --calibration"
             raise OutputError(f"'{self.folder}' holds another ensemble ({holds})", where="--out", hint=hint)
         tasks = []
-        for entry in json.loads((self.folder / "cases" / "cases.json").read_text("utf-8")):
+        for entry in read_input_json(self.folder / "cases" / "cases.json"):
             config, _, variation = str(entry["experiment"]).rpartition(".")
             experiment = BlindExperiment(self.config_file(config), variation, self.seed, self.purpose)
             own = {
@@ -275,7 +275,7 @@ def _draw_case(
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
     _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
-    ensemble.load_detectable_effect_sizes(json.loads(detectable.read_text("utf-8")))
+    ensemble.load_detectable_effect_sizes(read_input_json(detectable))
     case, label = ensemble.draw_planned_case(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import logging
 import threading
 from collections.abc import Mapping, Sequence
@@ -21,8 +20,8 @@ from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
 from yid_ocp.diagnosis.refit import PrecomputedFits
-from yid_ocp.errors import OutputError
-from yid_ocp.files import dataclass_from_plain_data, json_sha256, to_lossless_plain_data, write_json
+from yid_ocp.errors import DataError, OutputError
+from yid_ocp.files import dataclass_from_plain_data, json_sha256, read_input_json, to_lossless_plain_data, write_json
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
@@ -270,14 +269,14 @@ class JsonRefitStore:
             self.file.parent.rmdir()
 
     def _read(self) -> dict[str, StoredFit]:
+        if not self.file.exists():
+            return {}
         try:
-            held = json.loads(self.file.read_text(encoding="utf-8"))
+            held = read_input_json(self.file)
             if (held["format"], held["key"]) == (_STORE_FORMAT, self._key):
                 return {name: dataclass_from_plain_data(StoredFit, fit) for name, fit in held["refits"].items()}
             reason = "other inputs, another configuration or another version"
-        except FileNotFoundError:
-            return {}
-        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        except (DataError, ValueError, LookupError, TypeError, AttributeError):
             reason = "something that cannot be read"
         log.warning("the refits in %s are from %s and are not resumed", self.file, reason)
         return {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettin
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError, YidError
-from yid_ocp.files import file_sha256, is_file
+from yid_ocp.files import file_sha256, is_file, read_input_json
 from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
@@ -113,8 +112,8 @@ def read_result_file(file: Path) -> dict[str, Any]:
         hint = "give the run folder that `solve` or `diagnose` printed"
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), hint=hint)
     try:
-        result = dict(json.loads(file.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+        result = dict(read_input_json(file))
+    except (ValueError, TypeError) as error:
         raise DataError(f"the result cannot be read ({error})", where=str(file), hint="run it again") from error
     if result.get("format") in _OLD_FORMATS:
         what = f"the run is of an earlier version ({result['format']}), whose keys had other names"

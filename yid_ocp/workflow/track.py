@@ -24,6 +24,7 @@ from yid_ocp.files import (
     file_sha256,
     json_sha256,
     os_error_reason,
+    read_input_text,
     to_lossless_plain_data,
     write_text,
 )
@@ -416,9 +417,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     """Task: sequence calibration of a run as plain data, or the reason why it failed."""
     del inputs  # they belong to what the result depends on
     try:
-        made: dict[str, Any] = to_lossless_plain_data(
-            _tracker(config.read_text(encoding="utf-8"), config).calibrate_sequence()
-        )
+        made: dict[str, Any] = to_lossless_plain_data(_tracker(read_input_text(config), config).calibrate_sequence())
     except DataError as error:
         return {"refused": {"what": error.what, "where": error.where, "allowed": error.allowed, "hint": error.hint}}
     return made
@@ -427,7 +426,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     """Task: tracking result of one frame as plain data."""
     del inputs
-    tracker = _tracker(config.read_text(encoding="utf-8"), config)
+    tracker = _tracker(read_input_text(config), config)
     made: dict[str, Any] = to_lossless_plain_data(
         tracker.track_frame(index, dataclass_from_plain_data(SequenceCalibration, common))
     )

@@ -29,7 +29,7 @@ from yid_ocp.data.readers.base import (
 )
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
-from yid_ocp.files import file_sha256
+from yid_ocp.files import check_input_file, file_sha256
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
@@ -87,6 +87,9 @@ class OpenBag:
             hint = "pip install 'yid-ocp[bags]'"
             raise DataError("reading bags needs the package rosbags", where=str(path), hint=hint) from error
         self.path = path
+        for file in path.iterdir() if path.is_dir() else (path,):
+            if not file.is_dir():
+                check_input_file(file)
         counted: Counter[tuple[str, str]] = Counter()
         with self.read_errors_as_data_errors():
             # older ROS 2 bags do not hold the definitions of their messages; these have not changed since
@@ -428,7 +431,8 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
         if rows and not np.isnan(rows).all():
             channels[channel] = np.array(rows)
     if "position" not in channels:
-        raise DataError("the joint states have no positions", where=where)
+        allowed, hint = "messages whose `position` is filled", "choose another topic with --joint-topic"
+        raise DataError("the joint states have no positions", where=where, allowed=allowed, hint=hint)
     return JointGroup(entry.wanted, t, **channels)
 
 

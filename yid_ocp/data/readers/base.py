@@ -71,19 +71,30 @@ _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 
 
 def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
-    """Unit of each quantity, parsed from words such as `deg`, `mm` or `velocity=rpm`; `DataError` for no unit."""
+    """Unit of each quantity, from words such as `deg`, `mm`, or `velocity=rpm`, which goes before them.
+
+    `DataError` of what is no unit, and of two units of one quantity.
+    """
     units: dict[str, str] = {}
+    exact: dict[str, str] = {}
     for word in words:
         quantity, equals, unit = word.partition("=")
         if equals:
-            units[quantity.strip()] = unit.strip()
+            _set_unit(exact, quantity.strip(), unit.strip())
             continue
         of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
         if of is None:
             known = [unit for table in _TO_SI.values() for unit in table]
             raise DataError(f"'{word}' is no unit", where="units", **unknown_name_details(word, known))
-        units |= {quantity: word for quantity, si in _QUANTITIES.items() if si == of}
-    return units
+        for quantity in (quantity for quantity, si in _QUANTITIES.items() if si == of):
+            _set_unit(units, quantity, word)
+    return units | exact
+
+
+def _set_unit(units: dict[str, str], quantity: str, unit: str) -> None:
+    if units.setdefault(quantity, unit) != unit:
+        what, hint = f"'{quantity}' is given two units, {units[quantity]} and {unit}", f"as in {quantity}={unit}"
+        raise DataError(what, where="units", allowed="one unit for every quantity", hint=hint)
 
 
 def _spaceless(unit: str) -> str:

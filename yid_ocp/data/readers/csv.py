@@ -6,10 +6,11 @@ import csv
 import math
 import os
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from yid_ocp.data.readers.base import (
 )
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, ClockKind, JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
-from yid_ocp.files import file_sha256
+from yid_ocp.files import check_input_file, check_number_count, file_sha256
 
 _PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
 _NUMBERED = {"q": "position", "dq": "velocity", "cmd": "position_command"}
@@ -35,6 +36,7 @@ _NUMBERED = {"q": "position", "dq": "velocity", "cmd": "position_command"}
 _AXES = ("x", "y", "z")
 _MOST_BAD = 0.5
 """Part of a table's lines that may be bad; beyond it the table is not understood at all."""
+_MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
 _LISTED = 5
 """Numbers of bad lines that a note lists."""
 
@@ -128,9 +130,9 @@ def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
         if mark != ",":
             options["delimiter"] = mark
     rows = list(_rows(path, options.get("delimiter", ",")))
-    if not rows or not any(cell.strip() for cell in rows[0][1]):
-        raise DataError("the table is empty", where=str(path), allowed=_ALLOWED)
-    names = [cell.strip() for cell in rows[0][1]]
+    names = [cell.strip() for cell in rows[0][1]] if rows else []
+    if len(names) < 2 or len(rows) < 2:  # as reading it would say
+        _read_table(path, CsvOptions(delimiter=options.get("delimiter", ",")))
     if all(_is_number(cell) for cell in names):
         options["header"] = False
         names = [str(i + 1) for i in range(len(names))]
@@ -139,7 +141,10 @@ def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
     good = [[_number(cell) for cell in cells] for _, cells in rows if len(cells) == len(names)]
     table = np.array(good, float).reshape(len(good), len(names))
     numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
-    empty = np.array([[not cell.strip() for cell in cells] for _, cells in rows if len(cells) == len(names)])
+    if not numeric.any():
+        hint = "see whether it is a table, and what stands between its cells"
+        raise DataError("the table has no column of numbers", where=str(path), allowed=_ALLOWED, hint=hint)
+    empty = np.array([[not cell.strip() for cell in cells] for _, cells in rows if len(cells) == len(names)], bool)
     text = ~np.isfinite(table) & ~empty.reshape(table.shape)
     bad = int(np.sum(text[:, numeric].any(axis=1))) + len(rows) - len(good)
     if bad:
@@ -191,14 +196,29 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     if len(delimiter) != 1:
         raise DataError(f"the delimiter is {delimiter!r}", where=str(path), allowed="one character")
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            lines = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
+        with check_input_file(path).open(encoding="utf-8-sig", newline="") as file:
+            lines = csv.reader(_limited_lines(file, path), delimiter=delimiter, skipinitialspace=True)
+            count = 0
             for cells in lines:
-                if cells and not cells[0].lstrip().startswith("#"):
+                count += len(cells)
+                check_number_count(count, str(path))
+                if len(cells) > _MAX_COLUMNS:
+                    what, hint = f"the table has {len(cells)} columns", "see whether the delimiter is right"
+                    raise DataError(what, where=str(path), allowed=f"at most {_MAX_COLUMNS} columns", hint=hint)
+                if cells and not cells[0].lstrip().startswith(("#", "sep=")):  # the latter tells Excel the delimiter
                     yield lines.line_num, cells
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         what = f"the file is not a table of text ({error})"
         raise DataError(what, where=str(path), allowed="CSV with one header row, in UTF-8") from error
+
+
+def _limited_lines(file: TextIO, path: Path) -> Iterator[str]:
+    """Lines of a file, none of which is longer than a table's may be."""
+    while line := file.readline(_MAX_LINE_LENGTH + 1):
+        if len(line) > _MAX_LINE_LENGTH:
+            what, allowed = f"a line has more than {_MAX_LINE_LENGTH} characters", "one row of numbers per line"
+            raise DataError(what, where=str(path), allowed=allowed, hint="see whether it is a table")
+        yield line
 
 
 def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]], Array, tuple[str, ...]]:
@@ -226,7 +246,8 @@ def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]],
     for line, cells in lines:
         read(line, cells)
     if not rows:
-        raise DataError("the table has no rows", where=str(path), allowed="one header row, then one row per time")
+        allowed, hint = "one header row, then one row per time", "see whether the export was cut off"
+        raise DataError("the table has no rows", where=str(path), allowed=allowed, hint=hint)
     if len(bad) > _MOST_BAD * (len(rows) + len(bad)):
         what = f"{len(bad)} of {len(rows) + len(bad)} lines are no rows of {len(names)} numbers"
         where, allowed = f"{path}, line {bad[0]}", "a table most of whose lines are rows of numbers"
@@ -249,9 +270,10 @@ def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> Non
         others = [repr(mark) for mark in ";\t, " if mark in header[0] and mark != options.delimiter]
         hint = f"set delimiter={others[0]}" if others else ""
         raise DataError(f"the table has one column, '{header[0]}'", where=str(path), allowed=_ALLOWED, hint=hint)
-    repeated = [name for name in header if header.count(name) > 1] if options.header else []
-    if repeated:
-        raise DataError(f"two columns are called '{repeated[0]}'", where=f"{path}, line 1")
+    name, count = Counter(header).most_common(1)[0]
+    if options.header and count > 1:
+        allowed, hint = "a name of its own for every column", "rename one of them, or read the table with --no-header"
+        raise DataError(f"two columns are called '{name}'", where=f"{path}, line 1", allowed=allowed, hint=hint)
 
 
 def _is_number(cell: str) -> bool:
@@ -292,7 +314,8 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
             raise DataError(what, where=where, **unknown_name_details(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
-    meanings: list[tuple[str, str] | None] = []
+    meanings: dict[str, tuple[str, str] | None] = {}
+    meant: dict[tuple[str, str], str] = {}
     for name in header:
         own = _given_meaning(name, given[name], where) if name in given else _conventional_meaning(name)
         if own is None and name not in given:
@@ -300,13 +323,14 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
             skipped = f"{name}={SKIPPED_COLUMN_MEANING} to leave it out"
             hint = f"rename it, or say what it is: columns {name}=position:JOINT, or {skipped}"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
-        if own and own in meanings:
-            other = header[meanings.index(own)]
-            raise DataError(f"columns '{other}' and '{name}' mean the same, {' '.join(own).strip()}", where=where)
-        meanings.append(own)
-    if ("t", "") not in meanings:
+        if own and meant.setdefault(own, name) != name:
+            what = f"columns '{meant[own]}' and '{name}' mean the same, {' '.join(own).strip()}"
+            allowed, hint = "one column for every channel", f"leave one out: --columns {name}={SKIPPED_COLUMN_MEANING}"
+            raise DataError(what, where=where, allowed=allowed, hint=hint)
+        meanings[name] = own
+    if ("t", "") not in meant:
         raise DataError("the table has no column of times", where=where, allowed="t or time", hint="columns NAME=t")
-    return meanings
+    return list(meanings.values())
 
 
 def _conventional_meaning(column: str) -> tuple[str, str] | None:
@@ -341,9 +365,10 @@ def _given_meaning(column: str, given: str, where: str) -> tuple[str, str] | Non
 
 
 def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[tuple[str, str]], where: str) -> Array:
+    places = {meaning: i for i, meaning in enumerate(meanings)}
     for meaning in wanted:
-        if meaning not in meanings:
+        if meaning not in places:
             what = f"there is no column for {meaning[0]} of '{meaning[1]}'"
             allowed = "every channel for all joints, position always; x, y and z of every point"
             raise DataError(what, where=where, allowed=allowed)
-    return table[:, [meanings.index(meaning) for meaning in wanted]]
+    return table[:, [places[meaning] for meaning in wanted]]

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
+import re
+import string
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers.base import (
@@ -24,7 +25,7 @@ from yid_ocp.data.readers.base import (
 )
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError, unknown_name_details
-from yid_ocp.files import file_sha256
+from yid_ocp.files import check_input_file, check_number_count, file_sha256, read_input_json
 
 _STATE, _ACTION = "observation.state", "action"
 _CHANNELS = {
@@ -38,15 +39,29 @@ _SUFFIXES = {"pos": "position", "vel": "velocity", "torque": "effort", "effort":
 _VERSIONS = ("v2.0", "v2.1", "v3.0")
 
 
+class _Feature(BaseModel):
+    dtype: str = ""
+    names: Any = None
+
+
+class _Info(BaseModel):
+    """What is read of `meta/info.json`."""
+
+    codebase_version: str
+    fps: float = Field(gt=0, allow_inf_nan=False)
+    features: dict[str, _Feature]
+    total_episodes: int = Field(default=0, ge=0)
+    data_path: str = ""
+    chunks_size: int | None = Field(default=None, gt=0)
+    robot_type: str | None = None
+
+
 @dataclass(frozen=True)
 class _Dataset:
-    """What `meta/info.json` says: frames a second, features by name, number of episodes, and the whole text's data."""
+    """A dataset's folder and what its `meta/info.json` says."""
 
     folder: Path
-    rate: float
-    features: Mapping[str, Mapping[str, Any]]
-    episodes: int
-    info: Mapping[str, Any]
+    info: _Info
 
 
 @READERS.register("LeRobot dataset")
@@ -76,7 +91,7 @@ def read_lerobot(
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
     names, channels, left = _channels(dataset, table)
-    t = np.asarray(table["frame_index"], float) / dataset.rate
+    t = _times(dataset, table)
     raw = Recording(
         JointGroup(names, t - t[0], clock="nominal", **channels),
         (),
@@ -96,49 +111,43 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> FilePreview:
     dataset = _dataset(Path(path))
     table, _ = _episode(dataset, 0)
     names, channels, left = _channels(dataset, table)
-    group = JointGroup(names, np.asarray(table["frame_index"], float) / dataset.rate, clock="nominal", **channels)
+    group = JointGroup(names, _times(dataset, table), clock="nominal", **channels)
     why, count = dict(left), len(group.t)
     sources = tuple(
         FileDataSourceSummary(
             name,
-            str(feature.get("dtype", "")),
+            feature.dtype,
             count,
-            dataset.rate,
+            dataset.info.fps,
             "" if name in why else ("position_command" if name == _ACTION else f"joints {', '.join(names)}"),
             why.get(name, ""),
         )
-        for name, feature in dataset.features.items()
+        for name, feature in dataset.info.features.items()
     )
     units, guesses = guess_units(Recording(group))
     options: dict[str, Any] = {"episode": 0, "joints": list(names)}
     if units:
         options["units"] = units | ({"position_command": units["position"]} if "position" in units else {})
-    said = f"{dataset.episodes} episodes at {dataset.rate:g} Hz, {dataset.info.get('codebase_version', 'no version')}"
-    robot = dataset.info.get("robot_type")
+    said = f"{dataset.info.total_episodes} episodes at {dataset.info.fps:g} Hz, {dataset.info.codebase_version}"
+    robot = dataset.info.robot_type
     return FilePreview(sources, options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
 
 
 def _dataset(folder: Path) -> _Dataset:
     file = folder / "meta" / "info.json"
-    where = str(file)
+    where, hint = str(file), "convert it with the tools of LeRobot"
     try:
-        info = json.loads(file.read_text(encoding="utf-8"))
-        version = str(info["codebase_version"])
-        rate, features = float(info["fps"]), dict(info["features"])
-        episodes = int(info.get("total_episodes", 0))
-    except FileNotFoundError as error:
-        raise DataError("the dataset has no meta/info.json", where=where, allowed="a LeRobot dataset") from error
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        what = f"the description of the dataset is not understood ({type(error).__name__}: {error})"
-        raise DataError(what, where=where, allowed="codebase_version, fps and features in JSON") from error
+        info = _Info.model_validate(read_input_json(file))
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        what = f"{'.'.join(map(str, wrong['loc'])) or 'the whole'} in the dataset's description: {wrong['msg']}"
+        raise DataError(what, where=where, allowed="codebase_version, fps and features in JSON", hint=hint) from error
+    version = info.codebase_version
     if version not in _VERSIONS:
-        hint = "convert it with the tools of LeRobot"
         raise DataError(f"the dataset is of version {version}", where=where, allowed=", ".join(_VERSIONS), hint=hint)
-    if not (math.isfinite(rate) and rate > 0):
-        raise DataError(f"the dataset has {rate:g} frames a second", where=where, allowed="a number above 0")
-    if _STATE not in features:
-        raise DataError(f"the dataset has no {_STATE}", where=where, **unknown_name_details(_STATE, features))
-    return _Dataset(folder, rate, features, episodes, info)
+    if _STATE not in info.features:
+        raise DataError(f"the dataset has no {_STATE}", where=where, **unknown_name_details(_STATE, info.features))
+    return _Dataset(folder, info)
 
 
 def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Any], Path]:
@@ -149,14 +158,16 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Any], Path]:
         hint = "pip install 'yid-ocp[lerobot]'"
         raise DataError("reading LeRobot datasets needs pyarrow", where=str(dataset.folder), hint=hint) from error
     where = f"{dataset.folder}, episode {episode}"
-    allowed = f"0 to {dataset.episodes - 1}" if dataset.episodes else "an episode that was recorded"
-    if episode < 0 or (dataset.episodes and episode >= dataset.episodes):
+    last = dataset.info.total_episodes - 1
+    allowed = f"0 to {last}" if last >= 0 else "an episode that was recorded"
+    if episode < 0 or (last >= 0 and episode > last):
         raise DataError(f"there is no episode {episode}", where=str(dataset.folder), allowed=allowed)
     files = _files(dataset, episode)
-    wanted = [name for name in (_STATE, _ACTION, *_CHANNELS) if name in dataset.features]
+    wanted = [name for name in (_STATE, _ACTION, *_CHANNELS) if name in dataset.info.features]
     columns = [*wanted, "frame_index", "episode_index"]
     for file in files:
         try:
+            _check_size(parquet.ParquetFile(check_input_file(file)).metadata, columns, str(file))
             table = parquet.read_table(file, columns=columns, filters=[("episode_index", "=", episode)])
             found = {name: table[name].to_pylist() for name in columns}
         except (ArrowException, OSError, KeyError, ValueError) as error:
@@ -169,15 +180,31 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Any], Path]:
 
 def _files(dataset: _Dataset, episode: int) -> list[Path]:
     """Tables in which an episode may stand: its own one in version 2, any in version 3."""
-    pattern = str(dataset.info.get("data_path", ""))
-    size = dataset.info.get("chunks_size") or 1000
-    if "episode_index" in pattern:
-        try:
-            return [dataset.folder / pattern.format(episode_chunk=episode // int(size), episode_index=episode)]
-        except (KeyError, ValueError, IndexError, TypeError) as error:
-            where = str(dataset.folder / "meta" / "info.json")
-            raise DataError(f"data_path is '{pattern}'", where=where, allowed="episode_chunk, episode_index") from error
-    return sorted(dataset.folder.glob("data/*/*.parquet"))
+    pattern, numbers = dataset.info.data_path, {"episode_chunk": 0, "episode_index": episode}
+    if "episode_index" not in pattern:
+        return sorted(dataset.folder.glob("data/*/*.parquet"))
+    numbers["episode_chunk"] = episode // (dataset.info.chunks_size or 1000)
+    try:
+        fields = [entry for entry in string.Formatter().parse(pattern) if entry[1] is not None]
+        known = all(name in numbers and re.fullmatch(r"(0?\d\d?d)?", form or "") for _, name, form, _ in fields)
+        if known and not any(convert for *_, convert in fields) and ".." not in pattern and pattern[0] not in "/\\":
+            return [dataset.folder / pattern.format(**numbers)]
+    except ValueError:  # braces that do not match
+        pass
+    where, allowed = str(dataset.folder / "meta" / "info.json"), "{episode_chunk:03d} and {episode_index:06d} in a path"
+    raise DataError(f"data_path is '{pattern}'", where=where, allowed=allowed, hint="correct it as LeRobot writes it")
+
+
+def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
+    """Raise `DataError` where the wanted columns of a parquet file declare more numbers than can be meant."""
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    held = (group.column(i) for group in groups for i in range(group.num_columns))
+    count = sum(column.num_values for column in held if column.path_in_schema.split(".list.")[0] in columns)
+    check_number_count(count + 3 * metadata.num_rows, where)  # a row is a list of its own
+
+
+def _times(dataset: _Dataset, table: Mapping[str, Any]) -> Array:
+    return _matrix(table["frame_index"], "frame_index", dataset.folder)[:, 0] / dataset.info.fps
 
 
 def _channels(
@@ -195,12 +222,12 @@ def _channels(
             raise DataError(what, where=str(dataset.folder), allowed="every channel for all joints")
         channels[channel] = state[:, at]
     left = []
-    for name in dataset.features:
+    for name in dataset.info.features:
         if name in (_STATE, "timestamp", "frame_index", "episode_index", "index", "task_index"):
             continue
         target = "position_command" if name == _ACTION else _CHANNELS.get(name)
         if target is None:
-            left.append((name, f"a {dataset.features[name].get('dtype', 'feature')} feature that is not understood"))
+            left.append((name, f"a {dataset.info.features[name].dtype or 'feature'} feature that is not understood"))
             continue
         values = _matrix(table[name], name, dataset.folder)
         named = [_entry(entry)[0] for entry in _names(dataset, name, values.shape[1])]
@@ -216,13 +243,13 @@ def _matrix(rows: Sequence[Any], name: str, folder: Path) -> Array:
         matrix = np.array(rows, float)
     except (TypeError, ValueError) as error:
         what = f"{name} is not a list of as many numbers in every frame"
-        raise DataError(what, where=str(folder), allowed="numbers") from error
+        raise DataError(what, where=str(folder), allowed="numbers", hint="record the dataset again") from error
     return matrix[:, None] if matrix.ndim == 1 else matrix.reshape(len(matrix), -1)
 
 
 def _names(dataset: _Dataset, feature: str, count: int) -> list[str]:
     """Names of a feature's entries: a list, lists by kind of motor, or numbers where there are none."""
-    said = dataset.features[feature].get("names")
+    said = dataset.info.features[feature].names
     if isinstance(said, Mapping):
         parts = [list(part) if isinstance(part, (list, tuple)) else [key] for key, part in said.items()]
         said = [name for part in parts for name in part]

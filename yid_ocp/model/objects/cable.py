@@ -28,6 +28,7 @@ from annotated_types import Ge, Gt, Le, Len
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, ModelError, nearest_name_hint
+from yid_ocp.files import read_input_text
 from yid_ocp.model.flexible import (
     AXIS_UNIT_VECTORS,
     ElasticJoint,
@@ -118,12 +119,9 @@ class CableOptions:
 def read_vertex_positions(path: str | Path) -> dict[str, Array]:
     """Vertex positions [m] by name, from a CSV table with the columns point, x, y, z; `DataError` of another file."""
     try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+        rows = csv.DictReader(read_input_text(Path(path)).splitlines())
         return {row["point"]: np.array([float(row[axis]) for axis in "xyz"]) for row in rows}
-    except OSError as error:
-        raise DataError(f"the vertices cannot be read: {error.strerror}", where=str(path)) from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         allowed = "columns point, x, y, z with numbers in metres"
         raise DataError("the table of vertices is malformed", where=str(path), allowed=allowed) from error
 
