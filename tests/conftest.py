@@ -42,11 +42,21 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 
 def pytest_configure(config):
-    """Keep compiled code between runs, apart from the user's own, unless a place was chosen."""
+    """Keep compiled code between runs, apart from the user's own, unless a place was chosen; compile quickly.
+
+    Most steps of the tests are compiled for a few rollouts; see `shipped_optimization` for the others.
+    """
+    os.environ.setdefault("YID_OCP_OPTIMIZE", "0")
     if "YID_OCP_CACHE" not in os.environ and hasattr(config, "cache"):
         folder = config.cache.mkdir("compiled")
         folder.chmod(0o700)
         os.environ["YID_OCP_CACHE"] = str(folder)
+
+
+@pytest.fixture
+def shipped_optimization(monkeypatch):
+    """Code compiled as users have it."""
+    monkeypatch.delenv("YID_OCP_OPTIMIZE")
 
 
 @pytest.fixture(scope="session")

@@ -10,12 +10,11 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
-# settings that make each run quick: fewer links, a short horizon, interpreted where that is faster than compiling
+# settings that make each run quick: fewer links and a short horizon
 COARSE = (
     "model.object.links=1",
     "problem.duration=0.3",
     "solver.max_iterations=2",
-    "problem.use_compiler=false",
     # one stiffness: the others are hardly seen in so short a time, and their profile likelihoods take many refits
     "parameters={}",
     "parameters={T*.bend: {initial: 15}, T1.bend: {free: true, initial: 15}, T*.twist: {initial: 10}}",

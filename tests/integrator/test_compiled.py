@@ -19,6 +19,9 @@ from yid_ocp.model.urdf import read_urdf
 needs_compiler = pytest.mark.skipif(compiler._compiler_path() is None, reason="this machine has no C compiler")
 
 
+pytestmark = pytest.mark.usefixtures("shipped_optimization")
+
+
 @pytest.fixture
 def step(parts, urdf_folder):
     return compile_step(parts.closed_loop(urdf_folder)[0], 2e-3)

@@ -88,7 +88,7 @@ def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkey
     elif change == "flags":
         monkeypatch.setattr(compiler, "_COMMON_FLAGS", (*compiler._COMMON_FLAGS, "-g"))
     elif change == "level":
-        monkeypatch.setattr(compiler, "_OPTIMIZATION_FLAG", "-O0")
+        monkeypatch.setenv("YID_OCP_OPTIMIZE", "2")
     elif change == "casadi":
         monkeypatch.setattr(compiler.ca.CasadiMeta, "version", lambda: "another")
     compiler._machine.cache_clear()
@@ -235,6 +235,12 @@ def test_a_compiler_that_makes_no_library_leaves_the_interpreter(cache, tmp_path
     assert "going on without compiled code" in caplog.text
     assert ("no space left" in caplog.text) == ("no space left" in text)
     assert list(cache.iterdir()) == []
+
+
+def test_a_level_of_optimization_that_is_none_is_said(cache, monkeypatch):
+    monkeypatch.setenv("YID_OCP_OPTIMIZE", "fast")
+    with pytest.raises(ConfigError, match="YID_OCP_OPTIMIZE"):
+        compiler.compiled_shared_library(SOURCE % 42)
 
 
 def test_a_compiler_that_is_not_there_is_said(cache, monkeypatch):

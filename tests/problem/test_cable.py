@@ -266,7 +266,7 @@ def test_vertices_are_read_from_a_table(tmp_path):
     path.write_text("point,x,y\np0,1,2\n")
     with pytest.raises(DataError, match="malformed"):
         read_vertex_positions(path)
-    with pytest.raises(DataError, match="cannot be read"):
+    with pytest.raises(DataError, match="no such file"):
         read_vertex_positions(tmp_path / "none.csv")
 
 
@@ -282,7 +282,7 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository):
     recording = read_recording(folder / "bdlo1_train_021.h5")
     options = CableOptions(shape_memory=0.75)
     step = compile_step(cable_system(median_point_pair_distances(cable.edges, [recording]), cable, options), PERIOD)
-    settings = cable_options(cable, [recording], 2e-4, 0.1, options=options)
+    settings = replace(cable_options(cable, [recording], 2e-4, 0.1, options=options), duration=1.0)
     problem = EstimationProblem(step, [recording], estimable_parameter_names(cable, options), settings)
     error = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)[recording.name]
     carried = interpolated_displacement_baseline(

@@ -29,6 +29,7 @@ from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator.codegen import casadi_c_source, nonzero_indices
 from yid_ocp.integrator.step_model import NewtonStatus, out_of_memory_error
+from yid_ocp.parallel import CasadiLockedCache
 
 _LOG = logging.getLogger(__name__)
 
@@ -66,6 +67,17 @@ def _compiler_path() -> str | None:
     if path is None:
         _LOG.warning("no C compiler: everything works without compiled code, about ten times slower")
     return path
+
+
+def _optimization_flag() -> str:
+    """Flag of the step's optimisation; the environment's variable YID_OCP_OPTIMIZE says another level."""
+    level = os.environ.get("YID_OCP_OPTIMIZE", "")
+    if level not in ("", "0", "1", "2", "3"):
+        what, where = f"there is no optimisation '{level}'", "the environment's variable YID_OCP_OPTIMIZE"
+        raise ConfigError(
+            what, where=where, allowed="0, 1, 2, 3", hint="unset it; 0 is for many short runs, as tests are"
+        )
+    return f"-O{level}" if level else _OPTIMIZATION_FLAG
 
 
 def _cache_folder() -> Path:
@@ -135,7 +147,7 @@ def compiled_shared_library(source: str, make: Callable[[], str] | None = None) 
     The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version. With `make`,
     which returns the C text and is called only if the library is not in the cache, `source` is what determines it.
     """
-    target = _library_file(source, _OPTIMIZATION_FLAG, make)
+    target = _library_file(source, _optimization_flag(), make)
     if target is None:
         return None
     try:
@@ -253,6 +265,7 @@ class MappedFunction:
         self._inputs = [function.numel_in(i) for i in range(function.n_in())]
         self._outputs = [function.nnz_out(i) for i in range(function.n_out())]
         self._library = compiled_shared_library(self._source()) if use_compiler else None
+        self._mapped = CasadiLockedCache[int, ca.Function](function.map)
 
     def _source(self) -> str:
         name, f = self.function.name(), self.function
@@ -299,10 +312,9 @@ int yid_map(int count, const double **in, double **out) {{
             if code != NewtonStatus.OK:
                 raise RuntimeError(f"CasADi could not evaluate {self.function}")
         else:
-            for k in range(count):
-                point = [a if i in self.shared_inputs else a[k] for i, a in enumerate(arrays)]
-                for target, result in zip(values, self.function.call(point), strict=True):
-                    target[k] = np.array(result.nonzeros())
+            columns = [np.tile(a, (count, 1)).T if i in self.shared_inputs else a.T for i, a in enumerate(arrays)]
+            results = self._mapped(count).call(columns) if count else []
+            values = [np.array(r.nonzeros()).reshape(v.shape) for r, v in zip(results, values, strict=True)] or values
         dense = []
         for o, value in enumerate(values):
             sparsity = self.function.sparsity_out(o)
