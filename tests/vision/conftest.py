@@ -17,6 +17,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import System
 from yid_ocp.vision import (
+    CameraCalibrationOptions,
     CameraScene,
     DepthCamera,
     FrameTiming,
@@ -33,7 +34,6 @@ from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 DATA = Path(__file__).parent / "data"
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
 POSE = look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
-LATENCY = 0.06
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -97,19 +97,21 @@ COARSE = DepthCamera(
 
 @pytest.fixture(scope="session")
 def tracked(system, run, recording, shape):
-    """tracked(options, **camera and timing): frames, their track, the errors of all points in the good ones [m]."""
+    """tracked(**camera and timing): frames, their track, the errors of all points in the good ones [m].
 
-    def make(options=None, outliers=0.0, seed=0, frames=None, **timing):
-        when = FrameTiming(**{"mean_rate": 4.0, "latency": LATENCY, **timing})
+    Stamps are 60 ms late, and five frames are compared with the arm.
+    """
+
+    def make(outliers=0.0, seed=0, **timing):
+        when = FrameTiming(mean_rate=3.0, latency=0.06, **timing)
         scene = CameraScene(system, "package:baxter")
         camera = VirtualCamera(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
         made = render_virtual_frames(scene, run.t, run.q, camera)
-        seen = made.sequence if frames is None else made.sequence._select_frames(frames)
-        chosen = replace(options or TrackOptions(), tracked_points=system.point_frames)
-        found = track_object(scene, recording, seen, chosen)
+        options = TrackOptions(calibration=CameraCalibrationOptions(n_frames=5), tracked_points=system.point_frames)
+        found = track_object(scene, recording, made.sequence, options)
         were = np.array([shape.points_at(made.true_configuration_at(t)) for t in found.t])
         errors = np.linalg.norm(found.position - were, axis=2)
-        return SimpleNamespace(made=made, track=found, latency=when.latency, errors=errors)
+        return SimpleNamespace(made=made, track=found, errors=errors)
 
     return make
 

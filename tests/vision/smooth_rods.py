@@ -13,7 +13,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from yid_ocp.model.rotations import homogeneous_transform
-from yid_ocp.vision import CameraIntrinsics, CameraScene, FrameSequence, TrackOptions, look_at_pose, track_object
+from yid_ocp.vision import (
+    CameraIntrinsics,
+    CameraScene,
+    CloudFilterOptions,
+    FrameSequence,
+    TrackOptions,
+    look_at_pose,
+    track_object,
+)
 from yid_ocp.vision.frames import import_open3d
 from yid_ocp.vision.surface_meshes import TriangleMesh
 
@@ -24,6 +32,7 @@ LEAN = np.radians(45.0)
 Y_LENGTHS = {"T1": 0.813, "T2": 0.610, "T3": 0.737}
 Y_RADII = {"T1": 0.032, "T2": 0.025, "T3": 0.019}
 NOISE = 0.006  # [m] at 2 m
+COARSE = CloudFilterOptions(voxel_size=0.014)  # a third of the points, where radii do not matter
 
 
 def arc(start, direction, length, curvature, count=60):

@@ -119,7 +119,6 @@ def test_clouds(tmp_path, kind, big):
     for i in (2, 0, 1):
         assert np.array_equal(sequence.load_cloud(i), CLOUDS[i].astype(float))
         assert np.array_equal(sequence.load_colours(i), COLOURS[i])
-    assert np.allclose(sequence._select_frames([1]).load_colours(0), COLOURS[1])
     assert np.allclose(read_frames(bag.path, pose=POSE, unit="mm").load_cloud(0), 1e-3 * CLOUDS[0])
 
 

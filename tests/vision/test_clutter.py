@@ -4,15 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from smooth_rods import EYE, TARGET, SmoothY, box, filmed, floor_and_wall, measured, pole, seen
+from smooth_rods import COARSE, EYE, TARGET, SmoothY, box, filmed, floor_and_wall, measured, pole, seen
 
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.vision import (
-    CloudFilterOptions,
-    ExtraMesh,
-    FrameSequence,
-    look_at_pose,
-)
+from yid_ocp.vision import CloudFilterOptions, ExtraMesh, FrameSequence, look_at_pose
 from yid_ocp.vision.point_cloud import has_wanted_colour
 from yid_ocp.vision.sequence_calibration import BackgroundPoints, group_foreign_clusters
 from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
@@ -32,7 +27,7 @@ TABLE = [0.6, 0.5, -0.2], [0.6, 0.8, 0.04]
     ],
 )
 def test_things_in_reach_neither_drop_frames_nor_mislead(alone, things, junction):
-    found, error = measured(alone, *filmed(SmoothY(), FRAMES, things))
+    found, error = measured(alone, *filmed(SmoothY(), FRAMES, things), filters=COARSE)
     assert np.isfinite(error[:, 0, 0]).sum() >= junction * FRAMES
     assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.04
     relative = np.abs(error / found.std)[np.isfinite(error)]
@@ -46,7 +41,7 @@ def table():
 
 
 def test_messages_name_the_thing_and_what_helps(alone, table):
-    found, _ = measured(alone, *table)
+    found, _ = measured(alone, *table, filters=COARSE)
     thing = found.foreign_objects[0]
     assert thing.centre == pytest.approx([0.7, 0.5, -0.18], abs=0.15)
     assert thing.size[1] == pytest.approx(0.8, abs=0.1)
@@ -62,7 +57,7 @@ def test_every_remedy_takes_the_table_away(alone, table):
     empty = FrameSequence.from_clouds([0.0, 1.0], clouds, look_at_pose(EYE, TARGET))
     mesh = ExtraMesh(box=TABLE[1], xyz=TABLE[0])
     for how in ({"background_estimation": "frames"}, {"extra": [mesh]}, {"empty": empty}):
-        found, error = measured(alone, *table, **how)
+        found, error = measured(alone, *table, filters=COARSE, **how)
         assert np.nanmax(np.linalg.norm(error, axis=2)) < 0.02
         assert all(np.linalg.norm(thing.size) < 0.6 for thing in found.foreign_objects)
 

@@ -124,31 +124,25 @@ def result_of(folder):
     return result
 
 
-def test_what_an_interrupted_run_did_is_used(cli, config, whole, tmp_path, monkeypatch):
+def test_what_an_interrupted_run_did_is_used_and_several_workers_do_the_rest(cli, config, whole, tmp_path, monkeypatch):
     """Killed after the first frame: the next run does the others alone, with the same result to the last bit."""
     worked, work = [], FrameTracker.track_frame
 
     def interrupted(self, index, common):
-        if len(worked) == 1:
+        if worked:
             raise KeyboardInterrupt
-        worked.append(index)
-        return work(self, index, common)
+        worked.append(work(self, index, common))
+        return worked[0]
 
     monkeypatch.setattr(FrameTracker, "track_frame", interrupted)
     assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()
-    later = []
-
-    def counted(self, index, common):
-        later.append(index)
-        return work(self, index, common)
-
-    monkeypatch.setattr(FrameTracker, "track_frame", counted)
     monkeypatch.setattr(FrameTracker, "calibrate_sequence", None)  # it is known
-    assert cli("track", config, "--out", tmp_path / "run", "--set", "track.n_drawn_frames=0").code == 0
-    assert len(later) == 2
-    assert not set(later) & set(worked)
+    again = cli("track", config, "--out", tmp_path / "run", "--set", "track.n_drawn_frames=0", "--workers", "2")
+    assert again.code == 0, again.err
+    spent = [frame["seconds"] for frame in json.loads((tmp_path / "run" / "result.json").read_text())["frames"]]
+    assert spent[0] == worked[0].cpu_seconds
     assert not (tmp_path / "run.partial").exists()
     assert result_of(tmp_path / "run") == result_of(whole.folder)
     one, other = (read_recording(folder / "recording.h5").points[-1] for folder in (tmp_path / "run", whole.folder))
@@ -156,17 +150,11 @@ def test_what_an_interrupted_run_did_is_used(cli, config, whole, tmp_path, monke
     assert np.array_equal(one.std, other.std)
 
 
-def test_several_workers_find_the_same(cli, config, whole, tmp_path):
-    done = cli("track", config, "--out", tmp_path / "two", "--set", "track.n_drawn_frames=0", "--workers", "2")
-    assert done.code == 0, done.err
-    assert result_of(tmp_path / "two") == result_of(whole.folder)
-
-
 @pytest.mark.parametrize("name", ["track_single_arm", "track_dual_arm"])
 def test_the_examples_run(cli, repository, tmp_path, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
-    short = ("duration=1.2", "frame_rate=4.0", "dropped_fraction=0.0")
+    short = ("duration=1.0", "frame_rate=4.0", "dropped_fraction=0.0")
     arguments = [part for setting in short for part in ("--set", f"track.virtual_frames.{setting}")]
     quick = ("--quiet", "--set", "track.n_drawn_frames=0", "--set", "track.keep_frames=true")
     done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)

@@ -61,7 +61,7 @@ def test_a_sequence_survives_the_disk(folder):
     assert np.allclose(sequence.camera_pose, POSE)
     assert np.allclose(sequence.load_cloud(0), CLOUD, atol=1e-6)
     assert np.allclose(sequence.load_world_cloud(1), CLOUD[:2] @ POSE[:3, :3].T + POSE[:3, 3], atol=1e-6)
-    assert sequence._select_frames([1]).frame_names == ("000001.ply",)
+    assert sequence.frame_names == ("000000.ply", "000001.ply")
 
 
 COLOURS = np.array([[255, 0, 7], [1, 2, 3], [9, 200, 0]], np.uint8)

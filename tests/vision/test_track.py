@@ -23,33 +23,44 @@ from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CameraState
 from yid_ocp.vision.track import FrameTracker
 
 MILLIMETRE = 1e-3
+LATENCY, CALIBRATION_FRAMES = 0.06, 5
 
 
 @pytest.fixture(scope="module")
 def plain(system, small):
     """The small sequence tracked without the robot's meshes, all points, and what was told meanwhile."""
-    calls = []
-    options = TrackOptions(tracked_points=system.point_frames)
-    found = track_object(
-        CameraScene(system), small.recording, small.sequence, options, progress=lambda *told: calls.append(told)
-    )
+    calls, options = [], TrackOptions(tracked_points=system.point_frames)
+    scene, sequence = CameraScene(system), small.sequence
+    found = track_object(scene, small.recording, sequence, options, progress=lambda *told: calls.append(told))
     return SimpleNamespace(track=found, calls=calls)
 
 
-def test_points_at_two_metres(clean, system):
+def some_of(sequence, indices):
+    """A frame sequence with some of the frames alone."""
+    names = tuple(sequence.frame_names[i] for i in indices)
+    load = lambda k: sequence.load_cloud(indices[k])  # noqa: E731
+    return replace(sequence, stamps=sequence.stamps[indices], frame_names=names, load_cloud=load)
+
+
+def test_points_at_two_metres(clean):
     """Under 10 mm in the median and nothing accepted that is off by more than 40 mm, at stamps 60 ms late."""
-    assert len(clean.track.t) >= 9
+    assert len(clean.track.t) >= 7
     assert np.isfinite(clean.errors).all()
     assert (np.median(clean.errors, axis=0) < 3 * MILLIMETRE).all()
     assert clean.errors.max() < 15 * MILLIMETRE
     assert all((frame.cpu_seconds > 0) == (frame.shape_fit is not None) for frame in clean.track.frame_reports)
 
 
-def test_a_third_of_the_frames_lost_and_a_fifth_of_the_points_wrong(tracked):
-    hard = tracked(outliers=0.2, dropped_fraction=1 / 3, seed=2, latency_std=0.003)
+def test_a_third_of_the_frames_lost_a_fifth_of_the_points_wrong_and_stamps_late(tracked):
+    hard = tracked(outliers=0.2, dropped_fraction=1 / 3, seed=11, latency_std=0.003, late_fraction=0.25)
     assert np.isfinite(hard.errors).mean() > 0.9
     assert (np.nanmedian(hard.errors, axis=0) < 5 * MILLIMETRE).all()
-    assert np.nanmax(hard.errors) < 40 * MILLIMETRE
+    assert np.nanmax(hard.errors) < 15 * MILLIMETRE
+    late = set(np.flatnonzero(hard.made.sequence.stamps - hard.made.capture_times - LATENCY > 0.1).tolist())
+    dropped = {frame.index: frame.drop_reason for frame in hard.track.frame_reports if not frame.is_good}
+    assert len(late) == 2
+    assert set(dropped) == late
+    assert all("late" in reason for reason in dropped.values())
 
 
 def test_errors_are_within_the_stated_standard_deviations(clean, system):
@@ -62,21 +73,18 @@ def test_errors_are_within_the_stated_standard_deviations(clean, system):
 
 def test_the_seed_hardly_matters(system, small, plain):
     """The same frame sequence, other random points in the walk: within the noise."""
-    options = TrackOptions(tracked_points=system.point_frames)
-    again, other = (
-        track_object(CameraScene(system), small.recording, small.sequence, replace(options, seed=seed)).position
-        for seed in (0, 1)
-    )
-    assert np.abs(plain.track.position - other).max() < 2 * MILLIMETRE
-    assert np.array_equal(plain.track.position, again)
+    for seed, off in ((0, 0.0), (1, 2 * MILLIMETRE)):
+        options = TrackOptions(tracked_points=system.point_frames, seed=seed)
+        found = track_object(CameraScene(system), small.recording, small.sequence, options)
+        assert np.abs(plain.track.position - found.position).max() <= off
 
 
 def test_the_camera_and_its_clock_are_found(clean):
     camera, made = clean.track.camera_calibration, clean.made.sequence
-    assert camera.n_frames == len(made)
+    assert camera.n_frames == CALIBRATION_FRAMES
     std = np.sqrt(np.diag(camera.state_covariance))
     true = CameraState(
-        made.camera_pose, clock_offset=clean.latency, clock_reference_stamp=camera.camera_state.clock_reference_stamp
+        made.camera_pose, clock_offset=LATENCY, clock_reference_stamp=camera.camera_state.clock_reference_stamp
     )
     assert (np.abs(camera.camera_state.difference_from(true)) < 4 * std).all()
     assert std[CLOCK_OFFSET_INDEX] < 0.01
@@ -86,23 +94,11 @@ def test_the_camera_and_its_clock_are_found(clean):
     assert clean.track.shared_std.max() > 0
 
 
-def test_late_stamps_are_dropped(tracked):
-    chosen = range(2, 10)
-    made = tracked(late_fraction=0.25, seed=3, frames=chosen)
-    stamped = made.made.sequence.stamps - made.made.capture_times
-    late = {i for i, k in enumerate(chosen) if stamped[k] - made.latency > 0.1}
-    dropped = {frame.index for frame in made.track.frame_reports if not frame.is_good}
-    assert len(late) == 2
-    assert dropped == late
-    assert "late" in made.track.frame_reports[min(late)].drop_reason
-    assert np.nanmax(made.errors) < 15 * MILLIMETRE
-
-
 def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
-    sequence = clean.made.sequence._select_frames([1, 4, 6, 9])
+    sequence = some_of(clean.made.sequence, [1, 4, 7])
     pose = sequence.camera_pose.copy()
-    pose[:3, 3] += [0.03, -0.025, 0.02]
-    pose[:3, :3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ pose[:3, :3]
+    pose[:3, 3] += [0.015, -0.012, 0.01]
+    pose[:3, :3] = Rotation.from_rotvec([0.01, -0.005, 0.015]).as_matrix() @ pose[:3, :3]
     loose = {"max_distance_in_radii": 4.0, "max_distance_ratio": 20.0, "max_grasp_gap_change": 0.2}
     kept = {"calibration": CameraCalibrationOptions(fix_pose=True), "max_point_std": 0.2}
     scene, stds = CameraScene(system, "package:baxter"), []
@@ -124,7 +120,7 @@ def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
 def test_without_motion_the_clock_has_to_be_given(system, clean, small):
     joints = small.recording.joints
     still = Recording(replace(joints, position=np.tile(joints.position[:1], (len(joints.t), 1))))
-    sequence = clean.made.sequence._select_frames([0, 1, 2])
+    sequence = some_of(clean.made.sequence, [0, 1, 2])
     with pytest.raises(DataError, match="cannot be calibrated by the arm"):
         track_object(CameraScene(system, "package:baxter"), still, sequence)
 
@@ -211,7 +207,7 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
     def load(index):
         if 3 <= index < 3 + len(bad):
             return bad[index - 3](small.clouds[1])
-        return small.clouds[[2, 0, 1][index]] if index < 3 else small.clouds[0]
+        return small.clouds[[2, 0, 1][index] if index < 3 else 0]
 
     sequence = replace(small.sequence, stamps=np.array(stamps), frame_names=tuple(map(str, stamps)), load_cloud=load)
     found = track_object(CameraScene(system), small.recording, sequence)
@@ -228,24 +224,15 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
     assert sum(found.frame_drop_reason_counts.values()) == len(bad) + 3
 
 
-def spoilt(small, clouds=None, t=None):
-    """The small frame sequence with other clouds or stamps."""
-    return FrameSequence.from_clouds(
-        small.sequence.stamps if t is None else t,
-        small.clouds if clouds is None else clouds,
-        small.sequence.camera_pose,
-    )
-
-
 @pytest.mark.parametrize(
-    ("change", "options", "message"),
+    ("scale", "options", "message"),
     [
-        (lambda points: 1000 * points, TrackOptions(), "metres"),
-        (lambda points: points, TrackOptions(filters=CloudFilterOptions(box_lower=(0.0, 0.0, 5.0))), "camera's pose"),
+        (1000, TrackOptions(), "metres"),
+        (1, TrackOptions(filters=CloudFilterOptions(box_lower=(0.0, 0.0, 5.0))), "camera's pose"),
     ],
 )
-def test_nothing_but_bad_clouds_is_an_error(system, small, change, options, message):
-    sequence = spoilt(small, [change(points) for points in small.clouds])
+def test_nothing_but_bad_clouds_is_an_error(system, small, scale, options, message):
+    sequence = replace(small.sequence, load_cloud=lambda index: scale * small.clouds[index])
     with pytest.raises(DataError, match="not one frame could be used") as caught:
         track_object(CameraScene(system), small.recording, sequence, options)
     assert message in caught.value.what
@@ -255,7 +242,7 @@ def test_nothing_but_bad_clouds_is_an_error(system, small, change, options, mess
 
 
 def test_the_time_of_another_clock(system, small):
-    later = spoilt(small, t=small.sequence.stamps + 1.7e9)
+    later = replace(small.sequence, stamps=small.sequence.stamps + 1.7e9)
     with pytest.raises(DataError, match="their clocks are not the same") as caught:
         track_object(CameraScene(system), small.recording, later)
     assert "give the clock offset" in caught.value.hint

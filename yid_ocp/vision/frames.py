@@ -17,7 +17,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, cached_property, lru_cache
 from types import ModuleType
 
@@ -78,12 +78,6 @@ class CameraIntrinsics:
     def pixel_rays(self) -> Array:
         """Direction of every pixel with z = 1, shape (height, width, 3); NaN where the lens shows none."""
         return _rays(self)
-
-    def _project_to_pixels(self, points: ArrayLike) -> Array:
-        """Pixels (u, v) at which points of the camera's frame with z > 0, shape (N, 3) [m], appear; shape (N, 2)."""
-        seen = np.asarray(points, float)
-        x, y = self._distort(seen[:, 0] / seen[:, 2], seen[:, 1] / seen[:, 2])
-        return np.stack([self.fx * x + self.cx, self.fy * y + self.cy], axis=1)
 
     def points_from_depth(self, depth: ArrayLike) -> Array:
         """Points (N, 3) in the camera's frame, row by row, of a depth image (height, width) along the optical axis [m].
@@ -197,18 +191,6 @@ class FrameSequence:
     def load_world_cloud(self, index: int) -> Array:
         """Cloud of a frame in the world, shape (N, 3) [m]; `DataError` where it cannot be read."""
         return self.load_cloud(index) @ self.camera_pose[:3, :3].T + self.camera_pose[:3, 3]
-
-    def _select_frames(self, indices: Sequence[int]) -> FrameSequence:
-        """The frame sequence with only these frames, in this order."""
-        kept = [int(i) for i in indices]
-        names, colours = tuple(self.frame_names[i] for i in kept), self.load_colours
-        return replace(
-            self,
-            stamps=self.stamps[kept],
-            frame_names=names,
-            load_cloud=lambda i: self.load_cloud(kept[i]),
-            load_colours=None if colours is None else lambda i: colours(kept[i]),
-        )
 
     @staticmethod
     def from_clouds(
