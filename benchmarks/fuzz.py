@@ -3,16 +3,19 @@
     python benchmarks/fuzz.py [KIND ...] [--inputs 20000] [--seconds 3600] [--jobs 2] [--first 0]
     python benchmarks/fuzz.py KIND --only SEED --keep FOLDER
 
-An input is a valid file (configuration, setting, recording, table, bag, robot, camera frames) that was damaged by a
-rule and a seed: bits, blocks, lines, numbers, names, datasets, attributes, types. It is read as the program reads it.
-Sound is what it takes, and what it refuses with an error that says what is wrong; anything else is printed with the
-kind and the seed that make it again: an exception of another kind, a signal, more than 20 s, more than 2 GiB, a file
-left where the process stands. Exit code 1 where there is anything to print.
+An input is a valid file (configuration, setting, recording, table, bag, dataset, robot, camera frames) that was damaged
+by a rule and a seed: bits, blocks, lines, numbers, names, datasets, attributes, types. It is read as the program reads
+it, by previews and whole commands too; some inputs are odd environments, and signals at random times. Sound is what it
+takes, and what it refuses with an error of four parts; anything else is printed with the kind and the seed that make it
+again: an exception of another kind, a signal, more than 20 s, more than 2 GiB, a file left where the process stands, a
+command that goes on when it was asked to end. Exit code 1 where there is anything to print.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import json
 import math
 import multiprocessing
@@ -20,6 +23,8 @@ import os
 import re
 import resource
 import shutil
+import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -73,6 +78,10 @@ NUMBERS = (
     *("1,5", "0.1.2", "+", "nan", ".nan", "inf", ".inf", "-.inf", "one", "true", "null", "[1]", "{a: 1}", ""),
     *("9" * 40, "9" * 5000),
 )
+ODD_JSON: Sequence[Any] = (
+    *(None, True, "", "text", "{episode_index.foo}", "{episode_index:>9999999999}", "{}", "../{episode_index}", "v3.0"),
+    *(0, -1, 0.5, 1e308, 10**400, [], [[1]], ["a", "a"], [None], {}, {"names": 5}, {"dtype": [1]}),
+)
 PIECES = (
     *("\0", "\t", "\ufeff", "é" * 300, "---\n", "\n\n", "<<: ", "{" * 60, "[" * 60),
     *["*a", "&a", "!!set", "'", '"', "..", "/"],
@@ -117,6 +126,27 @@ def originals(folder: Path) -> None:
         FrameSequence.from_clouds([0.1, 0.2], [cloud, cloud], look_at_pose([2, 0, 0], [0, 0, 0])), folder / "frames"
     )
     write_bag(folder / "bag")
+    write_dataset(folder / "arm")
+
+
+def write_dataset(folder: Path) -> None:
+    """A LeRobot dataset of two episodes."""
+    import pyarrow
+    from pyarrow import parquet
+
+    entry = {"dtype": "float32", "shape": [2], "names": ["shoulder.pos", "elbow.pos"]}
+    numbers = {name: {"dtype": "int64", "shape": [1], "names": None} for name in ("frame_index", "episode_index")}
+    info = {"codebase_version": "v2.1", "fps": 30, "total_episodes": 2, "robot_type": "so101", "chunks_size": 1000}
+    info |= {"data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"}
+    info |= {"features": {"observation.state": entry, "action": entry, **numbers}}
+    for path in ("meta", "data/chunk-000"):
+        (folder / path).mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info, indent=1), encoding="utf-8")
+    for episode in range(2):
+        values = [[0.1 * i, 0.2 + episode] for i in range(9)]
+        table = {"observation.state": values, "action": values, "frame_index": list(range(9))}
+        file = folder / "data" / "chunk-000" / f"episode_{episode:06d}.parquet"
+        parquet.write_table(pyarrow.table({**table, "episode_index": [episode] * 9}), file)
 
 
 def write_bag(folder: Path) -> None:
@@ -314,6 +344,103 @@ def probe_frames(folder: Path, rng: Random) -> None:
         sequence.load_world_cloud(index)
 
 
+def probe_dataset(folder: Path, rng: Random) -> None:
+    """A LeRobot dataset whose metadata have other types or values, or whose table is damaged."""
+    if rng.random() < 0.3:
+        damage_folder(folder / "arm", rng)
+    else:
+        file = folder / "arm" / "meta" / "info.json"
+        info = json.loads(file.read_text())
+        for _ in range(int(rng.integers(1, 3))):
+            owner: Any = info
+            while isinstance(owner, dict) and owner and rng.random() < 0.7:
+                key = sorted(owner)[int(rng.integers(len(owner)))]
+                if not isinstance(owner[key], dict) or rng.random() < 0.4:
+                    owner[key] = ODD_JSON[int(rng.integers(len(ODD_JSON)))]
+                    break
+                owner = owner[key]
+        file.write_text(json.dumps(info))
+    if rng.random() < 0.5:
+        run_in_process("import", str(folder / "arm"), "--preview")
+    read_any(folder / "arm")
+
+
+def probe_preview(folder: Path, rng: Random) -> None:
+    """A preview of a table, or of what is none."""
+    file = folder / "table.csv"
+    if rng.random() < 0.3:
+        whole = [path for path in folder.rglob("*") if path.is_file()]
+        file.write_bytes(whole[int(rng.integers(len(whole)))].read_bytes())
+    lines = file.read_bytes().split(b"\n")
+    file.write_bytes(b"\n".join(lines[: int(rng.integers(1, len(lines) + 1))]))
+    if rng.random() < 0.7:
+        file.write_bytes(damaged_bytes(file.read_bytes(), rng))
+    run_in_process("import", str(file), "--preview")
+
+
+def probe_command(folder: Path, rng: Random) -> None:
+    """A whole command on an odd configuration that can be read."""
+    text = (folder / "config.yaml").read_text(encoding="utf-8")
+    found = list(re.finditer(r"(?<=[ \[])-?\d+\.?\d*", text))
+    one = found[int(rng.integers(len(found)))]
+    value = float(rng.choice([0, -1, 1e-9, 1e-3, 3, 1e3, 1e12, 1e300])) * float(rng.choice([1, rng.random()]))
+    (folder / "config.yaml").write_text(f"{text[: one.start()]}{value!r}{text[one.end() :]}", encoding="utf-8")
+    name = str(rng.choice(["solve", "simulate", "identifiability", "check", "inspect"]))
+    quick = ["--set", "problem.duration=0.2", "--set", "output.discretisation_check=none"]
+    more = ["--intervals", "none"] if name == "identifiability" else []
+    run_in_process(name, str(folder / "config.yaml"), "--out", str(folder / "run"), *quick, *more)
+
+
+def probe_environment(folder: Path, rng: Random) -> None:
+    """A command where streams, home, encoding or what its files are is odd."""
+    home, config = folder / "home", folder / "config.yaml"
+    home.write_text("a file, where no folder can be made")
+    line = f"{sys.executable} -m yid_ocp simulate {config} --out {folder / 'run'}"
+    case, allowed = int(rng.integers(9)), (0,)
+    if case >= 6:
+        target = (config, folder / "recording.h5", folder / "robot.urdf")[int(rng.integers(3))]
+        target.unlink()
+        os.mkfifo(target) if case == 6 else target.symlink_to("/dev/zero" if case == 7 else folder)
+        allowed = (2,)
+    tail = ("2>&-", "2>/dev/full", ">&-", "", "", "")[case] if case < 6 else ""
+    own = {3: {"HOME": str(home), "XDG_CACHE_HOME": ""}, 4: {"PYTHONIOENCODING": "ascii"}, 5: {"LC_ALL": "C"}}
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), **own.get(case, {})}
+    if case == 3:
+        environment.pop("YID_OCP_CACHE", None)
+    done = subprocess.run(
+        ["sh", "-c", f"{line} {tail}"], env=environment, capture_output=True, text=True, errors="replace", check=False
+    )
+    if done.returncode not in allowed:
+        raise UnsoundError(f"environment {case}: exit code {done.returncode}: {done.stderr[-300:]}")
+    if done.returncode == 2:
+        judged(2, done.stderr)
+
+
+def probe_signal(folder: Path, rng: Random) -> None:
+    """A command that is asked to end at a random time."""
+    line = [sys.executable, "-m", "yid_ocp", "solve", str(folder / "config.yaml"), "--out", str(folder / "run")]
+    number = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)[int(rng.integers(3))]
+
+    def plain() -> None:
+        for each in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(each, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    process = subprocess.Popen(line, env=environment, stdout=-3, stderr=-3, preexec_fn=plain)
+    try:
+        process.wait(float(rng.uniform(0.1, 4.0)))
+    except subprocess.TimeoutExpired:
+        asked = time.monotonic()
+        process.send_signal(number)
+        code = process.wait()
+        late = code in (0, 1) and time.monotonic() - asked > 0.5  # else it was past listening
+        if late or code not in (0, 1, -number, 128 + number):
+            raise UnsoundError(f"{number.name}: exit code {code}") from None
+        if code and [path for path in folder.iterdir() if path.name in ("run", ".run.partial")] and code > 0:
+            raise UnsoundError(f"{number.name}: something is left") from None
+
+
 KINDS: Mapping[str, Callable[[Path, Random], None]] = {
     "yaml": probe_yaml,
     "set": probe_set,
@@ -322,8 +449,14 @@ KINDS: Mapping[str, Callable[[Path, Random], None]] = {
     "bag": probe_bag,
     "urdf": probe_urdf,
     "frames": probe_frames,
+    "dataset": probe_dataset,
+    "preview": probe_preview,
+    "command": probe_command,
+    "environment": probe_environment,
+    "signal": probe_signal,
 }
-SHARES = {"yaml": 3, "set": 3, "hdf5": 3, "csv": 4, "bag": 3, "urdf": 4, "frames": 2}
+SHARES = {"yaml": 60, "set": 60, "hdf5": 60, "csv": 80, "bag": 60, "urdf": 80, "frames": 40}
+SHARES |= {"dataset": 60, "preview": 60, "command": 20, "environment": 1, "signal": 1}
 
 
 class UnsoundError(Exception):
@@ -333,10 +466,24 @@ class UnsoundError(Exception):
 def checked(folder: Path, *settings: str) -> None:
     """Run the command `check`."""
     shutil.rmtree(folder / "run", ignore_errors=True)
-    arguments = ["check", str(folder / "config.yaml"), "--quiet", "--out", str(folder / "run"), *settings]
-    code = command(arguments)
+    run_in_process("check", str(folder / "config.yaml"), "--quiet", "--out", str(folder / "run"), *settings)
+
+
+def run_in_process(*arguments: str) -> None:
+    """Run a command and judge how it ended."""
+    said = io.StringIO()
+    with contextlib.redirect_stderr(said):
+        code = command(list(arguments))
+    judged(code, said.getvalue())
+
+
+def judged(code: int, said: str) -> None:
+    """Whether a command ended as it may: refused with four parts, or done."""
     if code not in (0, 1, 2):
-        raise UnsoundError(f"exit code {code}")
+        raise UnsoundError(f"exit code {code}: {said[-300:]}")
+    error = said.rpartition("error: ")[2]
+    if code == 2 and not (all(f"\n  {part}: " in error for part in ("where", "allowed", "try")) and len(error) < 620):
+        raise UnsoundError(f"an error without its four parts, or too long: {error[:700]}")
 
 
 # -- workers ----------------------------------------------------------------------------------------------------------
@@ -362,8 +509,8 @@ def tried(case: Case, originals_folder: Path, work: Path) -> str:
     try:
         KINDS[case.kind](work, rng)
     except YidError as error:
-        if not error.what or "Traceback" in str(error):
-            return f"an error without words: {error!r}"
+        if "" in error.four_parts().values() or "Traceback" in str(error) or len(str(error)) > 600:
+            return f"an error without words, or with too many: {error!r}"
     except UnsoundError as error:
         return str(error)
     except Exception as error:  # whatever else comes up is what is looked for
@@ -458,7 +605,7 @@ def hunt(cases: Iterator[Case], seconds: float, jobs: int) -> tuple[int, list[tu
 
 def drawn(kinds: Sequence[str], inputs: int, first: int = 0) -> Iterator[Case]:
     """So many inputs, more of those kinds that take less time."""
-    order = [kind for kind in kinds for _ in range(SHARES[kind])]
+    order = np.random.default_rng(0).permutation([kind for kind in kinds for _ in range(SHARES[kind])]).tolist()
     for seed in range(first, first + inputs):
         yield Case(order[seed % len(order)], seed)
 
