@@ -74,9 +74,6 @@ class ModelError(YidError):
 class SolverError(YidError):
     """A solver does not support what was requested."""
 
-    _usual_allowed = "solvers and options as docs/settings.md lists them"
-    _usual_hint = "choose another solver or option"
-
 
 class OutputError(YidError):
     """A result cannot be written to its destination."""
@@ -88,15 +85,9 @@ class OutputError(YidError):
 class WorkerError(YidError):
     """Workers cannot be reached, or cannot do their tasks."""
 
-    _usual_allowed = "workers that can be reached, as docs/workers.md describes them"
-    _usual_hint = "leave --workers and --scheduler out"
-
 
 class InsufficientMemoryError(YidError):
     """The machine has too little memory."""
-
-    _usual_allowed = "a run that fits into this machine's memory"
-    _usual_hint = "shorten the run, or take fewer links"
 
 
 _MAX_MESSAGE_LENGTH = 560  # of the four parts together, without their labels

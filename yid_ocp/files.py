@@ -42,11 +42,14 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
     allowed = "a regular file"
     try:
         info = path.stat()
-    except FileNotFoundError as error:
-        raise DataError("there is no such file", where=str(path), allowed=allowed, hint="check the path") from error
+        readable = os.access(path, os.R_OK)
     except (OSError, ValueError) as error:  # a NUL in the name is a ValueError
-        what = f"the file cannot be read ({os_error_reason(error)})"
-        raise DataError(what, where=str(path), allowed=allowed, hint="check the path and your rights") from error
+        absent = isinstance(error, FileNotFoundError)
+        what = "there is no such file" if absent else f"the file cannot be read ({os_error_reason(error)})"
+        raise DataError(what, where=str(path), allowed=allowed, hint="check the path") from error
+    if not readable:
+        hint = "chmod it, or copy it to a folder of your own"
+        raise DataError("the file cannot be read (Permission denied)", where=str(path), allowed=allowed, hint=hint)
     if not stat.S_ISREG(info.st_mode):
         what = "this is a folder" if stat.S_ISDIR(info.st_mode) else "this is a pipe or a device"
         raise DataError(what, where=str(path), allowed=allowed, hint="copy what it gives into a file")
@@ -148,13 +151,10 @@ def file_sha256(path: Path) -> str:
         If it is missing or cannot be read.
     """
     digest = hashlib.sha256()
-    try:
-        for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
-            with check_input_file(entry).open("rb") as file:
-                while block := file.read(1 << 20):
-                    digest.update(block)
-    except OSError as error:
-        raise DataError(f"the file cannot be read ({os_error_reason(error)})", where=str(path)) from error
+    for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
+        with check_input_file(entry).open("rb") as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
     return digest.hexdigest()
 
 
@@ -179,10 +179,7 @@ def to_json_types(value: Any, notes: list[str] | None = None, path: str = "") ->
 
 
 def to_lossless_plain_data(value: Any) -> Any:
-    """Nested dataclasses, containers and arrays as JSON data without loss; NaN and infinities become text.
-
-    JSON has no infinities: what is not finite becomes text.
-    """
+    """Nested dataclasses, containers and arrays as JSON data without loss; NaN and infinities become text."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {entry.name: to_lossless_plain_data(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
     if isinstance(value, np.ndarray):
@@ -199,16 +196,7 @@ def to_lossless_plain_data(value: Any) -> Any:
 def attributes_to_json(value: Any, names: str) -> dict[str, Any]:
     """Some attributes of an object as JSON data, by name or as `key=name`, separated by blanks."""
     pairs = [name.partition("=") for name in names.split()]
-    return {key: json_with_nonfinite_as_none(getattr(value, name or key)) for key, _, name in pairs}
-
-
-def json_with_nonfinite_as_none(value: Any) -> Any:
-    """Numbers, texts and their containers as JSON data; NaN and infinities become None."""
-    if isinstance(value, Mapping):
-        return {key: json_with_nonfinite_as_none(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [json_with_nonfinite_as_none(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return {key: to_json_types(getattr(value, name or key)) for key, _, name in pairs}
 
 
 def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:

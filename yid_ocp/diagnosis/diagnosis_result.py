@@ -35,7 +35,7 @@ from yid_ocp.diagnosis.verdict import (
 )
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.effects import EffectBase
-from yid_ocp.files import attributes_to_json, json_with_nonfinite_as_none
+from yid_ocp.files import attributes_to_json, to_json_types
 from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult, min_bonferroni_p_value
 from yid_ocp.inference.smoother import SmootherResult
 from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
@@ -210,7 +210,7 @@ def statistics_compared_with_thresholds(finding: DiagnosisResult) -> dict[str, A
             fit.effects[-1].label: _behind(fit, finding.single_effect_models[0]) for fit in finding.single_effect_models
         },
     }
-    return {name: json_with_nonfinite_as_none(value) for name, value in found.items()}
+    return {name: to_json_types(value) for name, value in found.items()}
 
 
 def _behind(fit: RefittedModel, first: RefittedModel) -> dict[str, float]:
@@ -234,7 +234,7 @@ def final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     for entry, value in zip(problem.system.parameters, theta, strict=True):
         if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:
             free = entry.name in shared
-            std = json_with_nonfinite_as_none(fit.std[entry.name]) if free else 0.0
+            std = to_json_types(fit.std[entry.name]) if free else 0.0
             found[entry.name] = {"value": float(value), "std": std, "unit": entry.unit, "free": free}
     if finish.jacobian is None:
         finish = problem.evaluate(problem.vector(fit.values), equilibrium_guesses=finish.equilibrium_guesses)
@@ -272,7 +272,7 @@ def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
     for entry in finding.selected_effects if finding.unknown_reason == "stand_in" else ():
         own = [check for check in failed if check.effect_label == entry.effect.label] or failed
         reason = "; ".join(check.disagreement_text for check in own)
-        closed = json_with_nonfinite_as_none(entry.cumulative_closure.fraction)
+        closed = to_json_types(entry.cumulative_closure.fraction)
         listed.append({**attributes_to_json(entry.effect, _EFFECT), "closure": closed, "reason": reason})
     return listed
 
@@ -281,8 +281,8 @@ def _closure(closed: GapClosure | None) -> dict[str, Any]:
     if closed is None:
         return {"closure": None, "closure_ci": None}
     return {
-        "closure": json_with_nonfinite_as_none(closed.fraction),
-        "closure_ci": json_with_nonfinite_as_none([closed.ci_low, closed.ci_high]),
+        "closure": to_json_types(closed.fraction),
+        "closure_ci": to_json_types([closed.ci_low, closed.ci_high]),
     }
 
 

@@ -169,7 +169,6 @@ class InputCorrections:
             kind: self._lag_function(kind, joints)
             for kind, joints in (("torque", system.driven), ("joints.effort", system.prescribed))
         }
-        self.lags_torque = self._lags["torque"] is not None
         self._late = ca.Function("delay", [theta], [late, ca.jacobian(late, self._chosen)])
         slope = ca.vertcat(ca.SX(0, 1), *(ca.jacobian(true_effort[i], effort[i]) for i in range(count)))
         outputs = [true_angle, true_effort, ca.densify(slope)]
@@ -365,7 +364,6 @@ class ModelFunctions:
         self.step = step
         self.parameter_names = names
         self.input_corrections = InputCorrections(step.system, names, step.is_compiled)
-        self._start_parameters = start_parameters
         self._statics: CasadiLockedCache[None, EquilibriumSolver] = CasadiLockedCache(lambda _: EquilibriumSolver(step))
         self._start_fit: CasadiLockedCache[None, InitialStateFitter] = CasadiLockedCache(
             lambda _: InitialStateFitter(step, start_parameters)

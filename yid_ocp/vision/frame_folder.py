@@ -26,7 +26,6 @@ from yid_ocp.files import (
     atomic_write,
     check_input_file,
     check_number_count,
-    is_file,
     read_input_json,
     read_input_text,
     write_text,
@@ -47,8 +46,6 @@ _AGAIN = "copy or record it again"
 
 def _read_cloud(path: Path, coloured: bool = False) -> tuple[Array, ColourArray | None]:
     """Points of a cloud in the file's unit, and their red, green and blue where asked for and there, both (N, 3)."""
-    if not is_file(path):
-        raise DataError("the file of the cloud is missing", where=str(path))
     check_input_file(path, _MAX_FRAME_BYTES)
     if path.suffix.lower() == ".ply":
         return _read_ply(path, coloured)
@@ -112,8 +109,6 @@ def _read_pcd(path: Path) -> tuple[Array, ColourArray | None]:
 def _read_depth_image(path: Path) -> Array:
     """A depth image in the file's unit, shape (height, width); `DataError` where it is no grey PNG of 16 bits."""
     o3d = import_open3d()
-    if not is_file(path):
-        raise DataError("the file of the depth image is missing", where=str(path))
     with check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
         head = file.read(24)  # whose last eight bytes are a PNG's width and height
     check_number_count(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
@@ -142,11 +137,7 @@ _Element = tuple[str, int, list[tuple[str, str]]]
 
 def _read_ply(path: Path, coloured: bool) -> tuple[Array, ColourArray | None]:
     """Positions and colours of the vertices; other properties and later elements are left out."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"the cloud cannot be read ({error.strerror})", where=str(path)) from error
-    head, end, body = data.partition(b"end_header")
+    head, end, body = path.read_bytes().partition(b"end_header")
     line, _, body = body.partition(b"\n")
     if not end or len(head) > _MAX_HEADER_BYTES or line.strip() or not head.startswith(b"ply"):
         raise _damaged(path, "it has no head")

@@ -111,10 +111,9 @@ def read_result_file(file: Path) -> dict[str, Any]:
     if not is_file(file):
         hint = "give the run folder that `solve` or `diagnose` printed"
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), hint=hint)
-    try:
-        result = dict(read_input_json(file))
-    except (ValueError, TypeError) as error:
-        raise DataError(f"the result cannot be read ({error})", where=str(file), hint="run it again") from error
+    result = read_input_json(file)
+    if not isinstance(result, dict):
+        raise DataError("the file is no result of a run", where=str(file), hint="run it again")
     if result.get("format") in _OLD_FORMATS:
         what = f"the run is of an earlier version ({result['format']}), whose keys had other names"
         what, hint = f"{what}; {_RENAMED_KEYS_HINT}", "diagnose again with this version"

@@ -17,7 +17,7 @@ import scipy.stats
 from yid_ocp.diagnosis.blind.ensemble import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EFFECTS
-from yid_ocp.files import json_with_nonfinite_as_none
+from yid_ocp.files import to_json_types
 
 _FORMAT = "yid-blind/1"
 _CATEGORIES = tuple(BLIND_CASE_CATEGORY_SHARES)
@@ -410,10 +410,10 @@ def calibrate_thresholds(
             "side": rule.side,
             "cases": len(sample),
             "coverage": attained,
-            "quantile": json_with_nonfinite_as_none(value),
+            "quantile": to_json_types(value),
             "limit": rule.limit,
             "is": getattr(limits, rule.setting),
-            "sample": json_with_nonfinite_as_none(sorted(sample)),
+            "sample": to_json_types(sorted(sample)),
             "effects_beyond": {f"{size:.3g}": _binomial_proportion(hits) for size, hits in beyond.items()},
             "strange_beyond": _binomial_proportion(strange),
         }
