@@ -9,7 +9,6 @@ from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.vision import (
     CameraScene,
     DepthCamera,
-    FloorAndWall,
     FrameTiming,
     VirtualCamera,
     look_at_pose,
@@ -95,7 +94,7 @@ def test_frame_timing():
 
 def test_virtual_frames_are_the_same_every_time(system, run):
     pose = look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
-    camera = VirtualCamera(pose, timing=FrameTiming(mean_rate=2.0), background=FloorAndWall(None, None))
+    camera = VirtualCamera(pose, timing=FrameTiming(mean_rate=2.0))
     one, two = (render_virtual_frames(CameraScene(system), run.t, run.q, replace(camera, seed=seed)) for seed in (3, 4))
     first = one.sequence.load_cloud(1)
     one.sequence.load_cloud(0)

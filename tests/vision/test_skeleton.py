@@ -35,7 +35,6 @@ def test_nodes_lie_on_the_centre_lines():
     nodes, label = found.nodes, found.node_of_point
     assert np.median(from_bones(nodes)) < 0.005
     assert from_bones(nodes).max() < 0.02
-    assert found.node_weights.sum() == found.has_skeleton_node.sum()
     assert found.has_skeleton_node.mean() > 0.9
     for i in range(len(nodes)):
         mine = cloud.points[label == i]
@@ -44,11 +43,10 @@ def test_nodes_lie_on_the_centre_lines():
 
 
 def test_the_walk_begins_at_the_lowest_point():
-    for down, end in (((0, 0, -1), FOOT), ((0, 0, 1), ENDS[1]), ((0, 1, 0), ENDS[0])):
-        nodes = extract_skeleton(letter(), np.random.default_rng(0), down=down).nodes
-        assert np.linalg.norm(nodes[0] - end) < 0.05
-        # from there it goes on to neighbours
-        assert np.linalg.norm(np.diff(nodes[:6], axis=0), axis=1).max() < 0.1
+    nodes = extract_skeleton(letter(), np.random.default_rng(0)).nodes
+    assert np.linalg.norm(nodes[0] - FOOT) < 0.05
+    # from there it goes on to neighbours
+    assert np.linalg.norm(np.diff(nodes[:6], axis=0), axis=1).max() < 0.1
 
 
 def test_the_same_seed_gives_the_same_nodes_and_another_hardly_others():
@@ -73,7 +71,7 @@ def test_two_parts_and_a_stray_heap():
     found = extract_skeleton(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0))
     assert set(found.component_of_node.tolist()) == {0, 1}
     assert not found.has_skeleton_node[-60:].any()
-    weights = [found.node_weights[found.component_of_node == part].sum() for part in (0, 1)]
+    weights = np.bincount(found.component_of_node[found.node_of_point[found.has_skeleton_node]])
     assert weights[0] > weights[1]
 
 

@@ -32,11 +32,13 @@ from yid_ocp.virtual.mujoco_simulation import (
     SimulationResult,
     simulate_in_mujoco,
 )
+from yid_ocp.vision.frames import look_at_pose
 
 _Generators = Mapping[str, np.random.Generator]
 
 # every sensor draws from a stream of its own, so that leaving one out changes no other; the order is part of the seed
 _STREAMS = ("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias")
+_CAMERA_DIRECTION = np.array([0.93, 0.0, 0.37])  # from the object
 _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
 
@@ -74,12 +76,10 @@ class ArmSensorNoise:
 
 @dataclass(frozen=True)
 class PointCamera:
-    """A slow camera that measures positions of the object's points.
+    """A slow camera that measures positions of the object's points that no arm holds.
 
     Attributes
     ----------
-    visible_points : tuple of str, optional
-        Points it can see; all points that no arm holds where absent.
     point_std : float
         Standard deviation of the white noise on each coordinate of a point [m].
     frame_rate : float
@@ -92,7 +92,6 @@ class PointCamera:
         Camera (x right, y down, z ahead) in the world; 2 m from the object, opposite the robot, where absent.
     """
 
-    visible_points: tuple[str, ...] | None = None
     point_std: float = 5e-3
     frame_rate: float = 3.0
     has_dropouts: bool = True
@@ -149,7 +148,7 @@ def run_virtual_experiment(
     Raises
     ------
     ConfigError
-        The camera is to see a point that the system does not have, or the torques' noise is that of other joints.
+        The torques' noise is that of other joints.
     ModelError, DataError
         As `simulate_in_mujoco`.
     """
@@ -166,7 +165,7 @@ def run_virtual_experiment(
             system, values, seed=chosen.seed, initial_joint_angles=posture, excitation=excitation
         )
     held = tuple(dict.fromkeys(grasp.held_frame for grasp in system.grasps if grasp.held_frame in system.point_frames))
-    visible = () if chosen.camera is None else _visible(system, held, chosen.camera)
+    visible = tuple(point for point in system.point_frames if point not in held)
     times = np.empty(0)
     if chosen.camera is not None and visible:
         times = _frame_times(streams["frames"], duration, chosen.camera)
@@ -181,15 +180,6 @@ def run_virtual_experiment(
     joints = _joints(system, run, chosen, streams)
     about = f"{chosen.description} {made}".strip(), "yid_ocp virtual experiment", chosen.recording_name
     return validate_recording(Recording(joints, tuple(groups), *about, true_parameters=truth))
-
-
-def _visible(system: System, held: tuple[str, ...], camera: PointCamera) -> tuple[str, ...]:
-    if camera.visible_points is None:
-        return tuple(point for point in system.point_frames if point not in held)
-    for point in camera.visible_points:
-        if point not in system.point_frames:
-            raise ConfigError(f"the camera cannot see '{point}'", allowed=", ".join(system.point_frames))
-    return tuple(camera.visible_points)
 
 
 def _joints(system: System, run: SimulationResult, experiment: VirtualExperiment, streams: _Generators) -> JointGroup:
@@ -233,7 +223,9 @@ def _camera_points(
     clean = run.frame_point_positions[:, [system.point_frames.index(point) for point in visible]]
     position = _noisy(clean, camera.point_std, rng)
     position[rng.random(position.shape[:2]) < camera.hidden_probability] = np.nan
-    pose = _camera_pose(run.point_positions[0].mean(0)) if camera.pose is None else np.asarray(camera.pose, float)
+    target = run.point_positions[0].mean(0)
+    beside = target + 2.0 * _CAMERA_DIRECTION / np.linalg.norm(_CAMERA_DIRECTION)
+    pose = look_at_pose(beside, target) if camera.pose is None else np.asarray(camera.pose, float)
     std = np.full(clean.shape, camera.point_std)
     return PointGroup("points_camera", visible, run.frame_times, position, std, "camera", pose=pose)
 
@@ -279,17 +271,6 @@ def _frame_times(rng: np.random.Generator, duration: float, camera: PointCamera)
         lost = ((times[:, None] >= starts) & (times[:, None] <= starts + lengths)).any(1)
         times = times[~lost]
     return np.asarray(times)
-
-
-def _camera_pose(target: Array) -> Array:
-    away = np.array([0.93, 0.0, 0.37])
-    away /= np.linalg.norm(away)
-    right = np.cross(-away, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.column_stack([right, np.cross(-away, right), -away])
-    pose[:3, 3] = target + 2.0 * away
-    return pose
 
 
 # what is misread, by true position and effort

@@ -94,6 +94,10 @@ class _EffectContext:
         return int(model.jnt_bodyid[model.joint(named.get(place, place)).id])
 
 
+_ForceBuilder = Callable[[_EffectContext, Any, str, Any], _ForceCallback]
+"""From the scene, MuJoCo's model, a place and a size to a force."""
+
+
 def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallback:
     """A force law(q, v, t) at some joints by their angles and speeds and the time."""
 
@@ -103,64 +107,89 @@ def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallba
     return push
 
 
-def _joint_law(law: Callable[[Any, float, float], float]) -> Callable[[_EffectContext, Any, str, Any], _ForceCallback]:
-    """An effect that is a force law(size, q, v) of one joint."""
-    return lambda scene, model, joint, size: _joint_force(model.joint(joint).id, lambda q, v, t: law(size, q, v))
+def _joint_law(law: Callable[[Any, float, float, float], float]) -> _ForceBuilder:
+    """An effect that is a force law(size, q, v, t) of one joint."""
+    return lambda scene, model, joint, size: _joint_force(model.joint(joint).id, lambda q, v, t: law(size, q, v, t))
 
 
-def _bend_law(law: Callable[[float, Array], Array]) -> Callable[[_EffectContext, Any, str, float], _ForceCallback]:
+def _spring_law(law: Callable[[Any, Array, Array, float], Array]) -> _ForceBuilder:
+    """An effect that is a force law(size, angles from rest, stiffnesses, t) of the elastic joints of a segment."""
+
+    def made(scene: _EffectContext, model: Any, segment: str, size: Any) -> _ForceCallback:
+        at, stiffness, rest = scene.segment_springs(model, segment)
+        return _joint_force(at, lambda q, v, t: law(size, q - rest, stiffness, t))
+
+    return made
+
+
+def _bend_law(law: Callable[[float, Array], Array]) -> _ForceBuilder:
     """An effect that is a force law(size, q) of the bends of a segment, those about x first."""
     return lambda scene, model, segment, size: _joint_force(
         scene.bend_joint_ids(model, segment), lambda q, v, t: law(size, q)
     )
 
 
-def _body_force(body: int, force: Array | Callable[[Any], Array]) -> _ForceCallback:
-    """A force [N] on the centre of a body, in the world, constant or by MuJoCo's data."""
+def _body_forces(forces: Mapping[int, Callable[[Any], Array]]) -> _ForceCallback:
+    """Forces [N] on the centres of bodies, in the world, by MuJoCo's data."""
     mujoco = import_mujoco()
 
     def push(model: Any, data: Any) -> None:
-        now = force(data) if callable(force) else force
-        mujoco.mj_applyFT(model, data, now, np.zeros(3), data.xipos[body], body, data.qfrc_passive)
+        for body, force in forces.items():
+            mujoco.mj_applyFT(model, data, force(data), np.zeros(3), data.xipos[body], body, data.qfrc_passive)
 
     return push
 
 
-def _in_turn(forces: Sequence[_ForceCallback], only_in_motion_of: _EffectContext | None = None) -> _ForceCallback:
-    def push(model: Any, data: Any) -> None:
-        if only_in_motion_of is None or only_in_motion_of.has_motion_begun:
-            for force in forces:
-                force(model, data)
+def _attached(offset: Sequence[float], pull: Callable[[float, Array], Array]) -> _ForceBuilder:
+    """An effect pull(size, way) on a tip or an arm's link by its way to a point of the world [m].
 
-    return push
+    The point is `offset` from where the tip began, and on the other side of an arm's link.
+    """
+
+    def made(scene: _EffectContext, model: Any, place: str, size: float) -> _ForceCallback:
+        body, anchors = scene.end_body_id(model, place), list[Array]()
+        is_tip = any(segment.name == place for segment in scene.system.segment_layouts)
+
+        def force(data: Any) -> Array:
+            at = np.array(data.xipos[body])
+            if not anchors:
+                anchors.append(at + np.array(offset) if is_tip else at - np.array(offset))
+            return pull(size, anchors[0] - at)
+
+        return _body_forces({body: force})
+
+    return made
+
+
+def _in_motion(build: _ForceBuilder) -> _ForceBuilder:
+    """An effect that is absent until the motion begins."""
+
+    def made(scene: _EffectContext, model: Any, place: str, size: Any) -> _ForceCallback:
+        push = build(scene, model, place, size)
+        return lambda model, data: push(model, data) if scene.has_motion_begun else None
+
+    return made
 
 
 def _force_with_memory(
-    scene: _EffectContext, at: Any, start: Callable[[Any], Any], advance: Callable[..., Any], law: Callable[..., Any]
+    at: Any, start: Callable[[Any], Any], advance: Callable[..., Any], law: Callable[..., Any]
 ) -> _ForceCallback:
-    """A force law(q, z) at some joints; z = start(q) when the motion begins, then advance(z, q, v, step)."""
-    state: dict[str, Any] = {"t": 0.0}
+    """A force law(q, z) at some joints; z = start(q) at first, then advance(z, q, v, step)."""
+    state: dict[str, Any] = {}
 
     def push(_: Any, data: Any) -> None:
-        if not scene.has_motion_begun:
-            return
         q, v, now = np.array(data.qpos[at]), np.array(data.qvel[at]), float(data.time)
-        if "z" not in state:
-            state["z"], state["t"] = start(q), now
+        if not state:
+            state.update(z=start(q), t=now)
         step = now - state["t"]
         if step > 0:
-            state["z"], state["t"] = advance(state["z"], q, v, step), now
+            state.update(z=advance(state["z"], q, v, step), t=now)
         data.qfrc_passive[at] += law(q, state["z"])
 
     return push
 
 
 # -- effects of the library -------------------------------------------------------------------------------------------
-
-
-def _cubic_stiffness(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    at, _, rest = scene.segment_springs(model, place)
-    return _joint_force(at, lambda q, v, t: -size["k3"] * (q - rest) ** 3)
 
 
 def _standard_linear_solid(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
@@ -170,23 +199,22 @@ def _standard_linear_solid(scene: _EffectContext, model: Any, place: str, size: 
     def advance(z: Array, q: Array, v: Array, step: float) -> Array:
         return q + (z - q) * math.exp(-step / time)
 
-    return _force_with_memory(scene, at, np.copy, advance, lambda q, z: -branch * (q - z))
+    return _force_with_memory(at, np.copy, advance, lambda q, z: -branch * (q - z))
 
 
 def _hysteresis(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    at, _, _ = scene.segment_springs(model, place)
-
     def advance(z: Array, q: Array, v: Array, step: float) -> Array:
         return z + step * (v - np.abs(v) * z / size["yield_angle"])
 
-    return _force_with_memory(scene, at, np.zeros_like, advance, lambda q, z: -size["stiffness"] * z)
+    at = scene.segment_springs(model, place)[0]
+    return _force_with_memory(at, np.zeros_like, advance, lambda q, z: -size["stiffness"] * z)
 
 
 def _aerodynamic_drag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
     mujoco, segment = import_mujoco(), scene.system.segment_layout(place)
     radius = float(scene.value(segment.radius)[0])
 
-    def drag(body: int, length: float) -> _ForceCallback:
+    def drag(body: int, length: float) -> Callable[[Any], Array]:
         scale, found = _AIR_DENSITY * size["cd"] * radius * length, np.zeros(6)
 
         def force(data: Any) -> Array:
@@ -195,16 +223,21 @@ def _aerodynamic_drag(scene: _EffectContext, model: Any, place: str, size: _Valu
             normal = found[3:] - along * (along @ found[3:])
             return np.asarray(-scale * np.linalg.norm(normal) * normal)
 
-        return _body_force(body, force)
+        return force
 
     lengths = [float(scene.value(x)[0]) for x in segment.link_lengths]
-    return _in_turn([drag(*link) for link in zip(scene.link_body_ids(model, place), lengths, strict=True)])
+    return _body_forces({link[0]: drag(*link) for link in zip(scene.link_body_ids(model, place), lengths, strict=True)})
 
 
 def _gravity_scale(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
     bodies = sorted({int(model.jnt_bodyid[model.joint(joint).id]) for joint in object_joint_names(scene.system)})
     gravity = np.array(model.opt.gravity)
-    return _in_turn([_body_force(body, size["fraction"] * model.body_mass[body] * gravity) for body in bodies])
+
+    def lifted(mass: float) -> Callable[[Any], Array]:
+        force = size["fraction"] * mass * gravity
+        return lambda data: force
+
+    return _body_forces({body: lifted(model.body_mass[body]) for body in bodies})
 
 
 def _joint_presliding(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
@@ -212,26 +245,23 @@ def _joint_presliding(scene: _EffectContext, model: Any, place: str, size: _Valu
         way = math.copysign(1.0, v)
         return way + (s - way) * math.exp(-abs(v) * step / size["yield_angle"])
 
-    return _force_with_memory(scene, model.joint(place).id, lambda q: 0.0, advance, lambda q, s: -size["tau_c"] * s)
+    return _force_with_memory(model.joint(place).id, lambda q: 0.0, advance, lambda q, s: -size["tau_c"] * s)
 
 
 def _effort_lag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
     at, apart = model.joint(place).id, int(import_mujoco().mjtDisableBit.mjDSBL_EQUALITY)
-    state: dict[str, Any] = {"z": None, "command": 0.0, "t": 0.0}
+    state: list[float] = []
 
     def push(model: Any, data: Any) -> None:
         # the controller works with a model of its own, whose grasps are off: there no torque is applied
-        if not scene.has_motion_begun or model.opt.disableflags & apart:
+        if model.opt.disableflags & apart:
             return
-        command, step = float(data.qfrc_applied[at]), float(data.time) - state["t"]
-        if state["z"] is None:
-            state["z"] = command
-        elif step > 0:
-            # until now the command was the one before
-            held = state["command"]
-            state["z"] = held + (state["z"] - held) * math.exp(-step / size["time_constant"])
-        state["t"], state["command"] = float(data.time), command
-        data.qfrc_passive[at] += state["z"] - command
+        command, now = float(data.qfrc_applied[at]), float(data.time)
+        z, held, since = state or (command, command, now)  # until now the command was the one before
+        if now > since:
+            z = held + (z - held) * math.exp(-(now - since) / size["time_constant"])
+        state[:] = z, command, now
+        data.qfrc_passive[at] += z - command
 
     return push
 
@@ -248,8 +278,7 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
         raise ModelError("its mass sits too far from its frame", where=where, allowed=allowed)
     point = value(frame.placement.translation) + turn @ reach / mass
     own, centre = float(model.body_mass[body]), np.array(model.body_ipos[body])
-    w, x, y, z = model.body_iquat[body]
-    axes = Rotation.from_quat([x, y, z, w]).as_matrix()
+    axes = Rotation.from_quat(np.roll(model.body_iquat[body], -1)).as_matrix()
     apart = point - centre
     tensor = axes @ np.diag(model.body_inertia[body]) @ axes.T
     tensor += own * mass / (own + mass) * (apart @ apart * np.eye(3) - np.outer(apart, apart))
@@ -257,29 +286,28 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     if own + mass <= 0 or moments[0] <= 0:
         raise ModelError("more is taken away than the link has there", where=where, hint="less mass, or nearer by")
     axes[:, 2] *= np.linalg.det(axes)
-    x, y, z, w = Rotation.from_matrix(axes).as_quat()
     model.body_mass[body] = own + mass
     model.body_ipos[body] = (own * centre + mass * point) / (own + mass)
-    model.body_inertia[body], model.body_iquat[body] = moments, [w, x, y, z]
+    model.body_inertia[body], model.body_iquat[body] = moments, np.roll(Rotation.from_matrix(axes).as_quat(), 1)
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-_FORCES: Mapping[str, Callable[[_EffectContext, Any, str, _Values], _ForceCallback]] = {
-    "cubic_stiffness": _cubic_stiffness,
-    "standard_linear_solid": _standard_linear_solid,
-    "hysteresis": _hysteresis,
+_FORCES: Mapping[str, _ForceBuilder] = {
+    "cubic_stiffness": _spring_law(lambda size, angle, stiffness, t: -size["k3"] * angle**3),
+    "standard_linear_solid": _in_motion(_standard_linear_solid),
+    "hysteresis": _in_motion(_hysteresis),
     "aerodynamic_drag": _aerodynamic_drag,
     "gravity_scale": _gravity_scale,
     # not MuJoCo's own spring, whose rest angle the search for the equilibrium uses to hold the arm
-    "joint_spring": _joint_law(lambda size, q, v: -size["stiffness"] * (q - size["rest_angle"])),
-    "joint_coulomb": _joint_law(lambda size, q, v: -size["tau_c"] * math.tanh(v / _FRICTION_SMOOTHING_SPEED)),
+    "joint_spring": _joint_law(lambda size, q, v, t: -size["stiffness"] * (q - size["rest_angle"])),
+    "joint_coulomb": _joint_law(lambda size, q, v, t: -size["tau_c"] * math.tanh(v / _FRICTION_SMOOTHING_SPEED)),
     "joint_stribeck": _joint_law(
-        lambda size, q, v: (
+        lambda size, q, v, t: (
             -size["tau_s"] * math.exp(-((v / size["v_stribeck"]) ** 2)) * math.tanh(v / _FRICTION_SMOOTHING_SPEED)
         )
     ),
-    "joint_presliding": _joint_presliding,
-    "effort_lag": _effort_lag,
+    "joint_presliding": _in_motion(_joint_presliding),
+    "effort_lag": _in_motion(_effort_lag),
 }
 """Forces of the library's effects that are worked out here."""
 _FORCE_KINDS = tuple(_FORCES)
@@ -291,7 +319,6 @@ INJECTABLE_EFFECT_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCE_KI
 
 
 def _gusts(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    """Wind that comes and goes, spread over the segment's links [N]."""
     rng = np.random.default_rng(int(1e6 * abs(size)) % 2**32)
     rates, phases = rng.uniform(0.4, 1.6, 3), rng.uniform(0, 2 * math.pi, 3)
     bodies = scene.link_body_ids(model, segment)
@@ -300,11 +327,10 @@ def _gusts(scene: _EffectContext, model: Any, segment: str, size: float) -> _For
         gust = size * float(np.sum(np.sin(2 * math.pi * rates * data.time + phases)))
         return np.array([gust, 0.5 * gust, 0.0]) / len(bodies)
 
-    return _in_turn([_body_force(body, wind) for body in bodies], scene)
+    return _body_forces(dict.fromkeys(bodies, wind))
 
 
 def _crease(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    """A tube that gives way at one place once it is bent there: stiffness lost beyond an angle [N m/rad]."""
     joints = scene.system.segment_layout(segment).link_joints[_CREASED_LINK][:2]
     at, rest = np.array([model.joint(j).id for j in joints]), np.array([scene.rest_angles.get(j, 0.0) for j in joints])
 
@@ -315,67 +341,14 @@ def _crease(scene: _EffectContext, model: Any, segment: str, size: float) -> _Fo
     return _joint_force(at, law)
 
 
-def _tether(scene: _EffectContext, model: Any, place: str, size: float) -> _ForceCallback:
-    """A cord from the floor side to a tip, or from above to an arm's link, that is taut beyond its length [N/m]."""
-    body = scene.end_body_id(model, place)
-    above = all(segment.name != place for segment in scene.system.segment_layouts)
-    hung = np.array([0.0, 0.0, _CORD_LENGTH if above else -_CORD_LENGTH])
-
-    def pull(at: Array, anchor: Array) -> Array:
-        distance = float(np.linalg.norm(at - anchor))
-        return size * max(distance - _CORD_LENGTH, 0.0) * (anchor - at) / distance
-
-    return _attached(body, hung, pull)
-
-
-def _magnet(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    """A pole beside the tip that draws it, the more the nearer it is [N]."""
-
-    def pull(at: Array, anchor: Array) -> Array:
-        away = anchor - at
-        return size * _MAGNET_POLE_SIZE * away / (float(away @ away) + _MAGNET_POLE_SIZE**2)
-
-    return _attached(scene.end_body_id(model, segment), np.array([_MAGNET_DISTANCE, 0.0, 0.0]), pull)
-
-
-def _wall(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    """A soft wall that the tip runs into [N/m]."""
-
-    def pull(at: Array, anchor: Array) -> Array:
-        return np.array([0.0, -size * max(at[1] - anchor[1], 0.0), 0.0])
-
-    return _attached(scene.end_body_id(model, segment), np.array([0.0, _WALL_DISTANCE, 0.0]), pull)
-
-
-def _attached(body: int, offset: Array, pull: Callable[[Array, Array], Array]) -> _ForceCallback:
-    """A force on a body's centre by where it is and a point of the world, `offset` from where the body began."""
-    anchors: list[Array] = []
-
-    def force(data: Any) -> Array:
-        at = np.array(data.xipos[body])
-        if not anchors:
-            anchors.append(at + offset)
-        return pull(at, anchors[0])
-
-    return _body_force(body, force)
-
-
-def _stiffness_drift(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    """Springs that soften while the motion lasts, by this fraction in all."""
-    at, stiffness, rest = scene.segment_springs(model, segment)
-
-    def lost(q: Array, v: Array, t: float) -> Array:
-        return size * t / _DRIFT_TIME * stiffness * (q - rest) if scene.has_motion_begun else 0 * q
-
-    return _joint_force(at, lost)
+def _cord(size: float, way: Array) -> Array:
+    distance = float(np.linalg.norm(way))
+    return size * max(distance - _CORD_LENGTH, 0.0) * way / distance
 
 
 def _one_way_damping(scene: _EffectContext, model: Any, segment: str, size: float) -> _ForceCallback:
-    """Bends that are damped one way only [N m s/rad].
-
-    MuJoCo is told of it as its own damping, which it integrates implicitly: a light branch under so much explicit
-    damping bursts.
-    """
+    # MuJoCo is told of it as its own damping, which it integrates implicitly: a light branch under so much explicit
+    # damping bursts
     both = scene.bend_joint_ids(model, segment)
     usual = model.dof_damping[both].copy()
 
@@ -388,7 +361,6 @@ def _one_way_damping(scene: _EffectContext, model: Any, segment: str, size: floa
 
 
 def _saturating_drive(scene: _EffectContext, model: Any, joint: str, size: float) -> _ForceCallback:
-    """A drive that gives no more torque than this, whatever is commanded and recorded [N m]."""
     at = model.joint(joint).id
 
     def push(_: Any, data: Any) -> None:
@@ -398,51 +370,54 @@ def _saturating_drive(scene: _EffectContext, model: Any, joint: str, size: float
     return push
 
 
-def _warming_gear(scene: _EffectContext, model: Any, joint: str, size: float) -> _ForceCallback:
-    """Viscous friction that fades while the gear warms up [N m s/rad]."""
-
-    def friction(q: float, v: float, t: float) -> float:
-        return -size * math.exp(-t / _WARM_UP_TIME) * v if scene.has_motion_begun else 0.0
-
-    return _joint_force(model.joint(joint).id, friction)
-
-
 def _shifting_load(scene: _EffectContext, model: Any, joint: str, size: float) -> _ForceCallback:
-    """A loose load that slides to the other side once the joint has turned [N m]."""
-
     def advance(memory: Array, q: float, v: float, step: float) -> Array:
         begin, s = memory
         goal = math.tanh((q - begin) / _LOAD_SLIDE_ANGLE)
         return np.array([begin, s + step / _LOAD_SLIDE_TIME * (goal - s)])
 
     at = model.joint(joint).id
-    return _force_with_memory(scene, at, lambda q: np.array([q, 0.0]), advance, lambda q, memory: size * memory[1])
+    return _force_with_memory(at, lambda q: np.array([q, 0.0]), advance, lambda q, memory: size * memory[1])
 
 
 def _slipping_grasp(scene: _EffectContext, model: Any, grasp: str, size: float) -> _ForceCallback:
-    """A grasp that holds, lets the tube slip along itself, and holds again [m a slip]."""
     site = model.site(f"grasp_{grasp}_held").id
     begin = np.array(model.site_pos[site])
 
     def push(model: Any, data: Any) -> None:
-        if scene.has_motion_begun:
-            done = sum(float(np.clip((data.time - t) / _SLIP_DURATION, 0.0, 1.0)) for t in _SLIP_TIMES)
-            model.site_pos[site] = begin - np.array([0.0, 0.0, size * done])
+        done = sum(float(np.clip((data.time - t) / _SLIP_DURATION, 0.0, 1.0)) for t in _SLIP_TIMES)
+        model.site_pos[site] = begin - np.array([0.0, 0.0, size * done])
 
     return push
 
 
-OUT_OF_LIBRARY_EFFECTS: Mapping[str, Callable[[_EffectContext, Any, str, float], _ForceCallback]] = {
-    "torque_ripple": _joint_law(lambda size, q, v: size * math.sin(60.0 * q)),  # with the joint's angle [N m]
+OUT_OF_LIBRARY_EFFECTS: Mapping[str, _ForceBuilder] = {
+    "torque_ripple": _joint_law(lambda size, q, v, t: size * math.sin(60.0 * q)),  # with the joint's angle [N m]
     "cross_stiffness": _bend_law(lambda size, q: -size * np.roll(q, len(q) // 2)),  # couples the two [N m/rad]
     "quadratic_stiffness": _bend_law(lambda size, q: -size * q**2),  # stiffer one way than the other [N m/rad^2]
-    **{
-        made.__name__.removeprefix("_"): made
-        for made in (
-            *(_gusts, _crease, _tether, _magnet, _wall, _stiffness_drift, _one_way_damping, _saturating_drive),
-            *(_warming_gear, _shifting_load, _slipping_grasp),
-        )
-    },
+    "gusts": _in_motion(_gusts),  # wind that comes and goes, spread over a segment's links [N]
+    "crease": _crease,  # a tube that gives way at one place once bent there: stiffness lost beyond an angle [N m/rad]
+    # a cord from the floor side to a tip, or from above to an arm's link, taut beyond its length [N/m]
+    "tether": _attached((0.0, 0.0, -_CORD_LENGTH), _cord),
+    "magnet": _attached(  # a pole beside the tip that draws it, the more the nearer it is [N]
+        (_MAGNET_DISTANCE, 0.0, 0.0),
+        lambda size, way: size * _MAGNET_POLE_SIZE * way / (float(way @ way) + _MAGNET_POLE_SIZE**2),
+    ),
+    "wall": _attached(  # a soft wall that the tip runs into [N/m]
+        (0.0, _WALL_DISTANCE, 0.0), lambda size, way: np.array([0.0, -size * max(-way[1], 0.0), 0.0])
+    ),
+    # springs that soften while the motion lasts, by this fraction in all
+    "stiffness_drift": _in_motion(
+        _spring_law(lambda size, angle, stiffness, t: size * t / _DRIFT_TIME * stiffness * angle)
+    ),
+    "one_way_damping": _one_way_damping,  # bends that are damped one way only [N m s/rad]
+    "saturating_drive": _saturating_drive,  # gives no more torque than this, whatever is commanded and recorded [N m]
+    # viscous friction that fades while the gear warms up [N m s/rad]
+    "warming_gear": _in_motion(_joint_law(lambda size, q, v, t: -size * math.exp(-t / _WARM_UP_TIME) * v)),
+    # a loose load that slides to the other side once the joint has turned [N m]
+    "shifting_load": _in_motion(_shifting_load),
+    # a grasp that holds, lets the tube slip along itself, and holds again [m a slip]
+    "slipping_grasp": _in_motion(_slipping_grasp),
 }
 """Effects outside the library by kind: forces by the scene, MuJoCo's model, a place and a size."""
 

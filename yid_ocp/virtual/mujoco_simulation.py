@@ -115,8 +115,6 @@ class SimulationResult:
     point_positions, frame_point_positions : ndarray, shape (N + 1, np, 3) and (M, np, 3)
         Positions of `system.point_frames` in the world, at `t` and at `frame_times`, the camera's (M,) rounded to the
         simulator's step [m].
-    grasp_separation : ndarray, shape (N + 1, number of grasps)
-        Distance between the two ends of each grasp [m].
     """
 
     t: Array
@@ -126,7 +124,6 @@ class SimulationResult:
     point_positions: Array
     frame_times: Array
     frame_point_positions: Array
-    grasp_separation: Array
 
 
 def simulate_in_mujoco(
@@ -199,7 +196,7 @@ def simulate_in_mujoco(
 
 @dataclass(frozen=True, eq=False)
 class MujocoScene:
-    """A MuJoCo model with its state and the ids of joints, moved joints, points and grasp ends in it."""
+    """A MuJoCo model with its state and the ids of joints, moved joints and points in it."""
 
     mujoco: ModuleType
     model: Any
@@ -207,7 +204,6 @@ class MujocoScene:
     joint_ids: IntArray
     moved_joint_ids: IntArray
     point_site_ids: list[int]
-    grasp_site_ids: list[list[int]]
 
     @staticmethod
     def from_model(system: System, mujoco: ModuleType, model: Any) -> MujocoScene:
@@ -215,9 +211,8 @@ class MujocoScene:
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])
         sites = [model.site(name).id for name in system.point_frames]
-        ends = [[model.site(f"grasp_{g.name}_{end}").id for end in ("holder", "held")] for g in system.grasps]
         moved = order[list(system.driven_coordinate_indices or system.prescribed_coordinate_indices)]
-        return MujocoScene(mujoco, model, mujoco.MjData(model), order, moved, sites, ends)
+        return MujocoScene(mujoco, model, mujoco.MjData(model), order, moved, sites)
 
 
 @contextlib.contextmanager
@@ -380,7 +375,7 @@ def _play(
     mujoco, model, data = scene.mujoco, scene.model, scene.data
     steps, periods = round(simulation.duration * simulation.sample_rate), simulation.controller_periods_per_sample
     inner = simulation._steps_per_period
-    q, v, torques, points, error, seen = [], [], [], [], [], []
+    q, v, torques, points, seen = [], [], [], [], []
     for tick in range(steps * periods + 1):
         mujoco.mj_kinematics(model, data)
         torques.append(controller.apply_input(tick / (simulation.sample_rate * periods)))
@@ -388,7 +383,6 @@ def _play(
             q.append(data.qpos[scene.joint_ids])
             v.append(data.qvel[scene.joint_ids])
             points.append(data.site_xpos[scene.point_site_ids])
-            error.append([np.linalg.norm(data.site_xpos[a] - data.site_xpos[b]) for a, b in scene.grasp_site_ids])
         done = tick * inner
         for frame in frames[(frames >= done) & (frames < done + inner)]:
             if frame > done:
@@ -409,5 +403,4 @@ def _play(
         np.array(points),
         np.asarray(frames[: len(seen)] * simulation.time_step),
         np.array(seen).reshape(len(seen), len(scene.point_site_ids), 3),
-        np.array(error).reshape(steps + 1, len(scene.grasp_site_ids)),
     )

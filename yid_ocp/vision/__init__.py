@@ -20,7 +20,6 @@ from yid_ocp.vision.track import track_object as track_object
 from yid_ocp.vision.track_result import FrameReport as FrameReport
 from yid_ocp.vision.track_result import TrackResult as TrackResult
 from yid_ocp.vision.virtual_camera import DepthCamera as DepthCamera
-from yid_ocp.vision.virtual_camera import FloorAndWall as FloorAndWall
 from yid_ocp.vision.virtual_camera import FrameTiming as FrameTiming
 from yid_ocp.vision.virtual_camera import VirtualCamera as VirtualCamera
 from yid_ocp.vision.virtual_camera import VirtualFrames as VirtualFrames

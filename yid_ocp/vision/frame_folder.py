@@ -26,6 +26,7 @@ from yid_ocp.files import (
     atomic_write,
     check_input_file,
     check_number_count,
+    make_folder,
     read_input_json,
     read_input_text,
     write_text,
@@ -274,11 +275,7 @@ def write_frame_folder(
     OutputError
         The folder or a file cannot be written, or images without intrinsics.
     """
-    path = Path(folder)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"the folder cannot be made: {error.strerror}", where=str(path)) from error
+    path = make_folder(folder)
     if depth is not None and sequence.intrinsics is None:
         raise OutputError("depth images need the camera's intrinsics", where=str(path))
     o3d, ending = import_open3d(), _CLOUD_SUFFIXES[0] if depth is None else _DEPTH_IMAGE_SUFFIX

@@ -27,6 +27,7 @@ from scipy.spatial import cKDTree
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import DataError, unknown_name_details
+from yid_ocp.model.rotations import homogeneous_transform
 
 ColourArray = NDArray[np.uint8]
 
@@ -210,10 +211,7 @@ def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, np.asarray(up, float))
     right = right / np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.column_stack([right, np.cross(ahead, right), ahead])
-    pose[:3, 3] = position
-    return pose
+    return homogeneous_transform(np.column_stack([right, np.cross(ahead, right), ahead]), position)
 
 
 def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
@@ -225,12 +223,9 @@ def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
         matrix = np.asarray(pose, float)
     except (TypeError, ValueError) as error:
         raise DataError("the pose of the camera is not a matrix of numbers", where=where, hint=hint) from error
-    good = matrix.shape == (4, 4) and bool(np.isfinite(matrix).all())
-    if good:
-        rotation = matrix[:3, :3]
-        good = bool(np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0)
-        good = good and bool(np.allclose(matrix[3], [0, 0, 0, 1]))
-    if not good:
+    good = matrix.shape == (4, 4) and np.isfinite(matrix).all() and np.allclose(matrix[3], [0, 0, 0, 1])
+    turn = matrix[:3, :3] if good else -np.eye(3)
+    if not (np.allclose(turn.T @ turn, np.eye(3), atol=1e-4) and np.linalg.det(turn) > 0):
         raise DataError("the pose of the camera is not a rigid transform", where=where, allowed="4x4", hint=hint)
     return matrix
 

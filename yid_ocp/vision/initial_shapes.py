@@ -57,9 +57,8 @@ class _Centerline:
     @property
     def to_skeleton(self) -> CloudSkeleton:
         """Skeleton with the same nodes and edges, without points."""
-        count = len(self.nodes)
         none = np.empty(0, dtype=np.int64)
-        return CloudSkeleton(self.nodes, np.ones(count), none, self.edges, np.zeros(count, dtype=np.int64))
+        return CloudSkeleton(self.nodes, none, self.edges, np.zeros(len(self.nodes), dtype=np.int64))
 
     def outward_direction(self, end: int) -> Array:
         """Unit vector along the object at one of its ends, away from it, shape (3,)."""

@@ -271,7 +271,6 @@ class CloudSkeleton:
     """Nodes of a cloud and the graph between them."""
 
     nodes: Array  # (K, 3), centroids of the kept segments, in the order of the walk [m]
-    node_weights: Array  # (K,), points (weights) of each segment
     node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none
     edges: IntArray  # (E, 2), minimum spanning forest of the graph of nearest neighbours
     component_of_node: IntArray  # (K,), connected part of each node, the one with most points first
@@ -283,13 +282,13 @@ class CloudSkeleton:
 
 
 def _thin_to_nodes(
-    cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions, down: ArrayLike
+    cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions
 ) -> tuple[Array, Array, IntArray]:
     """Thin a cloud to nodes, segment by segment: nodes, their weights, and the node of each point."""
     label, alive = np.full(len(cloud), -1), np.arange(len(cloud))
     points, weight = cloud.points, cloud.point_weights
     nodes, size = list[Array](), list[float]()
-    seed = points[int(np.argmax(points @ np.asarray(down, float)))] if len(points) else np.zeros(3)
+    seed = points[int(np.argmin(points[:, 2]))] if len(points) else np.zeros(3)
 
     while len(alive):
         first = _near(points, seed, options)
@@ -347,20 +346,17 @@ _DEFAULTS = SkeletonOptions()
 
 
 def extract_skeleton(
-    cloud: WeightedCloud,
-    rng: np.random.Generator,
-    options: SkeletonOptions = _DEFAULTS,
-    down: ArrayLike = (0.0, 0.0, -1.0),
+    cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions = _DEFAULTS
 ) -> CloudSkeleton:
-    """Skeleton of a cloud without connected parts that hold too few points, begun at the point furthest `down` (3,)."""
-    nodes, size, label = _thin_to_nodes(cloud, rng, options, down)
+    """Skeleton of a cloud without connected parts that hold too few points, begun at the lowest point."""
+    nodes, size, label = _thin_to_nodes(cloud, rng, options)
     _, part = _spanning_forest(nodes, options)
     if not len(nodes):
-        return CloudSkeleton(nodes, size, label, np.empty((0, 2), dtype=np.int64), part)
+        return CloudSkeleton(nodes, label, np.empty((0, 2), dtype=np.int64), part)
     held = np.bincount(part, size)
     rank = np.argsort(np.argsort(-held, kind="stable"))
     keep = held[part] >= options.min_component_fraction * size.sum()
     renamed = np.full(len(nodes) + 1, -1)
     renamed[:-1][keep] = np.arange(int(keep.sum()))
     edges, _ = _spanning_forest(nodes[keep], options)
-    return CloudSkeleton(nodes[keep], size[keep], renamed[label], edges, rank[part[keep]])
+    return CloudSkeleton(nodes[keep], renamed[label], edges, rank[part[keep]])

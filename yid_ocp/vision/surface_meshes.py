@@ -31,9 +31,6 @@ _Triple = tuple[float, float, float]
 
 _FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
 _TOUCHING = 5e-4  # [m]
-_CELL = 0.01  # [m]
-_HALF_CELL = 0.5 * math.sqrt(3.0) * _CELL + 1e-5  # the furthest of a cell from its centre, and rounding [m]
-_CELLS = 1 << 20  # along each axis, more than any robot needs
 _NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
 
 
@@ -116,37 +113,6 @@ class TriangleMesh:
         return TriangleMesh._of(creation.revolve(outline, sections=_FACETS))
 
 
-class _Cells:
-    """Distances to a surface at the centres of cells, worked out when a cell is asked for."""
-
-    def __init__(self, scene: Any, origin: Array) -> None:
-        self._scene, self._origin = scene, origin
-        self._keys, self._away = np.empty(0, dtype=np.int64), np.empty(0)
-
-    def distance(self, points: Array) -> Array:
-        """Distance of points of the part's frame to its surface, shape (N,) [m]."""
-        return np.asarray(self._scene.compute_distance(_tensor(points), nthreads=1).numpy().astype(np.float64))
-
-    def within(self, points: Array, reach: float) -> BoolArray:
-        """Which points are no further than `reach` [m], shape (N,)."""
-        cell = np.floor((points - self._origin) / _CELL).astype(np.int64) + _CELLS // 2
-        key = (cell[:, 0] * _CELLS + cell[:, 1]) * _CELLS + cell[:, 2]
-        every, index = np.unique(key, return_inverse=True)
-        new = np.setdiff1d(every, self._keys, assume_unique=True)
-        if len(new):
-            place = np.stack([new // _CELLS**2, new // _CELLS % _CELLS, new % _CELLS], axis=1)
-            away = self.distance(self._origin + (place - _CELLS // 2 + 0.5) * _CELL)
-            keys, values = np.append(self._keys, new), np.append(self._away, away)
-            order = np.argsort(keys)
-            self._keys, self._away = keys[order], values[order]
-        away = self._away[np.searchsorted(self._keys, every)][index]
-        close = away + _HALF_CELL < reach
-        unsure = np.flatnonzero(~close & (away - _HALF_CELL < reach))
-        if len(unsure):
-            close[unsure] = self.distance(points[unsure]) <= reach
-        return np.asarray(close)
-
-
 class ArticulatedSurfaces:
     """Meshes by joint (-1: the world), in the joints' frames, of a numeric mechanism, with ray and distance queries.
 
@@ -156,14 +122,13 @@ class ArticulatedSurfaces:
     def __init__(self, mechanism: Mechanism, meshes: Mapping[int, TriangleMesh]) -> None:
         o3d = import_open3d()
         self.part_joints = tuple(sorted(meshes))
-        self._scenes, self._cells, self._boxes = list[Any](), list[_Cells](), list[Array]()
+        self._scenes, self._boxes = list[Any](), list[Array]()
         for mesh in (meshes[joint] for joint in self.part_joints):
             scene = o3d.t.geometry.RaycastingScene(nthreads=1)
             faces = o3d.core.Tensor(np.ascontiguousarray(mesh.faces, dtype=np.uint32))
             scene.add_triangles(_tensor(mesh.vertices), faces)
             self._scenes.append(scene)
             self._boxes.append(np.array([mesh.vertices.min(0), mesh.vertices.max(0)]))
-            self._cells.append(_Cells(scene, self._boxes[-1][0]))
         q = ca.SX.sym("q", len(mechanism.joints))
         kinematics = forward_kinematics(mechanism, q)
         poses, last = [], ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]]))
@@ -191,8 +156,7 @@ class ArticulatedSurfaces:
     ) -> BoolArray:
         """Whether world points (N, 3) lie within `reach` [m] of a surface at a configuration (n,), shape (N,).
 
-        No distance differs from that of a place by more than the way there: the cell in which a point lies, whose
-        centre's distance is kept, mostly tells. `moving_only` leaves out what is fixed to the world.
+        `moving_only` leaves out what is fixed to the world.
         """
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at(q)):
@@ -200,7 +164,8 @@ class ArticulatedSurfaces:
                 asked = np.flatnonzero(~result)
                 near, local = self._near(points[asked], part, pose, reach)
                 if len(near):
-                    result[asked[near]] = self._cells[part].within(local, reach)
+                    distance = self._scenes[part].compute_distance(_tensor(local), nthreads=1).numpy()
+                    result[asked[near]] = distance.astype(np.float64) <= reach
         return result
 
     def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
@@ -410,11 +375,10 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
         # the package's folder is the URDF's own or one above it, whether or not it still has its name
         parts = Path(package).parts
         candidates = [above / Path(*rest) for above in urdf.parents for rest in (parts, parts[1:]) if rest]
-    found = next((candidate for candidate in candidates if candidate.is_file()), None)
-    if found is None:
-        hint = "keep meshes beside the URDF's package"
-        raise ModelError(f"the mesh '{name}' is not there", where=str(urdf), hint=hint)
-    return found
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise ModelError(f"the mesh '{name}' is not there", where=str(urdf), hint="keep meshes beside the URDF's package")
 
 
 def tube_link_lengths_and_radii(
@@ -439,9 +403,9 @@ def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = No
     if not system.segment_layouts:
         raise DataError("the model has no object to see", hint="give it segments")
     meshes: dict[int, TriangleMesh] = {}
-    for segment, (lengths, radius) in zip(
-        system.segment_layouts, tube_link_lengths_and_radii(system, values).values(), strict=True
-    ):
+    sizes = tube_link_lengths_and_radii(system, values)
+    for segment in system.segment_layouts:
+        lengths, radius = sizes[segment.name]
         for i, (names, length) in enumerate(zip(segment.link_joints, lengths, strict=True)):
             parts = [TriangleMesh.cylinder(radius, 0.0, float(length))]
             if i or segment.parent_segment is not None:

@@ -16,8 +16,7 @@ from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import PointGroup, Recording, validate_recording
-from yid_ocp.errors import OutputError
-from yid_ocp.files import atomic_write
+from yid_ocp.files import atomic_write, make_folder
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.point_cloud import CloudSkeleton
 from yid_ocp.vision.sequence_calibration import ForeignObject, TubeDimensionCheck
@@ -150,11 +149,7 @@ def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os
     OutputError
         The folder or a file cannot be written.
     """
-    path = Path(folder)
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"the folder cannot be made: {error.strerror}", where=str(path)) from error
+    path = make_folder(folder)
     report, parts = stages.report, [] if stages.filtered_points is None else [stages.filtered_points]
     parts += [] if report.shape_fit is None else [report.shape_fit.link_ends.reshape(-1, 3)]
     near = np.concatenate([np.empty((0, 3)), *parts])

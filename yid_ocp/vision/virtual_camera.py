@@ -31,6 +31,9 @@ from yid_ocp.vision.surface_meshes import (
     tube_meshes_by_joint,
 )
 
+_FLOOR_AND_WALL = (([8.0, 8.0, 0.02], [1.0, 0.0, -0.94]), ([0.02, 8.0, 3.0], [-0.61, 0.0, 0.5]))
+"""Edges and middles of thin boxes [m]."""
+
 
 @dataclass(frozen=True)
 class DepthCamera:
@@ -140,21 +143,6 @@ class VirtualFrames:
     true_configuration_at: Callable[[float], Array]  # from a time to the configuration then, shape (n,)
 
 
-@dataclass(frozen=True)
-class FloorAndWall:
-    """Floor at height z and wall at position x around the robot [m]; None leaves one out."""
-
-    floor_height: float | None = -0.93
-    wall_position: float | None = -0.6
-
-    def _meshes(self) -> list[TriangleMesh]:
-        """Thin boxes."""
-        floor, wall = self.floor_height, self.wall_position
-        boxes = [] if floor is None else [([8.0, 8.0, 0.02], [1.0, 0.0, floor - 0.01])]
-        boxes += [] if wall is None else [([0.02, 8.0, 3.0], [wall - 0.01, 0.0, 0.5])]
-        return [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in boxes]
-
-
 @dataclass(eq=False)
 class _Images(Sequence[Array]):
     """Depth images at some configurations, each made from its own seed when asked for; the last one is kept."""
@@ -184,8 +172,6 @@ class VirtualCamera:
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
     depth_camera: DepthCamera = field(default_factory=DepthCamera)  # an Asus Xtion Pro Live where absent
     timing: FrameTiming = field(default_factory=FrameTiming)
-    # A floor under the paper's Y and a wall behind Baxter where absent; nothing where there is no robot either
-    background: FloorAndWall | None = None
     seed: int = 0  # of all that is drawn at random
 
 
@@ -193,6 +179,7 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     """Render the frames that a virtual camera takes of a motion, when they are loaded and the same every time.
 
     Configurations (N, n) at times (N,) [s] come from whatever simulator; between them a cubic spline interpolates.
+    Where there is a robot, the paper's Y stands on a floor, and a wall stands behind Baxter.
 
     Raises
     ------
@@ -207,8 +194,8 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     of = scene.system, scene.parameter_values
     tree, meshes = numeric_mechanism(*of), tube_meshes_by_joint(*of)
     robot = load_robot_meshes(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}
-    around = camera.background or (FloorAndWall() if robot else FloorAndWall(None, None))
-    still = [*around._meshes(), *([robot.pop(-1)] if -1 in robot else [])]
+    around = [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in _FLOOR_AND_WALL]
+    still = [*(around if robot else []), *([robot.pop(-1)] if -1 in robot else [])]
     surfaces = ArticulatedSurfaces(tree, meshes | robot | ({-1: TriangleMesh.concatenate(still)} if still else {}))
     images = _Images(surfaces, camera.depth_camera, pose, configuration, camera.seed)
     names = tuple(f"frame {i}" for i in range(len(taken)))
