@@ -120,7 +120,7 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
     run = load_config(file)
     if not resolve_recording_path(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
-    way = "plan={point: p6, target_offset: [0.02, 0.02, 0.0], duration: 1.0, n_spline_coefficients: 4}"
+    way = "plan={point: p6, target_offset: [0.01, 0.01, 0.0], duration: 0.6, n_spline_coefficients: 4}"
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", way)
     assert outcome.is_successful, outcome.result["message"]
     first = outcome.output.rollout.state[0]

@@ -14,7 +14,7 @@ from yid_ocp.data import read_recording
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.step import compile_step, compile_step_like
 from yid_ocp.model import Parameters
-from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, Status, SteepestDescent, solve
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
@@ -84,7 +84,7 @@ CONDENSED = MultipleShooting(condensing=True)
 
 
 @pytest.mark.parametrize(
-    ("solver", "duration"), [(MultipleShooting(), 0.4), (MultipleShooting(condensing=True, node_interval=10), 1.0)]
+    ("solver", "duration"), [(MultipleShooting(), 0.2), (MultipleShooting(condensing=True, node_interval=10), 1.0)]
 )
 def test_multiple_shooting_agrees(make_problem, solver, duration):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=duration)
@@ -103,10 +103,10 @@ def test_condensing_agrees(short, reference):
 
 @pytest.fixture(scope="module")
 def two_arms(paper_systems, clean):
-    """50 variables, 500 steps, six parameters from 3 N m/rad; two of the twists leave no trace in the data."""
+    """50 variables, 250 steps, six parameters from 3 N m/rad; two of the twists leave no trace in the data."""
     step = compile_step(paper_systems["dual"], 0.01)
     recording = read_recording(clean / "dual_arm_vision_estimate.h5")
-    return EstimationProblem(step, [recording], FREE)
+    return EstimationProblem(step, [recording], FREE, ProblemOptions(duration=2.5))
 
 
 @pytest.mark.parametrize(
