@@ -131,7 +131,7 @@ def test_without_the_extra_report(pendulum, tmp_path):
         "util.find_spec = lambda name, *a: None if name in ('jinja2', 'plotly') else find(name, *a);"
         "from yid_ocp.cli import main; sys.exit(main(sys.argv[1:]))"
     )
-    command = [sys.executable, "-c", code, "solve", str(pendulum), "--out", "run"]
+    command = [sys.executable, "-c", code, "simulate", str(pendulum), "--out", "run"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stderr.count("yid-ocp[report]") == 1

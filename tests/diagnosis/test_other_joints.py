@@ -43,7 +43,7 @@ def recording(side: str, seed: int, extra) -> Recording:
     """A multi-sine motion with the efforts of inverse dynamics, viscous friction and whatever `extra` adds."""
     names, _, model = robot(side)
     data, rng = model.createData(), np.random.default_rng(seed)
-    t = TIME_STEP * np.arange(601)
+    t = TIME_STEP * np.arange(301)
     frequency = rng.uniform([0.1, 0.3, 0.7], [0.25, 0.6, 1.2], (7, 3))
     phase = rng.uniform(0, 2 * np.pi, (7, 3))
     amplitude = 0.12 / frequency**0.7

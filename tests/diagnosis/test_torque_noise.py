@@ -34,7 +34,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, solve
 
-TIME_STEP, STEPS = 0.01, 300
+TIME_STEP, STEPS = 0.01, 200
 WHITE, OFFSET, ANGLE, POINT = 0.05, 0.1, 2e-4, 1e-3
 FREE = ("elbow.stiffness", "elbow.damping")
 
@@ -237,7 +237,7 @@ def test_noise_of_torques_is_not_mistaken_for_what_they_multiply(step, monkeypat
     """By recorded torques absent inertias, gains and lags are on average three to five standard deviations off."""
     monkeypatch.setattr("test_torque_noise.WHITE", 6 * WHITE)
     absent, z = with_absent(step, effect), []
-    for seed in range(20, 32):
+    for seed in range(20, 28):
         problem = weighted_at_truth(absent, recorded(step, seed), "proportional")
         residual, jacobian = linearization_without_weak_priors(problem, problem.evaluate(problem.initial_unknowns))
         covariance = np.linalg.inv(jacobian.T @ jacobian)
