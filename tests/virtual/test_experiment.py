@@ -1,10 +1,7 @@
 from __future__ import annotations
 
-import importlib.util
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -30,14 +27,14 @@ DEFAULTS = Path(yid_ocp.__file__).parent / "data" / "defaults"
 
 
 def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
-    system, run = SYSTEMS[1], runs(1, 2e-4, 5.0)
+    system, run = SYSTEMS[1], runs(1, 2e-4, 3.0)
     motion = random_multisine_motion(system, TRUTH, seed=SEEDS[1])
-    simulation = SimulationOptions(time_step=2e-4)
+    simulation = SimulationOptions(3.0, time_step=2e-4)
     recording = run_virtual_experiment(system, TRUTH, VirtualExperiment(motion=motion, simulation=simulation, seed=5))
     joints = recording.joints
     assert joints is not None
     assert joints.velocity is not None
-    np.testing.assert_array_equal(joints.t, np.arange(501) / 100)
+    np.testing.assert_array_equal(joints.t, np.arange(301) / 100)
     np.testing.assert_array_equal(joints.effort, run.effort)  # a camera must not disturb the experiment
     assert np.std(joints.position - run.q[:, :7]) == pytest.approx(2e-4, rel=0.1)
     assert np.std(joints.velocity - run.v[:, :7]) == pytest.approx(5e-3, rel=0.1)
@@ -65,7 +62,7 @@ def test_sensors_have_their_own_noise() -> None:
     often_hidden = PointCamera(hidden_probability=0.5)
 
     def record(seed: int, camera: PointCamera | None = often_hidden, noise: ArmSensorNoise | None = None) -> Recording:
-        simulation = SimulationOptions(3.0, time_step=5e-4)
+        simulation = SimulationOptions(3.0, time_step=1e-3)
         experiment = VirtualExperiment(motion, None, simulation, noise or ArmSensorNoise(), camera, seed=seed)
         return run_virtual_experiment(system, TRUTH, experiment)
 
@@ -121,43 +118,24 @@ def test_experiments_that_do_not_fit_are_refused() -> None:
         baxter_foam_y_system(3)
 
 
-def recipe() -> ModuleType:
-    """The module benchmarks/make_recordings.py."""
-    script = Path(__file__).resolve().parents[2] / "benchmarks" / "make_recordings.py"
-    spec = importlib.util.spec_from_file_location("make_recordings", script)
-    assert spec is not None
-    assert spec.loader is not None
-    made = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = made  # dataclasses look their module up
-    spec.loader.exec_module(made)
-    return made
-
-
-@pytest.mark.parametrize("kind", ["ROUGH", "CLEAN"])
-def test_recordings_are_reproducible(kind: str, clean: Path) -> None:
-    made = recipe()
-    torques, system = getattr(made, kind), SYSTEMS[2]
-    posture = grasping_joint_angles(system, made.TRUTH, offsets=made.OFFSETS[2])
-    excitation = MultisineOptions(gripper_travel=torques.travel[2], shake_torque_rms=torques.shake)
-    motion = random_multisine_motion(
-        system,
-        made.TRUTH,
-        seed=torques.motion_seeds[2, "estimate"],
-        initial_joint_angles=posture,
-        excitation=excitation,
-    )
-    run = simulate_in_mujoco(
-        system, made.TRUTH, motion, replace(torques.simulation, duration=1.0), initial_joint_angles=posture
-    )
-    joints = read_recording((DEFAULTS if torques.white else clean) / "dual_arm_no_vision_estimate.h5").joints
+@pytest.mark.parametrize(("kind", "arms"), [("ROUGH", 1), ("CLEAN", 2)])
+def test_recordings_are_reproducible(kind: str, arms: int, clean: Path, benchmark_module) -> None:
+    made = benchmark_module("make_recordings")
+    torques, system = getattr(made, kind), SYSTEMS[arms]
+    posture = grasping_joint_angles(system, made.TRUTH, offsets=made.OFFSETS[arms])
+    excitation = MultisineOptions(gripper_travel=torques.travel[arms], shake_torque_rms=torques.shake)
+    seed, start = torques.motion_seeds[arms, "estimate"], {"initial_joint_angles": posture}
+    motion = random_multisine_motion(system, made.TRUTH, seed=seed, excitation=excitation, **start)
+    run = simulate_in_mujoco(system, made.TRUTH, motion, replace(torques.simulation, duration=0.3), **start)
+    name = f"{['single', 'dual'][arms - 1]}_arm_no_vision_estimate.h5"
+    joints = read_recording((DEFAULTS if torques.white else clean) / name).joints
     assert joints is not None
-    if not torques.white:
-        np.testing.assert_allclose(joints.effort[:101], run.effort, rtol=0, atol=1e-6)
+    error = joints.effort[:31] - run.effort
     # noise and offsets as stated lie on the effort of the rough ones, noise alone on the angles of both
-    error = joints.effort[:101] - run.effort
-    white, offset = np.array(2 * torques.white or (1e-6,)), np.array(2 * torques.offset or (1e-6,))
-    assert np.all(error.std(axis=0) < 1.5 * white)
-    assert np.all(np.abs(error.mean(axis=0)) < 4 * offset)
-    np.testing.assert_allclose(
-        joints.position[:101], run.q[:, list(system.driven_coordinate_indices)], rtol=0, atol=1.5e-3
-    )
+    if torques.white:
+        assert np.all(error.std(axis=0) < 1.5 * np.array(arms * torques.white))
+        assert np.all(np.abs(error.mean(axis=0)) < 4 * np.array(arms * torques.offset))
+    else:
+        np.testing.assert_allclose(error, 0.0, rtol=0, atol=1e-6)
+    angles = run.q[:, list(system.driven_coordinate_indices)]
+    np.testing.assert_allclose(joints.position[:31], angles, rtol=0, atol=1.5e-3)

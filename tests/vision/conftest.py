@@ -45,11 +45,6 @@ def open3d():
 
 
 @pytest.fixture(scope="session")
-def truth():
-    return dict(TRUTH)
-
-
-@pytest.fixture(scope="session")
 def system(single_arm):
     return single_arm
 

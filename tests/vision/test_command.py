@@ -86,7 +86,6 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
     [
         (["track.frames_path=nowhere"], "no such folder of frames"),
         (["recordings.estimate=[]"], "no recording with the joint angles"),
-        (["track.options.clock.initial_offset=50"], "their clocks are not the same"),
         (["track.camera_pose=[[1,0,0,0],[0,1,0,0],[0,0,2,0],[0,0,0,1]]"], "not a rigid transform"),
         (["track.options.max_distance_in_radi=0.02"], "did you mean 'max_distance_in_radii'"),
         (["track.options.filters.robot_padding=-1"], "robot_padding = -1"),

@@ -81,16 +81,14 @@ def test_where_the_object_can_be(system, run):
 
 
 @pytest.mark.parametrize(
-    ("options", "wrong"),
+    ("options", "name"),
     [
-        (CloudFilterOptions, {"robot_padding": -1.0}),
-        (SkeletonOptions, {"segment_neighbours": 1}),
-        (SkeletonOptions, {"neighbour_radius": 0.0}),
-        (TrackOptions, {"max_distance_in_radii": 0.0}),
-        (ShapeFitOptions, {"surface_noise_std": 0.0}),
+        (CloudFilterOptions, "robot_padding"),
+        (SkeletonOptions, "neighbour_radius"),
+        (TrackOptions, "max_distance_in_radii"),
+        (ShapeFitOptions, "surface_noise_std"),
     ],
 )
-def test_options_are_checked(options, wrong):
-    [(name, value)] = wrong.items()
-    with pytest.raises(ConfigError, match=f"{name} = {value:g}"):
-        options(**wrong)
+def test_options_are_checked(options, name):
+    with pytest.raises(ConfigError, match=f"{name} = -1"):
+        options(**{name: -1.0})

@@ -117,14 +117,6 @@ def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
     assert stds[1] > 2 * stds[0]
 
 
-def test_without_motion_the_clock_has_to_be_given(system, clean, small):
-    joints = small.recording.joints
-    still = Recording(replace(joints, position=np.tile(joints.position[:1], (len(joints.t), 1))))
-    sequence = some_of(clean.made.sequence, [0, 1, 2])
-    with pytest.raises(DataError, match="cannot be calibrated by the arm"):
-        track_object(CameraScene(system, "package:baxter"), still, sequence)
-
-
 def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
     joints = recording.joints
     old = PointGroup("points_camera", ("w_T1",), [0.0], np.zeros((1, 1, 3)), 0.01)
@@ -262,34 +254,3 @@ def test_a_recording_that_does_not_fit(system, small, urdf_folder):
         track_object(CameraScene(system, urdf_folder / "double_pendulum.urdf"), small.recording, small.sequence)
     with pytest.raises(DataError, match="pose of the camera is missing"):
         FrameSequence.from_clouds([0.0], [small.clouds[0]], None)
-
-
-@pytest.mark.slow
-def test_solve_finds_the_truth_from_tracked_points(tracked, system, run, truth):
-    """From the frame sequence to the stiffnesses: the identifiable ones within what is stated."""
-    import yid_ocp as yid
-
-    rng = np.random.default_rng(1)
-    driven = list(system.driven_coordinate_indices)
-    joints = JointGroup(
-        system.driven,
-        run.t,
-        run.q[:, driven] + 2e-4 * rng.standard_normal((len(run.t), len(driven))),
-        effort=run.effort,
-        position_std=2e-4,
-        effort_std=0.0,
-    )
-    tip = run.point_positions[:, [system.point_frames.index("w_T2")]]
-    arm = PointGroup("points_arm", ("w_T2",), run.t, tip + 1e-3 * rng.standard_normal(tip.shape), 1e-3, sensor="arm")
-    made = tracked()
-    names = ("w_T1", "w_T3")
-    camera = made.track.to_point_group()
-    columns = [system.point_frames.index(name) for name in names]
-    camera = replace(camera, names=names, position=camera.position[:, columns], std=camera.std[:, columns])
-    step = yid.compile_step(system, 0.01)
-    problem = yid.EstimationProblem(step, [Recording(joints, (arm, camera))], free=list(truth))
-    solution = yid.solve(problem, yid.GaussNewton(cost_tolerance=1e-5))
-    found = {name: entry for name, entry in solution.parameters.items() if entry.verdict == "identifiable"}
-    assert {"T1.bend", "T2.bend"} <= set(found)
-    for name, entry in found.items():
-        assert abs(entry.value - truth[name]) < 3 * entry.std + 0.01 * truth[name]

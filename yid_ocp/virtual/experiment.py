@@ -153,8 +153,6 @@ def run_virtual_experiment(
         As `simulate_in_mujoco`.
     """
     chosen = experiment or VirtualExperiment()
-    seeds = np.random.SeedSequence(chosen.seed).spawn(len(_STREAMS))
-    streams = {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}
     duration = chosen.simulation.duration
     posture, motion = chosen.initial_joint_angles, chosen.motion
     if posture is None:
@@ -164,13 +162,20 @@ def run_virtual_experiment(
         motion = random_multisine_motion(
             system, values, seed=chosen.seed, initial_joint_angles=posture, excitation=excitation
         )
-    held = tuple(dict.fromkeys(grasp.held_frame for grasp in system.grasps if grasp.held_frame in system.point_frames))
-    visible = tuple(point for point in system.point_frames if point not in held)
     times = np.empty(0)
-    if chosen.camera is not None and visible:
-        times = _frame_times(streams["frames"], duration, chosen.camera)
+    if chosen.camera is not None and _held_and_visible_points(system)[1]:
+        times = _frame_times(_random_generators(chosen.seed)["frames"], duration, chosen.camera)
     options: dict[str, Any] = {"injected": chosen.injected_terms, "gear_play": chosen.gear_play, "frame_times": times}
     run = simulate_in_mujoco(system, values, motion, chosen.simulation, initial_joint_angles=posture, **options)
+    return record_simulation(system, values, chosen, run)
+
+
+def record_simulation(
+    system: System, values: Mapping[str, float] | None, experiment: VirtualExperiment, run: SimulationResult
+) -> Recording:
+    """Recording of a simulation that was made with an experiment's motion, as `run_virtual_experiment` returns it."""
+    chosen, streams = experiment, _random_generators(experiment.seed)
+    held, visible = _held_and_visible_points(system)
     groups = [_arm_points(system, held, run, chosen.arm_noise, streams)] if held else []
     if chosen.camera is not None and len(run.frame_times):
         groups.append(_camera_points(system, visible, run, chosen.camera, streams))
@@ -180,6 +185,18 @@ def run_virtual_experiment(
     joints = _joints(system, run, chosen, streams)
     about = f"{chosen.description} {made}".strip(), "yid_ocp virtual experiment", chosen.recording_name
     return validate_recording(Recording(joints, tuple(groups), *about, true_parameters=truth))
+
+
+def _random_generators(seed: int) -> _Generators:
+    """A stream of random numbers for every sensor."""
+    seeds = np.random.SeedSequence(seed).spawn(len(_STREAMS))
+    return {name: np.random.default_rng(own) for name, own in zip(_STREAMS, seeds, strict=True)}
+
+
+def _held_and_visible_points(system: System) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The system's points that grippers hold, and the others, which a camera sees."""
+    held = tuple(dict.fromkeys(grasp.held_frame for grasp in system.grasps if grasp.held_frame in system.point_frames))
+    return held, tuple(point for point in system.point_frames if point not in held)
 
 
 def _joints(system: System, run: SimulationResult, experiment: VirtualExperiment, streams: _Generators) -> JointGroup:

@@ -253,7 +253,7 @@ def simulate_recording_and_camera_frames(
     run: RunSettings, system: System, settings: VirtualFramesSettings
 ) -> tuple[Recording, VirtualFrames]:
     """Recording and camera frames of a virtual experiment, with initial parameter values as truth."""
-    from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
+    from yid_ocp.virtual.experiment import VirtualExperiment, record_simulation
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
@@ -270,17 +270,14 @@ def simulate_recording_and_camera_frames(
             system, seed=settings.seed, initial_joint_angles=posture, excitation=excitation
         )
         experiment = VirtualExperiment(
-            motion=motion,
-            initial_joint_angles=posture,
             simulation=simulation,
             camera=None,
             seed=settings.seed,
             recording_name=run.name,
             description=run.description,
         )
-        recording = run_virtual_experiment(system, None, experiment)
-        # the same once more, for the shape that a recording does not hold
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
+        recording = record_simulation(system, None, experiment, truth)
         timing = FrameTiming(
             settings.frame_rate,
             dropped_fraction=settings.dropped_fraction,
