@@ -35,6 +35,7 @@ from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.vision.frame_folder import read_frame_folder, write_frame_folder
+from yid_ocp.vision.frames import import_open3d
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.track import camera_scene, simulate_recording_and_camera_frames
@@ -65,11 +66,18 @@ def main() -> int:
 def _film(run: RunSettings, folder: Path, count: int = 0) -> Recording:
     """Write a virtual film as depth images, over and over until it has so many frames; the joints' recording."""
     recording, made = simulate_recording_and_camera_frames(run, build_system(run), run.track.virtual_frames)
-    write_frame_folder(made.sequence, folder, depth=made.depth_images)
-    joints = recording.joints
+    write_frame_folder(made.sequence, folder)
+    joints, lens, o3d = recording.joints, made.sequence.intrinsics, import_open3d()
     assert joints is not None
-    with (folder / "timestamps.csv").open(newline="") as file:
-        rows = [(row["file"], float(row["t"])) for row in csv.DictReader(file)]
+    assert lens is not None
+    rows = [(f"{i:06d}.png", float(t)) for i, t in enumerate(made.sequence.stamps)]
+    for i, (name, _) in enumerate(rows):
+        x, y, z = made.sequence.load_cloud(i).T
+        image = np.zeros((lens.height, lens.width), np.uint16)
+        row, column = np.rint(lens.fy * y / z + lens.cy), np.rint(lens.fx * x / z + lens.cx)
+        image[row.astype(int), column.astype(int)] = np.rint(1e3 * z)
+        o3d.io.write_image(str(folder / name), o3d.geometry.Image(image))
+        (folder / f"{i:06d}.ply").unlink()
     times = max(1, -(-count // len(rows)))
     length = float(joints.t[-1] - joints.t[0]) + float(np.diff(joints.t).mean())
     with (folder / "timestamps.csv").open("w", newline="") as file:

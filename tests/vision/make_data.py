@@ -48,7 +48,8 @@ def main() -> None:
     robot = ArticulatedSurfaces(tree, load_robot_meshes("package:baxter", tree))
     region = ReachableObjectRegion(system, CloudFilterOptions())
     pose, clouds = made.sequence.camera_pose, []
-    for i, q in enumerate(made.true_configurations):
+    true = [made.true_configuration_at(t) for t in made.capture_times]
+    for i, q in enumerate(true):
         points = made.sequence.load_world_cloud(i)
         cloud = voxel_averages(points[region.membership_test_at(q, pose[:3, 3])(points)], VOXEL)
         cloud = cloud.select(is_statistical_inlier(cloud, 12, 4.0))
@@ -62,7 +63,7 @@ def main() -> None:
     shape = ShapeFitter(system)
     truth = {
         "points": system.point_frames,
-        "position": [np.round(shape.points_at(q), 5).tolist() for q in made.true_configurations],
+        "position": [np.round(shape.points_at(q), 5).tolist() for q in true],
     }
     (FOLDER / "truth.json").write_text(json.dumps(truth) + "\n")
 

@@ -41,7 +41,6 @@ _POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"
 _PCD_HEADER_BYTES = 10_000  # [bytes]; where a PCD file says how many points it has
 _COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
 _MAX_FRAME_BYTES = 1 << 28  # of one cloud or image
-_LARGEST_DEPTH = 65.535  # [m]; what sixteen bits of millimetres hold
 _AGAIN = "copy or record it again"
 
 
@@ -263,36 +262,23 @@ def read_frame_folder(
     return FrameSequence(times, names, camera, load, intrinsics, str(path), colours)
 
 
-def write_frame_folder(
-    sequence: FrameSequence, folder: str | os.PathLike[str], *, depth: Sequence[ArrayLike] | None = None
-) -> None:
-    """Write a frame sequence as a folder for `read_frame_folder`: binary PLY clouds, or depth images in millimetres.
-
-    Instead of clouds depth images, each (height, width) [m], where given; the sequence must have intrinsics then.
+def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) -> None:
+    """Write a frame sequence as a folder of binary PLY clouds for `read_frame_folder`.
 
     Raises
     ------
     OutputError
-        The folder or a file cannot be written, or images without intrinsics.
+        The folder or a file cannot be written.
     """
-    path = make_folder(folder)
-    if depth is not None and sequence.intrinsics is None:
-        raise OutputError("depth images need the camera's intrinsics", where=str(path))
-    o3d, ending = import_open3d(), _CLOUD_SUFFIXES[0] if depth is None else _DEPTH_IMAGE_SUFFIX
-    names = [f"{i:06d}{ending}" for i in range(len(sequence))]
+    path, o3d = make_folder(folder), import_open3d()
+    names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
     for i, name in enumerate(names):
+        # float32 keeps 0.2 um at 2 m in half the space
+        points = np.ascontiguousarray(sequence.load_cloud(i), dtype=np.float32)
         with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-            if depth is None:  # float32 keeps 0.2 um at 2 m in half the space
-                points = np.ascontiguousarray(sequence.load_cloud(i), dtype=np.float32)
-                made = o3d.t.io.write_point_cloud(str(path / name), o3d.t.geometry.PointCloud(o3d.core.Tensor(points)))
-            else:
-                image = np.asarray(depth[i], float)
-                image = np.where(np.isfinite(image) & (image > 0) & (image < _LARGEST_DEPTH), image, 0.0)
-                image = np.ascontiguousarray(np.rint(1e3 * image).astype(np.uint16))
-                made = o3d.io.write_image(str(path / name), o3d.geometry.Image(image))
+            made = o3d.t.io.write_point_cloud(str(path / name), o3d.t.geometry.PointCloud(o3d.core.Tensor(points)))
         if not made:
-            kind = "cloud" if depth is None else "depth image"
-            raise OutputError(f"the {kind} cannot be written", where=str(path / name))
+            raise OutputError("the cloud cannot be written", where=str(path / name))
     pose = sequence.camera_pose.tolist()
     head: dict[str, Any] = {"format": _FRAMES_FORMAT, "pose": pose, "frame": "camera", "unit": "m"}
     if sequence.intrinsics is not None:

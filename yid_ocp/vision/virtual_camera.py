@@ -10,7 +10,7 @@ Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -138,31 +138,7 @@ class VirtualFrames:
 
     sequence: FrameSequence
     capture_times: Array  # (M,), time of every picture on the simulator's clock [s]
-    true_configurations: Array  # (M, n), configuration in every picture
-    depth_images: Sequence[Array]  # `depth[i]` is the measured depth image of frame i, made when asked for [m]
     true_configuration_at: Callable[[float], Array]  # from a time to the configuration then, shape (n,)
-
-
-@dataclass(eq=False)
-class _Images(Sequence[Array]):
-    """Depth images at some configurations, each made from its own seed when asked for; the last one is kept."""
-
-    surfaces: ArticulatedSurfaces
-    camera: DepthCamera
-    pose: Array
-    q: Array
-    seed: int
-    _kept: tuple[int | None, Array] = (None, np.empty(0))
-
-    def __len__(self) -> int:
-        return len(self.q)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        if self._kept[0] != index:
-            depth, cosine, _ = self.surfaces.render_depth_image(self.camera.intrinsics, self.pose, self.q[index])
-            rng = np.random.default_rng([self.seed, index])
-            self._kept = index, self.camera._simulate_depth_image(depth, cosine, rng)
-        return self._kept[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +173,12 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     around = [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in _FLOOR_AND_WALL]
     still = [*(around if robot else []), *([robot.pop(-1)] if -1 in robot else [])]
     surfaces = ArticulatedSurfaces(tree, meshes | robot | ({-1: TriangleMesh.concatenate(still)} if still else {}))
-    images = _Images(surfaces, camera.depth_camera, pose, configuration, camera.seed)
+
+    def cloud(index: int) -> Array:
+        depth, cosine, _ = surfaces.render_depth_image(lens, pose, configuration[index])
+        rng = np.random.default_rng([camera.seed, index])
+        return lens.points_from_depth(camera.depth_camera._simulate_depth_image(depth, cosine, rng))
+
     names = tuple(f"frame {i}" for i in range(len(taken)))
-    made = FrameSequence(stamps, names, pose, lambda i: lens.points_from_depth(images[i]), lens, "virtual camera")
-    return VirtualFrames(made, taken, configuration, images, lambda at: np.asarray(course(at)))
+    made = FrameSequence(stamps, names, pose, cloud, lens, "virtual camera")
+    return VirtualFrames(made, taken, lambda at: np.asarray(course(at)))
