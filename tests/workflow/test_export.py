@@ -196,7 +196,7 @@ def test_wrong_input_leaves_nothing(cli, found, pendulum_data, tmp_path) -> None
         ((found, "--format", "usd"), ["no format 'usd'", "allowed: mjcf", "UsdPhysics has no schema for cables"]),
         ((found, "--format", "csv"), ["no table", "export a recording"]),
         ((recording, "--format", "mjcf"), ["no run folder", "solve"]),
-        ((broken,), ["result.json", "run it again"]),
+        ((broken,), ["result.json", "not JSON"]),
         ((tmp_path,), ["no finished run"]),
         ((tmp_path / "nothing",), ["nothing"]),
         ((found, "--format", "urdf", "--out", tmp_path / "no" / "y.urdf"), ["folder to write to does not exist"]),

@@ -311,10 +311,10 @@ int yid_map(int count, const double **in, double **out) {{
                 raise out_of_memory_error(self.function.name(), 8 * (self.function.sz_w() + self.function.sz_iw()))
             if code != NewtonStatus.OK:
                 raise RuntimeError(f"CasADi could not evaluate {self.function}")
-        else:
+        elif count:
             columns = [np.tile(a, (count, 1)).T if i in self.shared_inputs else a.T for i, a in enumerate(arrays)]
-            results = self._mapped(count).call(columns) if count else []
-            values = [np.array(r.nonzeros()).reshape(v.shape) for r, v in zip(results, values, strict=True)] or values
+            results = self._mapped(count).call(columns)
+            values = [np.array(r.nonzeros()).reshape(v.shape) for r, v in zip(results, values, strict=True)]
         dense = []
         for o, value in enumerate(values):
             sparsity = self.function.sparsity_out(o)
