@@ -391,6 +391,7 @@ ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     ("text", "said"),
     [
         (ALIASES, "aliases"),
+        ("a: &a {b: 1}\nc: [" + "{<<: *a}, " * 600 + "]", "aliases"),
         ("description: &a [*a]\n", "not allowed"),
         ("description: " + "[" * 3000 + "]" * 3000, "levels"),
         ("{a: " * 2000 + "1" + "}" * 2000, "levels"),

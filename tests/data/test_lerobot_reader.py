@@ -160,6 +160,21 @@ def test_frame_numbers_that_are_none_are_refused(column: list[Any], tmp_path: Pa
         read_lerobot(path)
 
 
+@pytest.mark.parametrize("name", ["frame_index", "observation.state", "action"])
+def test_texts_that_unpack_to_very_many_bytes_are_refused_by_their_type(name: str, tmp_path: Path) -> None:
+    """A dictionary of one long text makes gigabytes of some kilobytes, though it declares few values."""
+    path = write_dataset(tmp_path / "arm", "v2.1")
+    import pyarrow
+    from pyarrow import parquet
+
+    file = path / "data" / "chunk-000" / "episode_000000.parquet"
+    table = parquet.read_table(file).to_pydict()
+    text = pyarrow.DictionaryArray.from_arrays(pyarrow.array([0] * len(table[name])), ["x" * 1_000_000])
+    parquet.write_table(pyarrow.table({**table, name: text}), file, store_schema=False)
+    with pytest.raises(DataError, match=f"{name} holds string where numbers are expected"):
+        read_lerobot(path)
+
+
 def test_a_table_that_unpacks_to_more_than_fits_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1")
     monkeypatch.setattr("yid_ocp.files.MAX_INPUT_NUMBERS", 30)  # four frames of eight numbers and three lists

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent, ScalarEvent
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, ScalarEvent
 from ruamel.yaml.parser import Parser
 from ruamel.yaml.scanner import Scanner
 
@@ -46,6 +46,7 @@ DEFAULT_CONFIG = "dual_arm_vision.yaml"
 DEFAULT_DIAGNOSIS_CONFIG = "diagnosis.yaml"
 
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
+_ALIAS_COST = 40  # in entries: the reader compares each mapping that an alias is merged into with all others
 _ALLOWED = "keys with numbers, text, true or false, [lists] and sections"
 
 
@@ -118,13 +119,20 @@ def _parse(text: str, origin: str) -> tuple[dict[str, Any], dict[_KeyPath, str]]
 
 def _loaded(text: str, origin: str) -> Any:
     """What the YAML reader makes of a text that is not too deep and asks for no types of its own."""
+    sizes: dict[str, int] = {}  # of what aliases stand for
+    begun: list[tuple[str | None, int]] = []  # anchors of the collections that are open, and counts before them
+    count = 0
     try:
-        depth = 0
-        for count, event in enumerate(_yaml().parse(io.StringIO(text))):
+        for event in _yaml().parse(io.StringIO(text)):
+            count += _ALIAS_COST + sizes.get(event.anchor, 0) if isinstance(event, AliasEvent) else 1
             if count > _MAX_ENTRIES:
-                raise _odd(f"there are more than {_MAX_ENTRIES} entries", origin, event)
-            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-            if depth > _MAX_DEPTH:
+                raise _odd(f"there are more than {_MAX_ENTRIES} entries, aliases written out", origin, event)
+            if isinstance(event, CollectionStartEvent):
+                begun.append((event.anchor, count))
+            elif isinstance(event, CollectionEndEvent):
+                anchor, before = begun.pop()
+                sizes |= {anchor: count - before} if anchor else {}
+            if len(begun) > _MAX_DEPTH:
                 raise _odd(f"more than {_MAX_DEPTH} levels stand in one another", origin, event)
             if isinstance(event, (ScalarEvent, CollectionStartEvent)) and event.tag is not None:
                 raise _odd(f"the tag '{event.tag}' asks for a type", origin, event)
@@ -159,9 +167,8 @@ def _odd(what: str, origin: str, event: Any) -> ConfigError:
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:
     """Plain Python values in place of the YAML reader's own; their lines go into `places`."""
-    if len(places) > _MAX_ENTRIES or len(path) > _MAX_DEPTH:
-        what = f"aliases make more than {_MAX_ENTRIES} entries, or stand for themselves"
-        raise ConfigError(what, where=origin, hint="write what the aliases stand for")
+    if len(path) > _MAX_DEPTH:
+        raise ConfigError("an alias stands for itself", where=origin, hint="write what the aliases stand for")
     if isinstance(node, CommentedMap):
         result: dict[str, Any] = {}
         for key, value in node.items():

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from yid_ocp.arrays import Array
@@ -150,8 +149,8 @@ def _dataset(folder: Path) -> _Dataset:
     return _Dataset(folder, info)
 
 
-def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Any], Path]:
-    """Columns of one episode, and the file in which it stands."""
+def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path]:
+    """Columns of one episode, shape (frames, numbers of a frame), and the file in which it stands."""
     try:
         from pyarrow import ArrowException, parquet
     except ImportError as error:
@@ -167,13 +166,15 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Any], Path]:
     columns = [*wanted, "frame_index", "episode_index"]
     for file in files:
         try:
-            _check_size(parquet.ParquetFile(check_input_file(file)).metadata, columns, str(file))
+            held = parquet.ParquetFile(check_input_file(file))
+            _check_size(held.metadata, columns, str(file))
+            _check_types(held.schema_arrow, columns, str(file))
             table = parquet.read_table(file, columns=columns, filters=[("episode_index", "=", episode)])
-            found = {name: table[name].to_pylist() for name in columns}
+            found = {name: _matrix(table[name].combine_chunks(), name, dataset.folder) for name in columns}
         except (ArrowException, OSError, KeyError, ValueError) as error:
             what = f"the table of the episode cannot be read ({type(error).__name__}: {error})"
             raise DataError(what, where=str(file), allowed=f"a parquet file with {', '.join(columns)}") from error
-        if found["frame_index"]:
+        if len(found["frame_index"]):
             return found, file
     raise DataError("no table has the episode", where=where, allowed=allowed, hint="download the whole dataset")
 
@@ -203,15 +204,28 @@ def _check_size(metadata: Any, columns: Sequence[str], where: str) -> None:
     check_number_count(count + 3 * metadata.num_rows, where)  # a row is a list of its own
 
 
-def _times(dataset: _Dataset, table: Mapping[str, Any]) -> Array:
-    return _matrix(table["frame_index"], "frame_index", dataset.folder)[:, 0] / dataset.info.fps
+def _check_types(schema: Any, columns: Sequence[str], where: str) -> None:
+    """Raise `DataError` where a column of a parquet file holds anything but numbers, or lists of them."""
+    from pyarrow import types
+
+    for name in columns:
+        kind = schema.field(name).type
+        while hasattr(kind, "value_field"):
+            kind = kind.value_type
+        if not (types.is_integer(kind) or types.is_floating(kind)):
+            what, hint = f"{name} holds {kind} where numbers are expected", "record the dataset again"
+            raise DataError(what, where=where, allowed="numbers, or lists of numbers", hint=hint)
+
+
+def _times(dataset: _Dataset, table: Mapping[str, Array]) -> Array:
+    return table["frame_index"][:, 0] / dataset.info.fps
 
 
 def _channels(
-    dataset: _Dataset, table: Mapping[str, Any]
+    dataset: _Dataset, table: Mapping[str, Array]
 ) -> tuple[tuple[str, ...], dict[str, Any], list[tuple[str, str]]]:
     """Joints, their channels, and the features that are left out, with the reason."""
-    state = _matrix(table[_STATE], _STATE, dataset.folder)
+    state = table[_STATE]
     entries = [_entry(name) for name in _names(dataset, _STATE, state.shape[1])]
     joints = tuple(dict.fromkeys(joint for joint, channel in entries if channel == "position"))
     channels: dict[str, Any] = {}
@@ -229,7 +243,7 @@ def _channels(
         if target is None:
             left.append((name, f"a {dataset.info.features[name].dtype or 'feature'} feature that is not understood"))
             continue
-        values = _matrix(table[name], name, dataset.folder)
+        values = table[name]
         named = [_entry(entry)[0] for entry in _names(dataset, name, values.shape[1])]
         if set(joints) <= set(named):
             channels.setdefault(target, values[:, [named.index(joint) for joint in joints]])
@@ -238,13 +252,18 @@ def _channels(
     return joints, channels, left
 
 
-def _matrix(rows: Sequence[Any], name: str, folder: Path) -> Array:
-    try:
-        matrix = np.array(rows, float)
-    except (TypeError, ValueError) as error:
+def _matrix(column: Any, name: str, folder: Path) -> Array:
+    """Numbers of a column, shape (rows, numbers in a row); NaN where one is missing."""
+    from pyarrow import compute
+
+    rows, n_lengths = len(column), 1
+    while hasattr(column.type, "value_field"):
+        n_lengths = max(n_lengths, len(compute.unique(compute.list_value_length(column))))
+        column = column.flatten()
+    if n_lengths > 1 or len(column) < rows:
         what = f"{name} is not a list of as many numbers in every frame"
-        raise DataError(what, where=str(folder), allowed="numbers", hint="record the dataset again") from error
-    return matrix[:, None] if matrix.ndim == 1 else matrix.reshape(len(matrix), -1)
+        raise DataError(what, where=str(folder), allowed="numbers", hint="record the dataset again")
+    return column.to_numpy(zero_copy_only=False).astype(float).reshape(rows, len(column) // max(rows, 1))
 
 
 def _names(dataset: _Dataset, feature: str, count: int) -> list[str]:
