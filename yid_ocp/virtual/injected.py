@@ -171,43 +171,34 @@ def _in_motion(build: _ForceBuilder) -> _ForceBuilder:
     return made
 
 
-def _force_with_memory(
-    at: Any, start: Callable[[Any], Any], advance: Callable[..., Any], law: Callable[..., Any]
-) -> _ForceCallback:
-    """A force law(q, z) at some joints; z = start(q) at first, then advance(z, q, v, step)."""
-    state: dict[str, Any] = {}
+def _memory_law(
+    start: Callable[[Any], Any], advance: Callable[..., Any], law: Callable[[Any, Any, Any, Any], Any]
+) -> _ForceBuilder:
+    """An effect that is a force law(size, stiffnesses, q, z) of a segment's elastic joints, or of one joint.
 
-    def push(_: Any, data: Any) -> None:
-        q, v, now = np.array(data.qpos[at]), np.array(data.qvel[at]), float(data.time)
-        if not state:
-            state.update(z=start(q), t=now)
-        step = now - state["t"]
-        if step > 0:
-            state.update(z=advance(state["z"], q, v, step), t=now)
-        data.qfrc_passive[at] += law(q, state["z"])
+    The memory is z = start(q) when the motion begins, then advance(size, z, q, v, step).
+    """
 
-    return push
+    def made(scene: _EffectContext, model: Any, place: str, size: Any) -> _ForceCallback:
+        is_tube = any(segment.name == place for segment in scene.system.segment_layouts)
+        at, stiffness, _ = scene.segment_springs(model, place) if is_tube else (model.joint(place).id, None, None)
+        state: dict[str, Any] = {}
+
+        def push(_: Any, data: Any) -> None:
+            q, v, now = np.array(data.qpos[at]), np.array(data.qvel[at]), float(data.time)
+            if not state:
+                state.update(z=start(q), t=now)
+            step = now - state["t"]
+            if step > 0:
+                state.update(z=advance(size, state["z"], q, v, step), t=now)
+            data.qfrc_passive[at] += law(size, stiffness, q, state["z"])
+
+        return push
+
+    return _in_motion(made)
 
 
 # -- effects of the library -------------------------------------------------------------------------------------------
-
-
-def _standard_linear_solid(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    at, stiffness, _ = scene.segment_springs(model, place)
-    branch, time = size["ratio"] * stiffness, size["relaxation_time"]
-
-    def advance(z: Array, q: Array, v: Array, step: float) -> Array:
-        return q + (z - q) * math.exp(-step / time)
-
-    return _force_with_memory(at, np.copy, advance, lambda q, z: -branch * (q - z))
-
-
-def _hysteresis(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    def advance(z: Array, q: Array, v: Array, step: float) -> Array:
-        return z + step * (v - np.abs(v) * z / size["yield_angle"])
-
-    at = scene.segment_springs(model, place)[0]
-    return _force_with_memory(at, np.zeros_like, advance, lambda q, z: -size["stiffness"] * z)
 
 
 def _aerodynamic_drag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
@@ -240,12 +231,10 @@ def _gravity_scale(scene: _EffectContext, model: Any, place: str, size: _Values)
     return _body_forces({body: lifted(model.body_mass[body]) for body in bodies})
 
 
-def _joint_presliding(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
-    def advance(s: float, q: float, v: float, step: float) -> float:
-        way = math.copysign(1.0, v)
-        return way + (s - way) * math.exp(-abs(v) * step / size["yield_angle"])
-
-    return _force_with_memory(model.joint(place).id, lambda q: 0.0, advance, lambda q, s: -size["tau_c"] * s)
+def _slid(size: _Values, s: float, q: float, v: float, step: float) -> float:
+    """Friction's share of its largest value after a step."""
+    way = math.copysign(1.0, v)
+    return way + (s - way) * math.exp(-abs(v) * step / size["yield_angle"])
 
 
 def _effort_lag(scene: _EffectContext, model: Any, place: str, size: _Values) -> _ForceCallback:
@@ -294,8 +283,16 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
 
 _FORCES: Mapping[str, _ForceBuilder] = {
     "cubic_stiffness": _spring_law(lambda size, angle, stiffness, t: -size["k3"] * angle**3),
-    "standard_linear_solid": _in_motion(_standard_linear_solid),
-    "hysteresis": _in_motion(_hysteresis),
+    "standard_linear_solid": _memory_law(
+        np.copy,
+        lambda size, z, q, v, step: q + (z - q) * math.exp(-step / size["relaxation_time"]),
+        lambda size, stiffness, q, z: -(size["ratio"] * stiffness) * (q - z),
+    ),
+    "hysteresis": _memory_law(
+        np.zeros_like,
+        lambda size, z, q, v, step: z + step * (v - np.abs(v) * z / size["yield_angle"]),
+        lambda size, stiffness, q, z: -size["stiffness"] * z,
+    ),
     "aerodynamic_drag": _aerodynamic_drag,
     "gravity_scale": _gravity_scale,
     # not MuJoCo's own spring, whose rest angle the search for the equilibrium uses to hold the arm
@@ -306,7 +303,7 @@ _FORCES: Mapping[str, _ForceBuilder] = {
             -size["tau_s"] * math.exp(-((v / size["v_stribeck"]) ** 2)) * math.tanh(v / _FRICTION_SMOOTHING_SPEED)
         )
     ),
-    "joint_presliding": _in_motion(_joint_presliding),
+    "joint_presliding": _memory_law(lambda q: 0.0, _slid, lambda size, stiffness, q, s: -size["tau_c"] * s),
     "effort_lag": _in_motion(_effort_lag),
 }
 """Forces of the library's effects that are worked out here."""
@@ -370,14 +367,10 @@ def _saturating_drive(scene: _EffectContext, model: Any, joint: str, size: float
     return push
 
 
-def _shifting_load(scene: _EffectContext, model: Any, joint: str, size: float) -> _ForceCallback:
-    def advance(memory: Array, q: float, v: float, step: float) -> Array:
-        begin, s = memory
-        goal = math.tanh((q - begin) / _LOAD_SLIDE_ANGLE)
-        return np.array([begin, s + step / _LOAD_SLIDE_TIME * (goal - s)])
-
-    at = model.joint(joint).id
-    return _force_with_memory(at, lambda q: np.array([q, 0.0]), advance, lambda q, memory: size * memory[1])
+def _load_shifted(size: float, memory: Array, q: float, v: float, step: float) -> Array:
+    begin, s = memory
+    goal = math.tanh((q - begin) / _LOAD_SLIDE_ANGLE)
+    return np.array([begin, s + step / _LOAD_SLIDE_TIME * (goal - s)])
 
 
 def _slipping_grasp(scene: _EffectContext, model: Any, grasp: str, size: float) -> _ForceCallback:
@@ -415,7 +408,9 @@ OUT_OF_LIBRARY_EFFECTS: Mapping[str, _ForceBuilder] = {
     # viscous friction that fades while the gear warms up [N m s/rad]
     "warming_gear": _in_motion(_joint_law(lambda size, q, v, t: -size * math.exp(-t / _WARM_UP_TIME) * v)),
     # a loose load that slides to the other side once the joint has turned [N m]
-    "shifting_load": _in_motion(_shifting_load),
+    "shifting_load": _memory_law(
+        lambda q: np.array([q, 0.0]), _load_shifted, lambda size, stiffness, q, memory: size * memory[1]
+    ),
     # a grasp that holds, lets the tube slip along itself, and holds again [m a slip]
     "slipping_grasp": _in_motion(_slipping_grasp),
 }

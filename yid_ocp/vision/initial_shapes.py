@@ -11,7 +11,7 @@ Verroust & Lazarus (2000), Extracting skeletal curves from 3D scattered data, do
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -272,7 +272,7 @@ class InitialShapeFinder:
         lasts = [indices[-1] for _, _, indices, _, _ in found]
         tips = [last for last in lasts if last not in carrying]
         self._corners = [0, *(2 * lasts.index(tip) + 1 for tip in tips)]
-        ways = {tip: set(self._way(tip)) for tip in tips}
+        ways = {tip: set(tree.ancestor_joint_indices(tip)) for tip in tips}
         self._links = [
             _Link(indices, begin, end, next(k for k, tip in enumerate(tips) if indices[-1] in ways[tip]))
             for _, _, indices, begin, end in found
@@ -282,11 +282,6 @@ class InitialShapeFinder:
         to_tips = np.array([0.0, *self._root_to_tip_lengths])
         self._end_distances = to_tips[:, None] + to_tips - 2 * np.pad(np.array(shared), ((1, 0), (1, 0)))
         np.fill_diagonal(self._end_distances, 0.0)
-
-    def _way(self, joint: int) -> Iterator[int]:
-        while joint >= 0:
-            yield joint
-            joint = self._parent[joint]
 
     def find_initial_shapes(self, trace: _Centerline) -> list[_InitialShape]:
         """Initial shapes that follow a centerline whose ends are as far apart as the object's.
