@@ -372,12 +372,12 @@ def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLik
     e, s = step.equations, step.sizes
     half = np.atleast_2d(np.asarray(v, float)) * step.time_step / 2
     middle = np.atleast_2d(np.asarray(q, float))
-    with CASADI_LOCK:
-        function = ca.Function("momentum", e.arguments, [e.row_scale * e.rigid_body_terms.lagrangian_by_v])
     none = [np.zeros(s[key]) for key in ("n", "nz", "nz", "m", "nu")]
-    last, pairs = (np.asarray(theta, float), step.time_step), zip(middle, half, strict=True)
-    rows = [np.array(function(m - d, m + d, *none, *last)).ravel() for m, d in pairs]
-    return np.array(rows).reshape(np.shape(q))
+    with CASADI_LOCK:
+        momentum = e.row_scale * e.rigid_body_terms.lagrangian_by_v
+        function = ca.Function("momentum", e.arguments, [momentum]).map(len(middle))
+        rows = function((middle - half).T, (middle + half).T, *none, np.asarray(theta, float), step.time_step)
+    return np.array(ca.densify(rows)).T.reshape(np.shape(q))
 
 
 @dataclass(frozen=True)
