@@ -138,6 +138,21 @@ def test_a_line_for_excel_is_skipped(tmp_path: Path) -> None:
     assert np.array_equal(joints_of(read_csv(path)).position[:, 0], [1, 2])
 
 
+def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monkeypatch):
+    """A line takes more than its cells, and is counted as 16 of them."""
+    file = tmp_path / "a.csv"
+    file.write_text("t,q_a\n" + "".join(f"{i},{i}\n" for i in range(9)))
+    for module in ("files", "data.readers.csv"):
+        monkeypatch.setattr(f"yid_ocp.{module}.MAX_INPUT_NUMBERS", 10 * (2 + 16))
+    for read in (read_csv, preview_file):
+        read(file)
+    with file.open("a") as more:
+        more.write("9,9\n")
+    for read in (read_csv, preview_file):
+        with pytest.raises(DataError, match="more than can be meant"):
+            read(file)
+
+
 def test_too_many_columns_are_refused_before_the_work(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_text(",".join(["t", *(f"q_{i}" for i in range(20_000))]) + "\n" + ",".join(["0"] * 20_001) + "\n")

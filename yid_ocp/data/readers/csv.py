@@ -6,9 +6,11 @@ import csv
 import math
 import os
 import re
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -28,7 +30,7 @@ from yid_ocp.data.readers.base import (
 )
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, ClockKind, JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
-from yid_ocp.files import check_input_file, check_number_count, file_sha256
+from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_number_count, file_sha256
 
 _PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
 _NUMBERED = {"q": "position", "dq": "velocity", "cmd": "position_command"}
@@ -37,6 +39,7 @@ _AXES = ("x", "y", "z")
 _MOST_BAD = 0.5
 """Part of a table's lines that may be bad; beyond it the table is not understood at all."""
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
+_LINE_COST = 16  # in cells: what a line takes beside them
 _LISTED = 5
 """Numbers of bad lines that a note lists."""
 
@@ -129,24 +132,29 @@ def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
         mark = next((mark for mark in ";\t " if mark in first[0].strip()), ",")
         if mark != ",":
             options["delimiter"] = mark
-    rows = list(_rows(path, options.get("delimiter", ",")))
-    names = [cell.strip() for cell in rows[0][1]] if rows else []
-    if len(names) < 2 or len(rows) < 2:  # as reading it would say
+    lines = _rows(path, options.get("delimiter", ","))
+    names = [cell.strip() for cell in next(lines, (1, []))[1]]
+    head = next(lines, None)
+    if len(names) < 2 or head is None:  # as reading it would say
         _read_table(path, CsvOptions(delimiter=options.get("delimiter", ",")))
+    n_lines, numbers, blank = 0, array("d"), bytearray()
+    first_lines = [head] if head else []
     if all(_is_number(cell) for cell in names):
         options["header"] = False
+        first_lines.insert(0, (1, names))
         names = [str(i + 1) for i in range(len(names))]
-    else:
-        rows = rows[1:]
-    good = [[_number(cell) for cell in cells] for _, cells in rows if len(cells) == len(names)]
-    table = np.array(good, float).reshape(len(good), len(names))
+    for _, cells in chain(first_lines, lines):
+        n_lines += 1
+        if len(cells) == len(names):
+            numbers.extend(map(_number, cells))
+            blank.extend(not cell.strip() for cell in cells)
+    table = np.array(numbers).reshape(-1, len(names))
     numeric = np.isfinite(table).mean(axis=0) > _MOST_BAD if len(table) else np.zeros(len(names), bool)
     if not numeric.any():
         hint = "see whether it is a table, and what stands between its cells"
         raise DataError("the table has no column of numbers", where=str(path), allowed=_ALLOWED, hint=hint)
-    empty = np.array([[not cell.strip() for cell in cells] for _, cells in rows if len(cells) == len(names)], bool)
-    text = ~np.isfinite(table) & ~empty.reshape(table.shape)
-    bad = int(np.sum(text[:, numeric].any(axis=1))) + len(rows) - len(good)
+    text = ~np.isfinite(table) & (np.array(blank).reshape(table.shape) == 0)
+    bad = int(np.sum(text[:, numeric].any(axis=1))) + n_lines - len(table)
     if bad:
         options["skip_bad_lines"] = True
     meanings = [_conventional_meaning(name) for name in names]
@@ -170,7 +178,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
         )
         for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True)
     )
-    notes = [f"{bad} of {len(rows)} lines are no rows of numbers"] if bad else []
+    notes = [f"{bad} of {n_lines} lines are no rows of numbers"] if bad else []
     clean = table[np.isfinite(t)]
     try:
         units, why = guess_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
@@ -200,8 +208,9 @@ def _rows(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
             lines = csv.reader(_limited_lines(file, path), delimiter=delimiter, skipinitialspace=True)
             count = 0
             for cells in lines:
-                count += len(cells)
-                check_number_count(count, str(path))
+                count += len(cells) + _LINE_COST
+                if count > MAX_INPUT_NUMBERS:
+                    check_number_count(count, str(path))
                 if len(cells) > _MAX_COLUMNS:
                     what, hint = f"the table has {len(cells)} columns", "see whether the delimiter is right"
                     raise DataError(what, where=str(path), allowed=f"at most {_MAX_COLUMNS} columns", hint=hint)
@@ -227,7 +236,7 @@ def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]],
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]
     _check_header(names, path, options)
-    rows: list[list[float]] = []
+    numbers = array("d")
     bad: list[int] = []
     if not options.header:
         names = [str(i + 1) for i in range(len(first))]
@@ -235,7 +244,7 @@ def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]],
 
     def read(line: int, cells: Sequence[str]) -> None:
         try:
-            rows.append(_numbers(cells, names, meanings, f"{path}, line {line}"))
+            numbers.extend(_numbers(cells, names, meanings, path, line))
         except DataError:
             if not options.skip_bad_lines:
                 raise
@@ -245,19 +254,21 @@ def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]],
         read(number, first)
     for line, cells in lines:
         read(line, cells)
-    if not rows:
+    table = np.array(numbers).reshape(-1, sum(meaning is not None for meaning in meanings))
+    if not len(table):
         allowed, hint = "one header row, then one row per time", "see whether the export was cut off"
         raise DataError("the table has no rows", where=str(path), allowed=allowed, hint=hint)
-    if len(bad) > _MOST_BAD * (len(rows) + len(bad)):
-        what = f"{len(bad)} of {len(rows) + len(bad)} lines are no rows of {len(names)} numbers"
+    n_lines = len(table) + len(bad)
+    if len(bad) > _MOST_BAD * n_lines:
+        what = f"{len(bad)} of {n_lines} lines are no rows of {len(names)} numbers"
         where, allowed = f"{path}, line {bad[0]}", "a table most of whose lines are rows of numbers"
         hint = "look at it with --preview; set the delimiter or leave columns of text out"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     notes: tuple[str, ...] = ()
     if bad:
         listed = ", ".join(map(str, bad[:_LISTED])) + (", ..." if len(bad) > _LISTED else "")
-        notes = (f"{len(bad)} of {len(rows) + len(bad)} lines were bad and left out (line {listed})",)
-    return [meaning for meaning in meanings if meaning], np.array(rows), notes
+        notes = (f"{len(bad)} of {n_lines} lines were bad and left out (line {listed})",)
+    return [meaning for meaning in meanings if meaning], table, notes
 
 
 def _check_header(header: Sequence[str], path: Path, options: CsvOptions) -> None:
@@ -288,9 +299,10 @@ def _number(cell: str) -> float:
 
 
 def _numbers(
-    cells: Sequence[str], header: Sequence[str], meanings: Sequence[tuple[str, str] | None], where: str
+    cells: Sequence[str], header: Sequence[str], meanings: Sequence[tuple[str, str] | None], path: Path, line: int
 ) -> list[float]:
     if len(cells) != len(header):
+        where = f"{path}, line {line}"
         raise DataError(f"the row has {len(cells)} cells", where=where, allowed=f"{len(header)} cells, as the header")
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
@@ -298,6 +310,7 @@ def _numbers(
             try:
                 numbers.append(float(cell) if cell.strip() else math.nan)
             except ValueError as error:
+                where = f"{path}, line {line}"
                 allowed = "a number with a decimal point, or nothing where there was no measurement"
                 raise DataError(f"column '{name}' holds '{cell}'", where=where, allowed=allowed) from error
     return numbers
