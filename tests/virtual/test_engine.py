@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH, Runs
+from virtual_examples import SYSTEMS, TRUTH, Runs, mujoco
 
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
@@ -23,8 +23,6 @@ from yid_ocp.virtual.mujoco_simulation import (
     settle_to_equilibrium,
     simulate_in_mujoco,
 )
-
-mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
 
 @pytest.mark.parametrize("arms", [1, 2])

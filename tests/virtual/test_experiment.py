@@ -21,8 +21,6 @@ from yid_ocp.virtual.experiment import (
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
-mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
-
 DEFAULTS = Path(yid_ocp.__file__).parent / "data" / "defaults"
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH
+from virtual_examples import SYSTEMS, TRUTH, mujoco
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import EFFECTS, make_effect
@@ -28,8 +28,6 @@ from yid_ocp.virtual.injected import (
 from yid_ocp.virtual.joint_motion import random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-
-mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
 SYSTEM = SYSTEMS[1]
 SIZES = {

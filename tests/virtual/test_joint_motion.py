@@ -11,8 +11,6 @@ from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 
-mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
-
 
 def test_initial_posture_reaches_the_tubes_within_the_limits() -> None:
     for arms, system in SYSTEMS.items():

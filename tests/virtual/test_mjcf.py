@@ -13,8 +13,6 @@ from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System, floating_clamp
 from yid_ocp.virtual.mjcf import mujoco_xml
 
-mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
-
 
 @pytest.mark.parametrize(
     ("system", "values"),

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH
+from virtual_examples import SYSTEMS, TRUTH, mujoco
 
 from yid_ocp.virtual.experiment import VirtualExperiment
 from yid_ocp.virtual.injected import (
@@ -25,8 +25,6 @@ from yid_ocp.virtual.injected import (
 from yid_ocp.virtual.joint_motion import random_multisine_motion
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-
-mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
 SYSTEM = SYSTEMS[1]
 

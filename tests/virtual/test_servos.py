@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -20,8 +21,6 @@ from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_moti
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_replay import replay_in_mujoco
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-
-mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
 
 POSTURE = {"pan": 0.2, "lift": 0.4, "elbow": 1.0, "wrist_flex": 0.3, "wrist_roll": 0.0}
 JOINTS = tuple(POSTURE)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from virtual_examples import assert_same_mechanics
+from virtual_examples import assert_same_mechanics, mujoco
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ModelError
@@ -16,8 +16,6 @@ from yid_ocp.export.models import effect_format_support
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.mjcf import ParameterEvaluator, compile_mjcf, joint_dynamics_terms, mujoco_xml
-
-mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
 
 MECHANICAL = {
     "kelvin_voigt": ("T", {"tau": 0.05}),

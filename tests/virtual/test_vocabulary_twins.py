@@ -25,8 +25,6 @@ from yid_ocp.virtual.injected import InjectedEffect, _InjectedTerms, run_experim
 from yid_ocp.virtual.mjcf import compile_mjcf, mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
-mujoco = pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo: pip install 'yid-ocp[blind]'")
-
 POSTURE = {"shoulder": 0.4, "elbow": 0.7}
 
 

@@ -14,6 +14,7 @@ from yid_ocp.vision import (
     look_at_pose,
     render_virtual_frames,
 )
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, numeric_mechanism, tube_meshes_by_joint
 
 SHAPE = (480, 640)
 
@@ -37,11 +38,12 @@ def test_noise_grows_with_the_square_of_distance(distance):
 
 
 def test_the_figures_at_two_metres():
-    camera = replace(DepthCamera(), disparity_step=0.0)
-    assert np.nanstd(inner(camera._simulate_depth_image(*wall(2.0), np.random.default_rng(0)))) == pytest.approx(
-        0.0058, rel=0.05
+    fine, stepped = (
+        inner(camera._simulate_depth_image(*wall(2.0), np.random.default_rng(0)))
+        for camera in (replace(DepthCamera(), disparity_step=0.0), DepthCamera())
     )
-    steps = np.unique(DepthCamera()._simulate_depth_image(*wall(2.0), np.random.default_rng(0)))
+    assert np.nanstd(fine) == pytest.approx(0.0058, rel=0.05)
+    steps = np.unique(stepped)
     assert np.diff(steps[np.isfinite(steps)]).mean() == pytest.approx(0.0115, rel=0.1)
 
 
@@ -74,19 +76,11 @@ def test_outliers_are_as_many_as_asked_for():
 
 def test_frame_timing():
     rng = np.random.default_rng(0)
-    when = FrameTiming(
-        mean_rate=10.0,
-        period_jitter=0.25,
-        dropped_fraction=1 / 3,
-        latency=0.05,
-        latency_std=0.002,
-        late_fraction=0.1,
-        late_stamp_delay=0.2,
-    )
+    when = FrameTiming(10.0, dropped_fraction=1 / 3, latency=0.05, latency_std=0.002, late_fraction=0.1)
     taken, stamps = when._sample_times_and_stamps(0.0, 300.0, rng)
     assert len(taken) == pytest.approx(2000, rel=0.05)
     delay = stamps - taken - 0.05
-    assert (delay > 0.15).mean() == pytest.approx(0.1, abs=0.03)
+    assert (delay > 0.1).mean() == pytest.approx(0.1, abs=0.03)
     assert np.std(delay[delay < 0.1]) == pytest.approx(0.002, rel=0.1)
     with pytest.raises(ConfigError, match="rate"):
         FrameTiming(mean_rate=0.0)._sample_times_and_stamps(0.0, 1.0, rng)
@@ -101,8 +95,6 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     assert np.array_equal(first, one.sequence.load_cloud(1))
     assert not np.array_equal(one.capture_times[:3], two.capture_times[:3])
     # the object's surface is where the points are
-    from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, numeric_mechanism, tube_meshes_by_joint
-
     tubes = ArticulatedSurfaces(numeric_mechanism(system), tube_meshes_by_joint(system))
     away, _, _ = tubes.nearest_moving_surface(
         one.sequence.load_world_cloud(1), one.true_configuration_at(one.capture_times[1]), 0.2

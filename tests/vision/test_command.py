@@ -31,16 +31,6 @@ track:
 """
 
 
-@pytest.fixture
-def cli(capsys):
-    def run(*arguments):
-        code = main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return SimpleNamespace(code=code, out=captured.out, err=captured.err)
-
-    return run
-
-
 @pytest.fixture(scope="module")
 def config(repository, tmp_path_factory):
     file = tmp_path_factory.mktemp("config") / "small.yaml"

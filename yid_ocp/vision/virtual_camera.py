@@ -35,6 +35,10 @@ _FLOOR_AND_WALL = (([8.0, 8.0, 0.02], [1.0, 0.0, -0.94]), ([0.02, 8.0, 3.0], [-0
 """Edges and middles of thin boxes [m]."""
 
 
+_PERIOD_JITTER = 0.25  # share of its mean by which a period varies either way
+_LATE_STAMP_DELAY = 0.15  # [s]
+
+
 @dataclass(frozen=True)
 class DepthCamera:
     """Geometry and errors of a structured-light depth camera; the defaults are an Asus Xtion Pro Live."""
@@ -109,27 +113,22 @@ class FrameTiming:
     """Timing model of a camera: frame rate, dropped frames and errors of time stamps."""
 
     mean_rate: float = 3.0  # mean rate [Hz]
-    period_jitter: float = 0.25  # periods vary by this share either way
     dropped_fraction: float = 0.0  # share of frames that never arrive
     # by how much every stamp is later than the picture, and the camera's clock ahead, taken together [s]
     latency: float = 0.0
     latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
-    late_fraction: float = 0.0  # share of frames that are stamped `late_stamp_delay` [s] too late
-    late_stamp_delay: float = 0.15
+    late_fraction: float = 0.0  # share of frames that are stamped much too late
 
     def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
         """Times of the pictures that arrive and their stamps, both shape (M,) [s]."""
-        if not (self.mean_rate > 0 and 0 <= self.period_jitter < 1):
-            raise ConfigError(
-                f"mean_rate = {self.mean_rate}, period_jitter = {self.period_jitter}",
-                allowed="mean_rate > 0, 0 <= period_jitter < 1",
-            )
-        count = math.ceil((stop - start) * self.mean_rate / (1 - self.period_jitter)) + 2
-        taken = start + np.cumsum(rng.uniform(1 - self.period_jitter, 1 + self.period_jitter, count) / self.mean_rate)
+        if not self.mean_rate > 0:
+            raise ConfigError(f"mean_rate = {self.mean_rate}", allowed="mean_rate > 0")
+        count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
+        taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
         taken = taken[taken < stop]
         taken = taken[rng.random(len(taken)) >= self.dropped_fraction]
         stamps = taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
-        return taken, stamps + np.where(rng.random(len(taken)) < self.late_fraction, self.late_stamp_delay, 0.0)
+        return taken, stamps + np.where(rng.random(len(taken)) < self.late_fraction, _LATE_STAMP_DELAY, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
