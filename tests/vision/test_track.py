@@ -11,7 +11,6 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.vision import (
-    CameraCalibrationOptions,
     CameraClockOptions,
     CameraScene,
     CloudFilterOptions,
@@ -94,27 +93,18 @@ def test_the_camera_and_its_clock_are_found(clean):
     assert clean.track.shared_std.max() > 0
 
 
-def test_a_displaced_camera_is_put_right_or_said(system, recording, clean):
+def test_a_displaced_camera_is_put_right(system, recording, clean):
     sequence = some_of(clean.made.sequence, [1, 4, 7])
     pose = sequence.camera_pose.copy()
-    pose[:3, 3] += [0.015, -0.012, 0.01]
-    pose[:3, :3] = Rotation.from_rotvec([0.01, -0.005, 0.015]).as_matrix() @ pose[:3, :3]
-    loose = {"max_distance_in_radii": 4.0, "max_distance_ratio": 20.0, "max_grasp_gap_change": 0.2}
-    kept = {"calibration": CameraCalibrationOptions(fix_pose=True), "max_point_std": 0.2}
-    scene, stds = CameraScene(system, "package:baxter"), []
-    for more, word in (({}, "sees the arm"), (kept, "contradicts")):
-        options = TrackOptions(**loose, min_visible_coverage=0.0, **more)
-        found = track_object(scene, recording, replace(sequence, camera_pose=pose), options)
-        assert word in found.camera_calibration.message
-        truth = np.array([found._place(clean.made.true_configuration_at(t)) for t in found.t])
-        errors = found.position - truth
-        assert np.nanmean((errors / found.std) ** 2) < 1.5
-        if not stds:
-            assert np.nanmax(np.linalg.norm(errors, axis=2)) < 15 * MILLIMETRE
-            assert np.allclose(found.to_point_group().pose, sequence.camera_pose, atol=0.02)
-            assert "one error of all frames" in found.to_point_group().sensor
-        stds.append(np.nanmedian(found.std))
-    assert stds[1] > 2 * stds[0]
+    pose[:3, 3] += [0.03, -0.025, 0.02]
+    pose[:3, :3] = Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix() @ pose[:3, :3]
+    found = track_object(CameraScene(system, "package:baxter"), recording, replace(sequence, camera_pose=pose))
+    assert "sees the arm" in found.camera_calibration.message
+    errors = found.position - np.array([found._place(clean.made.true_configuration_at(t)) for t in found.t])
+    assert np.nanmean((errors / found.std) ** 2) < 1.5
+    assert np.nanmax(np.linalg.norm(errors, axis=2)) < 15 * MILLIMETRE
+    assert np.allclose(found.to_point_group().pose, sequence.camera_pose, atol=0.02)
+    assert "one error of all frames" in found.to_point_group().sensor
 
 
 def test_a_recording_that_solve_reads(tmp_path, clean, recording, system):
