@@ -27,6 +27,7 @@ _DataclassType = TypeVar("_DataclassType")
 MAX_INPUT_NUMBERS = 1 << 26
 """Largest count of numbers of one file from outside: as float64 with copies, 32 bytes each, they are 2 GiB."""
 MAX_TEXT_BYTES = 1 << 26  # of a file that is read as one text
+_MEMORY_OF_READING = 3 << 30  # address space that a library may take to read a file [bytes]
 
 
 def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
@@ -58,6 +59,28 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
         allowed = f"at most {max_bytes / 2**20:.0f} MiB"
         raise DataError(what, where=str(path), allowed=allowed, hint="see whether it is the right file")
     return path
+
+
+@contextlib.contextmanager
+def limited_memory() -> Iterator[None]:
+    """Context manager in which this process cannot take more than 3 GiB beside what it has, on Linux.
+
+    It is for libraries that unpack what a file from outside holds; what is more becomes a MemoryError.
+    """
+    before = None
+    with contextlib.suppress(ImportError, OSError):
+        import resource
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        if soft == resource.RLIM_INFINITY:  # else there is an outer one, or the user's own
+            held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            resource.setrlimit(resource.RLIMIT_AS, (held + _MEMORY_OF_READING, hard))
+            before = soft, hard
+    try:
+        yield
+    finally:
+        if before is not None:
+            resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def check_number_count(count: int, where: str) -> None:

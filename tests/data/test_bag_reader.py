@@ -14,7 +14,7 @@ from heard import Heard
 from recording_examples import joints_of
 
 from yid_ocp.data.readers import preview_file, read_any
-from yid_ocp.data.readers.bags import read_bag
+from yid_ocp.data.readers.bags import OpenBag, read_bag
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
@@ -399,6 +399,22 @@ def test_bags_that_are_none(tmp_path: Path) -> None:
         read_any(tmp_path)
     with pytest.raises(DataError, match="no such file"):
         read_bag(tmp_path / "absent.bag")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the system cannot limit memory")
+def test_what_a_bag_unpacks_to_is_limited(tmp_path: Path) -> None:
+    bag = OpenBag(write_bag(tmp_path, "mcap", arm_and_camera()))
+    with pytest.raises(DataError, match="MemoryError"), bag.read_errors_as_data_errors():
+        bytearray(4 << 30)
+    assert len(bytearray(4 << 30)) == 4 << 30  # and afterwards nothing is
+
+
+def test_metadata_of_a_bag_that_take_long_are_refused(tmp_path: Path) -> None:
+    path = write_bag(tmp_path, "mcap folder", arm_and_camera())
+    with (path / "metadata.yaml").open("a") as file:
+        file.write("more: [" + "1, " * 100_000 + "1]\n")
+    with pytest.raises(DataError, match="more than can be meant"):
+        read_any(path)
 
 
 def test_bags_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

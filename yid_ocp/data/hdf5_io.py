@@ -19,12 +19,10 @@ from pathlib import Path
 import h5py
 
 from yid_ocp.errors import DataError
-from yid_ocp.files import MAX_INPUT_NUMBERS, atomic_write, check_input_file, os_error_reason
+from yid_ocp.files import MAX_INPUT_NUMBERS, atomic_write, check_input_file, limited_memory, os_error_reason
 
 _READ_TIMEOUT = 10.0
 """Time limit for reading a whole file [s]."""
-_TRIAL_MEMORY = 3 << 30
-"""Address space that the trial of a file may take beside what the process has [bytes]."""
 
 
 def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
@@ -53,40 +51,32 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
         child = os.fork()
     if child == 0:
         try:
-            _limit_memory()
             faulthandler.disable()
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
-            os.write(there, f".{complaint(path)}".encode(errors="replace")[:2000])
+            with limited_memory():
+                said = complaint(path)
+            os.write(there, f".{said}".encode(errors="replace")[:2000])
         finally:
             os._exit(0)
     os.close(there)
     try:
         ready, _, _ = select.select([here], [], [], _READ_TIMEOUT)
-        said = os.read(here, 4000).decode(errors="replace") if ready else None
+        answer = os.read(here, 4000).decode(errors="replace") if ready else None
     finally:
         os.close(here)
         with contextlib.suppress(ProcessLookupError):
             os.kill(child, signal.SIGKILL)
         _, status = os.waitpid(child, 0)
-    if said is None:
+    if answer is None:
         what = f"the {noun} file cannot be read within {_READ_TIMEOUT:g} s: it is damaged, or far too large"
-    elif not said:
+    elif not answer:
         number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
         how = signal.Signals(number).name if number else "an exit"
         what = f"the {noun} file is damaged (it ends the {noun} library with {how})"
     else:
-        what = said[1:]
+        what = answer[1:]
     if what:
         raise DataError(what, where=str(path), hint="copy or record it again, as one file of its own")
-
-
-def _limit_memory() -> None:
-    """Limit the address space of this process to what it has and `_TRIAL_MEMORY`, where the system can."""
-    with contextlib.suppress(ImportError, OSError, ValueError):
-        import resource
-
-        held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (held + _TRIAL_MEMORY,) * 2)
 
 
 _MAX_GROUP_DEPTH = 10

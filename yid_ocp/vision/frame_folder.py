@@ -26,6 +26,7 @@ from yid_ocp.files import (
     atomic_write,
     check_input_file,
     check_number_count,
+    limited_memory,
     make_folder,
     read_input_json,
     read_input_text,
@@ -97,7 +98,7 @@ def _read_pcd(path: Path) -> tuple[Array, ColourArray | None]:
         raise DataError(what, where=str(path), hint=_AGAIN)
     # Open3D says what is wrong on the standard output and returns an empty cloud
     try:
-        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        with limited_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             cloud = o3d.io.read_point_cloud(str(path))
     except (MemoryError, RuntimeError) as error:
         what = f"the cloud is damaged: it declares more points than fit into memory ({error})"

@@ -29,7 +29,7 @@ from yid_ocp.data.readers.base import (
 )
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
-from yid_ocp.files import check_input_file, file_sha256
+from yid_ocp.files import check_input_file, file_sha256, limited_memory
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
 _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
@@ -70,6 +70,9 @@ class _BagTopic:
     count: int
 
 
+_MAX_METADATA_BYTES = 1 << 18  # of a bag's YAML, which is read slowly
+
+
 class OpenBag:
     """An open ROS 1 bag, ROS 2 bag or MCAP file, with its `topics` and the `reader` of rosbags.
 
@@ -89,7 +92,7 @@ class OpenBag:
         self.path = path
         for file in path.iterdir() if path.is_dir() else (path,):
             if not file.is_dir():
-                check_input_file(file)
+                check_input_file(file, _MAX_METADATA_BYTES if file.suffix == ".yaml" else None)
         counted: Counter[tuple[str, str]] = Counter()
         with self.read_errors_as_data_errors():
             # older ROS 2 bags do not hold the definitions of their messages; these have not changed since
@@ -103,7 +106,8 @@ class OpenBag:
     def read_errors_as_data_errors(self) -> Iterator[None]:
         """Context manager that turns every error while the bag is read into a `DataError`."""
         try:
-            yield
+            with limited_memory():  # what is packed may say nothing, or lie, about its size
+                yield
         except Exception as error:  # rosbags lets through whatever a damaged file makes struct, sqlite3 or zstd raise
             what, where = f"the bag cannot be read ({type(error).__name__}: {error})", str(self.path)
             allowed = "a ROS 1 .bag, a ROS 2 folder with metadata.yaml, or an .mcap or .db3 file of ROS 2"
