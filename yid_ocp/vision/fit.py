@@ -423,10 +423,9 @@ class ShapeFitter:
         gradient, hessian = np.zeros(total), np.zeros((total, total))
 
         def add(rows: Array, error: Array, weight: Array) -> None:
-            nonlocal gradient, hessian
             weighted = rows * weight[:, None]
-            gradient = gradient + weighted.T @ error
-            hessian = hessian + weighted.T @ rows
+            gradient[:] += weighted.T @ error
+            hessian[:] += weighted.T @ rows
 
         if task is not None:
             depths = line_of_sight_residuals(np.array(out).reshape(-1, 2, 3), self.link_radii, task.points, task.camera)

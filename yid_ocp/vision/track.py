@@ -66,7 +66,6 @@ from yid_ocp.vision.surface_meshes import (
 )
 from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, TrackResult
 
-_ProgressCallback = Callable[[int, int, str], None]
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
 
 _ASKED = 8  # frames, at most, that are asked about the object's sizes
@@ -84,7 +83,6 @@ def track_object(
     options: TrackOptions | None = None,
     *,
     empty: FrameSequence | None = None,
-    progress: _ProgressCallback | None = None,
 ) -> TrackResult:
     """Track the object's points in a frame sequence.
 
@@ -97,8 +95,6 @@ def track_object(
         Joint angles, for the self-filter, the grasps and the clock; None where the model has no robot.
     empty : FrameSequence, optional
         Frames of the scene without robot and object, by the same camera: a background.
-    progress : callable, optional
-        Called with frames done, frames in all and what is being done.
 
     Raises
     ------
@@ -108,14 +104,8 @@ def track_object(
         A point that the system does not have; meshes that cannot be read.
     """
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
-    told = progress or (lambda done, total, text: None)
-    total = len(tracker.calibration_frames) + len(tracker.frame_order)
-    common = tracker.calibrate_sequence(lambda done, text: told(done, total, text))
-    frames = []
-    for done, i in enumerate(tracker.frame_order, start=len(tracker.calibration_frames)):
-        told(done, total, f"fitting {sequence.frame_names[i]}")
-        frames.append(tracker.track_frame(i, common))
-    told(total, total, "done")
+    common = tracker.calibrate_sequence()
+    frames = [tracker.track_frame(i, common) for i in tracker.frame_order]
     return tracker.to_track_result(*tracker.assign_root_and_mark_outliers(frames), common)
 
 
@@ -207,10 +197,9 @@ class FrameTracker:
             q[index] = self.joint_angles_at(t)
         return q
 
-    def calibrate_sequence(self, progress: Callable[[int, str], None] = lambda done, text: None) -> SequenceCalibration:
+    def calibrate_sequence(self) -> SequenceCalibration:
         """Calibration shared by the sequence, estimated from some of its frames."""
-        calibration = self._calibration(progress)
-        progress(len(self.calibration_frames), "comparing the object's sizes")
+        calibration = self._calibration()
         background = BackgroundPoints()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
         if self.empty_scene is not None:
@@ -247,20 +236,18 @@ class FrameTracker:
             background = found.merged_with(background)
         return SequenceCalibration(calibration, sizes, background)
 
-    def _calibration(self, progress: Callable[[int, str], None]) -> CameraCalibration:
+    def _calibration(self) -> CameraCalibration:
         options = self.options
         if self.arm_surface is None:
             return calibration_without_estimation(self.sequence.camera_pose, options.clock, "no robot to compare")
         glimpses = []
-        for done, i in enumerate(self.calibration_frames):
-            progress(done, f"reading {self.sequence.frame_names[i]}")
+        for i in self.calibration_frames:
             try:
                 points, _ = self._finite(self.sequence, i)
             except DataError:
                 continue  # the second pass says why
             thinned = voxel_averages(points, options.filters.voxel_size).points
             glimpses.append(CalibrationFrame(float(self.sequence.stamps[i]), thinned))
-        progress(len(self.calibration_frames), "calibrating the camera by the arm")
         rng = np.random.default_rng(options.seed)
         pose, source = self.sequence.camera_pose, self.sequence.source
         return calibrate_camera(self.arm_surface, glimpses, pose, rng, options.calibration, options.clock, source)
