@@ -13,7 +13,8 @@ PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dua
 # settings that make each run quick: fewer links and a short horizon
 COARSE = (
     "model.object.links=1",
-    "problem.duration=0.3",
+    # so short that the first fit is good: no other start is tried
+    "problem.duration=0.1",
     "solver.max_iterations=2",
     # one stiffness: the others are hardly seen in so short a time, and their profile likelihoods take many refits
     "parameters={}",
@@ -25,16 +26,21 @@ DEFT = "../../shared/recordings/deft/bdlo1_train_{}.h5"
 QUICK = {
     **dict.fromkeys(PAPER, (*COARSE, *UNREFINED)),
     "single_arm_vision": COARSE,
-    "baxter_arm": ("problem.duration=2.0",),
+    "baxter_arm": ("problem.duration=1.6", *UNREFINED),
     "double_pendulum": ("problem.duration=3.0",),
     "servo_arm": (
-        "problem.duration=0.5",
+        "problem.duration=0.2",
         "model.object.segments.rod.links=1",
-        "solver.max_iterations=3",
+        "solver.max_iterations=2",
         "problem.use_compiler=false",
         *UNREFINED,
     ),
-    "panda_beam": ("problem.duration=1.5", "model.object.segments.beam.links=2", "solver.max_iterations=3"),
+    "panda_beam": (
+        "problem.duration=0.8",
+        "model.object.segments.beam.links=1",
+        "solver.max_iterations=3",
+        *UNREFINED,
+    ),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "soft_beam": (
         "problem.duration=0.3",

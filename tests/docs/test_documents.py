@@ -78,7 +78,7 @@ def test_names_in_the_pages_exist(repository):
     assert not absent
 
 
-def test_the_tutorial_runs(page, run_script, repository):
+def test_the_tutorial_runs(page, run_script, repository, shipped_optimization):
     run_script("\n".join(blocks(page("tutorial"), "python")), repository)
 
 

@@ -1,7 +1,5 @@
 """Parallel work: threads, processes and cluster clients, which no other package starts."""
 
-from yid_ocp.parallel.batched_evaluation import batched_call as batched_call
-from yid_ocp.parallel.batched_evaluation import map_with_batched_calls as map_with_batched_calls
 from yid_ocp.parallel.resumable_tasks import LOCAL_WORKER_CONFIG as LOCAL_WORKER_CONFIG
 from yid_ocp.parallel.resumable_tasks import Task as Task
 from yid_ocp.parallel.resumable_tasks import TaskProgressCallback as TaskProgressCallback
@@ -13,5 +11,7 @@ from yid_ocp.parallel.threads_and_processes import CASADI_LOCK as CASADI_LOCK
 from yid_ocp.parallel.threads_and_processes import CasadiLockedCache as CasadiLockedCache
 from yid_ocp.parallel.threads_and_processes import InlineExecutor as InlineExecutor
 from yid_ocp.parallel.threads_and_processes import available_processor_count as available_processor_count
+from yid_ocp.parallel.threads_and_processes import batched_call as batched_call
 from yid_ocp.parallel.threads_and_processes import map_in_threads as map_in_threads
+from yid_ocp.parallel.threads_and_processes import map_with_batched_calls as map_with_batched_calls
 from yid_ocp.parallel.threads_and_processes import process_pool as process_pool

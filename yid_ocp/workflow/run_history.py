@@ -139,7 +139,7 @@ def baseline_estimates(run: RunSettings) -> tuple[RunEstimates, ...]:
         if any(Path(folder).resolve() == Path(other.run_name).resolve() for other in found):
             what = f"{folder} is given twice, and would count twice"
             raise run.config_error(what, *where, hint="list every run once")
-        if differing := _difference(run, folder):
+        if differing := _difference(run, _settings(folder)):
             what = f"{folder} is a run of another model: model.{differing} differs"
             hint = f"compare model.{differing} with {Path(folder) / 'config.yaml'}"
             raise run.config_error(what, *where, allowed=_SAME_MODEL, hint=hint)
@@ -167,16 +167,15 @@ def require_same_model(folders: Sequence[Path]) -> None:
     if dependent:
         raise ConfigError(dependent, where="report", hint="diagnose without --baseline for a history, or leave one out")
     known = [(folder, settings) for folder in folders if (settings := _settings(folder)) is not None]
-    for folder, _ in known[1:]:
-        if differing := _difference(known[0][1], folder):
+    for folder, settings in known[1:]:
+        if differing := _difference(known[0][1], settings):
             what = f"the runs are of different models: model.{differing} differs"
             allowed = f"{_SAME_MODEL} as in {known[0][0]}"
             raise ConfigError(what, where=str(folder / "config.yaml"), allowed=allowed)
 
 
-def _difference(run: RunSettings, folder: str | Path) -> str:
-    """The first section of the model in which a run and one in a folder differ, empty where none is known to."""
-    there = _settings(folder)
+def _difference(run: RunSettings, there: RunSettings | None) -> str:
+    """The first section of the model in which two runs differ, empty where none is known to."""
     if there is None:
         return ""
     for key in _COMPARED_MODEL_SECTIONS:
