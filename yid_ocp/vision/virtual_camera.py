@@ -36,7 +36,6 @@ _FLOOR_AND_WALL = (([8.0, 8.0, 0.02], [1.0, 0.0, -0.94]), ([0.02, 8.0, 3.0], [-0
 
 
 _PERIOD_JITTER = 0.25  # share of its mean by which a period varies either way
-_LATE_STAMP_DELAY = 0.15  # [s]
 
 
 @dataclass(frozen=True)
@@ -117,7 +116,6 @@ class FrameTiming:
     # by how much every stamp is later than the picture, and the camera's clock ahead, taken together [s]
     latency: float = 0.0
     latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
-    late_fraction: float = 0.0  # share of frames that are stamped much too late
 
     def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
         """Times of the pictures that arrive and their stamps, both shape (M,) [s]."""
@@ -127,8 +125,7 @@ class FrameTiming:
         taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
         taken = taken[taken < stop]
         taken = taken[rng.random(len(taken)) >= self.dropped_fraction]
-        stamps = taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
-        return taken, stamps + np.where(rng.random(len(taken)) < self.late_fraction, _LATE_STAMP_DELAY, 0.0)
+        return taken, taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
 
 
 @dataclass(frozen=True, eq=False)
