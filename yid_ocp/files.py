@@ -24,10 +24,10 @@ from yid_ocp.errors import DataError, OutputError
 _DataclassType = TypeVar("_DataclassType")
 
 
-MAX_INPUT_NUMBERS = 1 << 26
-"""Largest count of numbers of one file from outside: as float64 with copies, 32 bytes each, they are 2 GiB."""
+MAX_INPUT_NUMBERS = 50_000_000
+"""Largest count of numbers of one file from outside: as float64 with copies, 40 bytes each, they are 2 GB."""
 MAX_TEXT_BYTES = 1 << 26  # of a file that is read as one text
-_MEMORY_OF_READING = 3 << 30  # address space that a library may take to read a file [bytes]
+_MEMORY_OF_READING = 7 << 28  # address space that a library may take to read a file [bytes]
 
 
 def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
@@ -63,7 +63,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 @contextlib.contextmanager
 def limited_memory() -> Iterator[None]:
-    """Context manager in which this process cannot take more than 3 GiB beside what it has, on Linux.
+    """Context manager in which this process cannot take more than 1.75 GiB beside what it has, on Linux.
 
     It is for libraries that unpack what a file from outside holds; what is more becomes a MemoryError.
     """
