@@ -11,7 +11,8 @@ from yid_ocp.data import read_recording, write_recording
 from yid_ocp.errors import ConfigError, OutputError
 from yid_ocp.workflow.batch import list_batch_runs, run_batch
 
-QUICK = ("output.write_report=false", "output.discretisation_check=none", "recordings.held_out=[]")
+SHORT = "problem.duration=0.6"
+QUICK = ("output.write_report=false", "output.discretisation_check=none", "recordings.held_out=[]", SHORT)
 
 
 @pytest.fixture
@@ -104,7 +105,8 @@ def test_what_cannot_be_a_batch_is_refused(pendulum, tmp_path):
 
 def test_the_command_runs_the_fleet_in_processes(cli, pendulum, fleet, tmp_path):
     (fleet / "spoiled.h5").unlink()
-    given = (pendulum, "--recordings", fleet / "*.h5", "--set", QUICK[0], "--set", QUICK[1], "--out", "fleet_runs")
+    settings = [part for setting in QUICK for part in ("--set", setting)]
+    given = (pendulum, "--recordings", fleet / "*.h5", *settings, "--out", "fleet_runs")
     done = cli("batch", *given, "--workers", 1)
     assert done.code == 0, done.err
     assert "2 runs: 2 converged." in done.out

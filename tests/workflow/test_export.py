@@ -39,7 +39,7 @@ def written_run(folder, effects, run):
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    run = load_config(None, default=DEFAULT_DIAGNOSIS_CONFIG)
+    run = load_config(None, ["problem.duration=1.5"], default=DEFAULT_DIAGNOSIS_CONFIG)
     return written_run(tmp_path_factory.mktemp("found") / "run", {"kelvin_voigt@T1.tau": 0.05}, run)
 
 
