@@ -210,6 +210,12 @@ BROKEN = {
 }
 
 
+def test_what_is_missing_in_a_urdf_is_said(tmp_path):
+    (tmp_path / "page.urdf").write_text("<html></html>")
+    with pytest.raises(ModelError, match="the URDF cannot be read: 'name' is missing"):
+        read_urdf(tmp_path / "page.urdf")
+
+
 @pytest.mark.parametrize("name", list(BROKEN))
 def test_a_broken_urdf_is_refused(name, tmp_path):
     parts, words = BROKEN[name]

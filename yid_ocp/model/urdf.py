@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import DataError, ModelError, nearest_name_hint
+from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.files import MAX_TEXT_BYTES, check_input_file, is_file
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -172,7 +172,8 @@ def _parsed(file: Path) -> Any:
     except ModelError:
         raise
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
-        what = f"the URDF cannot be read: {error.what if isinstance(error, DataError) else error}"
+        reason = f"{error} is missing" if isinstance(error, KeyError) else getattr(error, "what", error)
+        what = f"the URDF cannot be read: {reason}"
         allowed, hint = "a file of URDF with links and joints", "look at it with check_urdf, or export it again"
         raise ModelError(what, where=str(file), allowed=allowed, hint=hint) from error
 
