@@ -35,7 +35,7 @@ class Bench:
         system = self.system.with_effects(
             [make_effect(*label.split("@"), self.system, values) for label, values in effects.items()]
         )
-        step = compile_step(system, TIME_STEP, use_compiler=False)
+        step = compile_step(system, TIME_STEP)
         rng = np.random.default_rng(seed)
         steps = round(duration / TIME_STEP)
         t = TIME_STEP * np.arange(steps + 1)

@@ -20,7 +20,7 @@ from yid_ocp.workflow.plan import discrimination_plan_settings, run_plan
 PLAN = """\
   elbow.damping: {free: true}
 recordings: {estimate: [RECORDING]}
-problem: {use_compiler: false, path_cutoff: 15.0, feedback: none}
+problem: {path_cutoff: 15.0, feedback: none}
 plan:
   {goal: information, duration: 0.8, hold_duration: 0.4, n_spline_coefficients: 3, n_random_starts: 2,
     limits: {max_acceleration: 15.0}}

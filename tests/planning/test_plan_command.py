@@ -16,7 +16,7 @@ from yid_ocp.workflow.plan import compile_step_for_planning, identified_paramete
 from yid_ocp.workflow.simulate import run_simulate
 
 PLAN = """\
-problem: {use_compiler: false, path_cutoff: .inf}
+problem: {path_cutoff: .inf}
 plan: {point: tip, target_offset: [0.0, 0.15, 0.04], start_joint_positions: {shoulder: 0.2}, duration: 0.7,
   hold_duration: 0.3, position_tolerance: 0.02}
 """
