@@ -94,6 +94,13 @@ def as_recording(cable, t, courses, name="made"):
     return Recording(points=(PointGroup("points", cable.vertices, t, seen),), name=name)
 
 
+def vertex_positions(cable, system):
+    """CasADi function of the positions of all vertices, of q and theta."""
+    q = ca.SX.sym("q", system.n_coordinates)
+    at = forward_kinematics(system.mechanism, q).frame_position
+    return ca.Function("places", [q, system.parameters.symbols], [at(v) for v in cable.vertices])
+
+
 @pytest.fixture(scope="module")
 def twin(cable, clamps):
     """The compiled step of a cable, and a recording made with it at known values, from rest."""
@@ -111,15 +118,9 @@ def twin(cable, clamps):
     assert rest.is_converged, rest.message
     swept = simulate(step, theta, rest.state, len(t) - 1, None, path)
     assert swept.status.is_converged, swept.status.message
-    q = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, q)
-    places = ca.Function(
-        "places", [q, system.parameters.symbols], [kinematics.frame_position(v) for v in cable.vertices]
-    )
-    seen = {
-        v: np.stack([np.array(places(s[: system.n_coordinates], theta)[i]).ravel() for s in swept.state])
-        for i, v in enumerate(cable.vertices)
-    }
+    places = vertex_positions(cable, system).map(len(swept.state))
+    positions = places(swept.state[:, : system.n_coordinates].T, theta)
+    seen = {v: np.array(p).T for v, p in zip(cable.vertices, positions, strict=True)}
     return step, options, as_recording(cable, t, seen, "twin")
 
 
@@ -135,11 +136,7 @@ def test_a_cable_names_segments_clamps_junctions_and_vertices(cable, twin):
 
 def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
     system = twin[0].system
-    q = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, q)
-    places = ca.Function(
-        "places", [q, system.parameters.symbols], [kinematics.frame_position(v) for v in cable.vertices]
-    )
+    places = vertex_positions(cable, system)
     at = np.array([np.array(p).ravel() for p in places(np.zeros(system.n_coordinates), system.parameters.vector())])
     shape = cable.undeformed_polyline(cable.vertices)
 

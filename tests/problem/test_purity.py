@@ -106,23 +106,22 @@ def test_an_answer_at_rest_does_not_depend_on_earlier_questions(arm):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_answer_does_not_depend_on_threads(kind, pendulum):
-    seeds = list(range(4)) * 2
-    reference = [said(pendulum(kind), x) for x in points(pendulum(kind), seeds)]
     asked = pendulum(kind)
+    asking = points(asked, range(4))
+    reference = [said(pendulum(kind), x) for x in asking]
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda x: said(asked, x), points(asked, seeds)))
-    for one, other in zip(found, reference, strict=True):
+        found = list(pool.map(lambda x: said(asked, x), asking * 2))
+    for one, other in zip(found, reference * 2, strict=True):
         assert_same(one, other)
 
 
 def test_compiled_answers_do_not_depend_on_threads(arm):
-    seeds = list(range(3)) * 2
-    one_by_one = arm("equilibrium")
-    reference = [said(one_by_one, x) for x in points(one_by_one, seeds)]
-    asked = arm("equilibrium")
+    one_by_one, asked = arm("equilibrium"), arm("equilibrium")
+    asking = points(asked, range(3))
+    reference = [said(one_by_one, x) for x in asking]
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(lambda x: said(asked, x), points(asked, seeds)))
-    for one, other in zip(found, reference, strict=True):
+        found = list(pool.map(lambda x: said(asked, x), asking * 2))
+    for one, other in zip(found, reference * 2, strict=True):
         assert_same(one, other)
 
 
