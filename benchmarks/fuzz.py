@@ -29,7 +29,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -49,6 +49,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.vision import FrameSequence, look_at_pose, read_frames, write_frame_folder
 
 PATIENCE = 20.0  # [s]
+LATE = "not done after"
 MEMORY = 2 << 30
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -516,7 +517,7 @@ def tried(case: Case, originals_folder: Path, work: Path) -> str:
     except Exception as error:  # whatever else comes up is what is looked for
         return f"{type(error).__name__}: {error}"[:500]
     if time.monotonic() - begun > PATIENCE:
-        return f"{time.monotonic() - begun:.1f} s"
+        return f"{LATE} {time.monotonic() - begun:.1f} s"
     if left := [path.name for path in stand.iterdir()]:
         return f"left where the process stands: {left}"
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
@@ -546,9 +547,13 @@ class Worker:
 
 
 def hunt(cases: Iterator[Case], seconds: float, jobs: int) -> tuple[int, list[tuple[Case, str]]]:
-    """Try inputs until they or the time end; returns how many were tried, and those taken wrongly."""
+    """Try inputs until they or the time end; returns how many were tried, and those taken wrongly.
+
+    What was late is tried once more: the machine may have been busy with something else.
+    """
     context = multiprocessing.get_context("spawn")
     found: list[tuple[Case, str]] = []
+    late: list[Case] = []
     count, begun, number = 0, time.monotonic(), 0
     with tempfile.TemporaryDirectory(prefix="yid-fuzz-") as folder:
         valid = Path(folder) / "valid"
@@ -584,18 +589,24 @@ def hunt(cases: Iterator[Case], seconds: float, jobs: int) -> tuple[int, list[tu
                         worker.process.join()
                         said = f"its process ended with {worker.process.exitcode}"
                 elif time.monotonic() - worker.since > 1.5 * PATIENCE + (30 if count < jobs else 0):
-                    said = f"no end after {1.5 * PATIENCE:g} s"
+                    said = f"{LATE} {1.5 * PATIENCE:g} s"
                 if said is None:
                     continue
-                count += 1
-                if said:
+                if not (again := said.startswith(LATE) and worker.case not in late):
+                    count += 1
+                else:
+                    late.append(worker.case)
+                if said and not again:
                     found.append((worker.case, said))
                     print(f"{worker.case.kind} --only {worker.case.seed}: {said}", flush=True)
-                worker.case = None
-                if said.startswith(("its process", "no end", f"{MEMORY}")) or "GiB" in said:
+                worker.case = worker.case if again else None
+                if said.startswith(("its process", LATE)) or "GiB" in said:
                     worker.process.kill()
                     worker.process.join()
-                    workers[i] = started()
+                    worker = workers[i] = replace(started(), case=worker.case)
+                if worker.case is not None:
+                    worker.since = time.monotonic()
+                    worker.pipe.send(worker.case)
             wait([worker.pipe for worker in workers if worker.case is not None], timeout=0.2)
         for worker in workers:
             worker.process.kill()
