@@ -123,6 +123,7 @@ class InterpretedKernel:
                 return NewtonStatus.OK, largest(further), iteration
         return NewtonStatus.NOT_CONVERGED, error, NEWTON_ITERATION_LIMIT
 
+    @np.errstate(over="ignore", invalid="ignore")  # the status says what is not finite
     def rollout(self, inputs: RolloutInputs) -> Rollout:
         """Simulate one rollout step by step."""
         theta, torque, path = inputs.theta, inputs.torque, inputs.prescribed_path

@@ -317,6 +317,8 @@ class EstimationProblem(ReprMixin):
         jacobian = np.vstack([*jacobians, prior_jacobian]) if derivatives else None
         if not np.isfinite(cost):
             return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
+        if jacobian is not None and not np.all(np.isfinite(jacobian)):
+            return Evaluation(np.inf, residual, None, False, "the derivatives are not finite", done)
         return Evaluation(cost, residual, jacobian, True, "", done)
 
     def cost_and_gradient(
