@@ -572,15 +572,19 @@ def hunt(cases: Iterator[Case], seconds: float, jobs: int) -> tuple[int, list[tu
 
         workers = [started() for _ in range(jobs)]
         going = True
-        while going or any(worker.case is not None for worker in workers):
-            for i, worker in enumerate(workers):
-                if worker.case is None:
-                    case = next(cases, None) if going and time.monotonic() - begun < seconds else None
-                    going = going and case is not None
-                    if case is not None:
-                        worker.case, worker.since = case, time.monotonic()
-                        worker.pipe.send(case)
-                    continue
+        while True:
+            for worker in (each for each in workers if each.case is None):
+                case = next(cases, None) if going and time.monotonic() - begun < seconds else None
+                going = going and case is not None
+                if case is not None:
+                    worker.case, worker.since = case, time.monotonic()
+                    worker.pipe.send(case)
+            busy = [(i, worker) for i, worker in enumerate(workers) if worker.case is not None]
+            if not busy:
+                break
+            wait([worker.pipe for _, worker in busy], timeout=0.2)
+            for i, worker in busy:
+                assert worker.case is not None
                 said: str | None = None
                 if worker.pipe.poll():
                     try:
@@ -594,6 +598,8 @@ def hunt(cases: Iterator[Case], seconds: float, jobs: int) -> tuple[int, list[tu
                     continue
                 if not (again := said.startswith(LATE) and worker.case not in late):
                     count += 1
+                    if count % 5000 == 0:
+                        print(f"{count} inputs, {len(found)} found, {time.monotonic() - begun:.0f} s", flush=True)
                 else:
                     late.append(worker.case)
                 if said and not again:
@@ -607,7 +613,6 @@ def hunt(cases: Iterator[Case], seconds: float, jobs: int) -> tuple[int, list[tu
                 if worker.case is not None:
                     worker.since = time.monotonic()
                     worker.pipe.send(worker.case)
-            wait([worker.pipe for worker in workers if worker.case is not None], timeout=0.2)
         for worker in workers:
             worker.process.kill()
             worker.process.join()
