@@ -438,6 +438,8 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     except OSError as error:
         what = f"the working directory is not there: {error.strerror or error}"
         return _wrong(OutputError(what, hint="cd to one that is"), as_json)
+    # matrices are small: threads of the linear algebra library cost more than they give, in workers as well
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = int(import_module(f"yid_ocp.workflow.{arguments.module}").run(arguments))
         sys.stdout.flush()

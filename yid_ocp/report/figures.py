@@ -33,7 +33,8 @@ _MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and th
 _MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
 _ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP = 130, 76, 30  # in a figure of rows [px]
 _TOP_MARGIN, _BOTTOM_MARGIN = 64, 44  # [px]
-_SHADE = {"fillcolor": GRID_COLOR, "opacity": 0.7, "line_width": 0, "layer": "below"}
+_SHADE = {"fillcolor": GRID_COLOR, "opacity": 0.7, "line": {"width": 0}, "layer": "below"}
+_AXIS_STYLE = {"gridcolor": GRID_COLOR, "zeroline": False, "linecolor": GRID_COLOR}
 
 
 def line_color(i: int) -> str:
@@ -58,22 +59,26 @@ def styled_report_figure(
     import plotly.graph_objects as go
 
     figure = go.Figure() if base is None else base
-    figure.update_layout(
-        height=height,
-        margin={"l": 70, "r": 20, "t": 30, "b": 45},
-        paper_bgcolor="rgba(0,0,0,0)",
-        plot_bgcolor="rgba(0,0,0,0)",
-        font={"family": "system-ui, sans-serif", "size": 13, "color": TEXT_COLOR},
-        legend={"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0},
-        hovermode="closest",
-        modebar={"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_COLORS[0]},
-    )
-    style = {"gridcolor": GRID_COLOR, "zeroline": False, "linecolor": GRID_COLOR}
-    figure.update_xaxes(title_text=x or None, **style)
-    figure.update_yaxes(title_text=y or None, **style)
+    figure.update_layout(_report_layout(height))
+    figure.update_xaxes(title_text=x or None, **_AXIS_STYLE)
+    figure.update_yaxes(title_text=y or None, **_AXIS_STYLE)
     if log_y:
         figure.update_yaxes(type="log", exponentformat="power")
     return figure
+
+
+def _report_layout(height: int) -> dict[str, Any]:
+    """Layout that all figures of a page share, without their axes."""
+    return {
+        "height": height,
+        "margin": {"l": 70, "r": 20, "t": 30, "b": 45},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "font": {"family": "system-ui, sans-serif", "size": 13, "color": TEXT_COLOR},
+        "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0},
+        "hovermode": "closest",
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_COLORS[0]},
+    }
 
 
 def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_objects.Figure:
@@ -164,52 +169,65 @@ def time_plots_figure(
     lines : mapping of name to str, optional
         Color of the lines; one after the other when absent.
     """
-    from plotly.subplots import make_subplots
+    import plotly.graph_objects as go
 
     names = dict.fromkeys(name for curve in curves for name in curve.lines)
     colors = lines or {name: line_color(i) for i, name in enumerate(names)}
     heights = [_LOW_ROW_HEIGHT if curve.is_low_row else _ROW_HEIGHT for curve in curves]
     inner = sum(heights) + _ROW_GAP * (len(curves) - 1)
-    figure = make_subplots(
-        rows=len(curves), cols=1, shared_xaxes=True, vertical_spacing=_ROW_GAP / inner, row_heights=heights
-    )
-    figure = styled_report_figure(inner + _TOP_MARGIN + _BOTTOM_MARGIN, "", "", base=figure)
+    # all at once: a figure that grows by one trace after the other is checked anew each time
+    axes: dict[str, Any] = {}
+    traces: list[dict[str, Any]] = []
+    shapes: list[dict[str, Any]] = []
+    titles: list[dict[str, Any]] = []
     told: set[str] = set()
-    for row, curve in enumerate(curves, start=1):
-        at = {"row": row, "col": 1}
+    top, last = 1.0, str(len(curves)) if len(curves) > 1 else ""
+    for row, (curve, height) in enumerate(zip(curves, heights, strict=True), start=1):
+        number = str(row) if row > 1 else ""
+        shared = {} if number == last else {"matches": f"x{last}", "showticklabels": False}
+        axes[f"xaxis{number}"] = {"anchor": f"y{number}", "domain": [0, 1], **shared, **_AXIS_STYLE}
+        domain = [max(top - height / inner, 0.0), top]
+        axes[f"yaxis{number}"] = {"anchor": f"x{number}", "domain": domain, "nticks": 4, **_AXIS_STYLE}
+        at = {"type": "scatter", "xaxis": f"x{number}", "yaxis": f"y{number}"}
         if len(curve.t):
             marker = {"color": dots, "size": 3 if len(curve.t) > 60 else 6}
-            figure.add_scatter(
-                **_thinned(curve.t, curve.measured), mode="markers", marker=marker,
-                name="measured", showlegend="measured" not in told, legendgroup="measured", **at,
-            )  # fmt: skip
+            shown = {"name": "measured", "showlegend": "measured" not in told, "legendgroup": "measured"}
+            traces.append({**_thinned(curve.t, curve.measured), "mode": "markers", "marker": marker, **shown, **at})
             told.add("measured")
         for name, (t, value) in curve.lines.items():
             # what is measured seldom may have neighbours on neither side
             mode = "lines+markers" if curve.is_low_row and len(t) <= 60 else "lines"
-            figure.add_scatter(
-                **_thinned(t, value), mode=mode, name=name, showlegend=name not in told,
-                legendgroup=name, line={"color": colors[name], "width": 1.5}, marker={"size": 4}, **at,
-            )  # fmt: skip
+            style = {"mode": mode, "line": {"color": colors[name], "width": 1.5}, "marker": {"size": 4}}
+            shown = {"name": name, "showlegend": name not in told, "legendgroup": name}
+            traces.append({**_thinned(t, value), **style, **shown, **at})
             told.add(name)
         if curve.band_half_height is not None:
-            figure.add_hrect(y0=-curve.band_half_height, y1=curve.band_half_height, **at, **_SHADE)
+            shapes.append(_shade(number, (0, 1), (-curve.band_half_height, curve.band_half_height)))
         for begin, end in curve.marked_intervals:
-            figure.add_vrect(x0=begin, x1=end, **at, **_SHADE | {"fillcolor": AFTER_COLOR, "opacity": 0.2})
+            mark = _shade(number, (begin, end), (0, 1), along_time=True)
+            shapes.append(mark | {"fillcolor": AFTER_COLOR, "opacity": 0.2})
         # beside a low row a turned title has no room, and collides with that of the next one
-        _add_axis_title(figure, curve, figure.layout[f"yaxis{row if row > 1 else ''}"].domain[1])
-    figure.update_yaxes(nticks=4)
-    figure.update_layout(
-        margin={"l": 54, "r": 12, "t": _TOP_MARGIN, "b": _BOTTOM_MARGIN},
-        legend={"y": 1 + 22 / inner, "yanchor": "bottom"},
-    )
-    figure.update_xaxes(title_text="time [s]", row=len(curves), col=1)
+        titles.append(_axis_title(curve, top))
+        top -= (height + _ROW_GAP) / inner
+    axes[f"xaxis{last}"]["title"] = {"text": "time [s]"}
+    figure = go.Figure(traces, {**axes, "shapes": shapes, "annotations": titles})
+    margin = {"l": 54, "r": 12, "t": _TOP_MARGIN, "b": _BOTTOM_MARGIN}
+    layout = _report_layout(inner + _TOP_MARGIN + _BOTTOM_MARGIN)
+    legend = {**layout["legend"], "y": 1 + 22 / inner}
+    figure.update_layout({**layout, "margin": margin, "legend": legend})
     return figure
 
 
-def _add_axis_title(figure: plotly.graph_objects.Figure, curve: TimePlotData, y: float) -> None:
+def _shade(number: str, x: tuple[float, float], y: tuple[float, float], *, along_time: bool = False) -> dict[str, Any]:
+    """A shaded rectangle of a row, over its whole width, or over its whole height where it is a time interval."""
+    domain = (f"x{number}", f"y{number} domain") if along_time else (f"x{number} domain", f"y{number}")
+    corners = {"x0": x[0], "x1": x[1], "y0": y[0], "y1": y[1]}
+    return {"type": "rect", "xref": domain[0], "yref": domain[1], **corners, **_SHADE}
+
+
+def _axis_title(curve: TimePlotData, y: float) -> dict[str, Any]:
     at = {"x": 0, "xref": "paper", "xanchor": "left", "y": y, "yref": "paper", "yanchor": "bottom"}
-    figure.add_annotation(text=curve.axis_title, showarrow=False, font={"size": 12}, **at)
+    return {"text": curve.axis_title, "showarrow": False, "font": {"size": 12}, **at}
 
 
 def lines_over_time_figure(curve: TimePlotData) -> plotly.graph_objects.Figure:
@@ -220,11 +238,11 @@ def lines_over_time_figure(curve: TimePlotData) -> plotly.graph_objects.Figure:
         style = {"color": line_color(i), "width": 1.5, "dash": dash}
         figure.add_scatter(**_thinned(t, value), mode="lines", name=name, line=style)
     if curve.band_half_height is not None:
-        figure.add_hrect(y0=-curve.band_half_height, y1=curve.band_half_height, **_SHADE)
+        figure.add_shape(_shade("", (0, 1), (-curve.band_half_height, curve.band_half_height)))
     # the legend below takes as many rows as the screen is narrow
     below = {"orientation": "h", "y": -0.22, "yanchor": "top", "x": 0, "font": {"size": 11}}
     figure.update_layout(legend=below, margin={"t": 30})
-    _add_axis_title(figure, curve, 1)
+    figure.add_annotation(_axis_title(curve, 1))
     return figure
 
 

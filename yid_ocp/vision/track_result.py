@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array
@@ -186,8 +184,9 @@ def _pictures(stages: FrameProcessingStages) -> list[_Picture]:
 
 
 def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Picture) -> None:
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
     axes: Any = figure.add_subplot(projection="3d")
     _, _, places, lines, line_colour = picture
     rng = np.random.default_rng(0)
@@ -214,8 +213,9 @@ def draw_tracked_points(track: TrackResult, file: str | os.PathLike[str]) -> Non
 
     `OutputError` where the file cannot be written.
     """
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(9, 2.2 * len(track.point_names) + 0.8), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(track.point_names), 1, sharex=True, squeeze=False)[:, 0]
     fine = np.linspace(track.t[0], track.t[-1], 400)
     course = np.array([track.points_at(t) for t in fine])
