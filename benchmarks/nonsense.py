@@ -27,6 +27,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, YidError
+from yid_ocp.integrator.step import Step
 from yid_ocp.solvers import solve
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.run_inputs import resolve_recording_path
@@ -485,12 +486,12 @@ def prepared(case: Case, folder: Path) -> RunSettings:
     return load_config(CONFIGS / f"{case.config}.yaml", [*chosen, *case.settings])
 
 
-def tried(case: Case, folder: Path, solving: bool = True) -> dict[str, Any]:
-    """What becomes of a case: how it ended, the causes named, the parameters found."""
+def tried(case: Case, folder: Path, solving: bool = True, step: Step | None = None) -> dict[str, Any]:
+    """What becomes of a case, on a step built before where one is given: how it ended, causes, parameters found."""
     begun = time.perf_counter()
     try:
         run = prepared(case, folder)
-        problem = build_problem(run)
+        problem = build_problem(run, step)
     except (DataError, YidError) as error:
         named = bool(case.refused) and case.refused in str(error)
         return {"outcome": "refused", "named": named, "causes": [], "found": [], "error": str(error)}

@@ -13,12 +13,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from here import Here
 from light_tasks import deadly, squared
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import WorkerError
-from yid_ocp.parallel import Task, WorkerConfig, run_tasks
+from yid_ocp.parallel import InlineExecutor, Task, WorkerConfig, run_tasks
 from yid_ocp.parallel.dask_cluster import dask_executor as connected
 from yid_ocp.progress import NullProgress
 from yid_ocp.version import software_fingerprint
@@ -205,7 +204,7 @@ def test_a_blind_proof_survives_a_killed_worker(scheduler, pendulum, tmp_path):
     killing = Killing(scheduler)
     there = run_blind([run], tmp_path / "there", CASES, 3, killing, scheduler.config)
     assert killing.killed
-    here = run_blind([run], tmp_path / "here", CASES, 3, workers=Here())
+    here = run_blind([run], tmp_path / "here", CASES, 3, workers=InlineExecutor())
     for own in (there.result, here.result):
         own.pop("seconds")
         for entry in own["marks"]:

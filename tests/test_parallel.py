@@ -86,7 +86,8 @@ def tasks_of(count: int, **arguments: Any) -> list[Task]:
 
 
 @pytest.fixture
-def threads():
+def threads(monkeypatch):
+    monkeypatch.setattr(parallel_tasks, "_give_back", lambda: None)  # of the many objects of a test run
     with ThreadPoolExecutor(max_workers=2) as pool:
         yield pool
 
@@ -120,15 +121,10 @@ def test_what_is_done_is_not_done_again(tmp_path, threads):
     assert calls.read_text().split().count("7") == 1
 
 
-def half(text: str) -> str:
-    return text[: len(text) // 2]
-
-
 @pytest.mark.parametrize(
     "spoiled",
     [
-        half,
-        lambda text: "",
+        lambda text: text[: len(text) // 2],
         lambda text: "[1]",
         lambda text: text.replace('"number": 0', '"number": 9'),
         lambda text: text.replace("yid-task/1", "yid-task/0"),

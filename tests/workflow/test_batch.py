@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 
 import pytest
-from here import Here
 
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.errors import ConfigError, OutputError
+from yid_ocp.parallel import InlineExecutor
 from yid_ocp.workflow.batch import list_batch_runs, run_batch
 
+HERE = InlineExecutor()
 SHORT = "problem.duration=0.6"
 QUICK = ("output.write_report=false", "output.discretisation_check=none", "recordings.held_out=[]", SHORT)
 
@@ -34,7 +35,7 @@ def test_a_failing_run_stops_no_other_and_is_tried_again(pendulum, pendulum_data
     members = list_batch_runs([pendulum], str(fleet / "*.h5"), QUICK)
     assert [member.name for member in members] == ["monday", "spoiled", "tuesday"]
     out = tmp_path / "batch"
-    first = run_batch(members, out, workers=Here())
+    first = run_batch(members, out, workers=HERE)
     assert names(first) == {"monday": "converged", "spoiled": "error", "tuesday": "converged"}
     assert not first.is_successful
     told = {entry["name"]: entry for entry in first.result["runs"]}
@@ -53,11 +54,11 @@ def test_a_failing_run_stops_no_other_and_is_tried_again(pendulum, pendulum_data
 
     kept = (out / "runs" / "monday" / "result.json").stat().st_mtime_ns
     write_recording(read_recording(fleet / "monday.h5"), fleet / "spoiled.h5")
-    second = run_batch(members, out, workers=Here())
+    second = run_batch(members, out, workers=HERE)
     assert second.is_successful
     assert (out / "runs" / "monday" / "result.json").stat().st_mtime_ns == kept
     write_recording(read_recording(fleet / "tuesday.h5"), fleet / "monday.h5")
-    third = run_batch(members, out, workers=Here())
+    third = run_batch(members, out, workers=HERE)
     changed = {entry["name"]: entry["parameters"]["elbow.damping"]["value"] for entry in third.result["runs"]}
     assert (out / "runs" / "monday" / "result.json").stat().st_mtime_ns > kept
     assert changed["monday"] == changed["tuesday"] != told["monday"]["parameters"]["elbow.damping"]["value"]
@@ -66,14 +67,14 @@ def test_a_failing_run_stops_no_other_and_is_tried_again(pendulum, pendulum_data
 def test_robots_are_configurations_and_what_differs_has_no_history(pendulum, written, pendulum_data, tmp_path):
     other = written(pendulum_data.text.replace("rest_position: 0.2", "rest_position: 0.25"), "other.yaml")
     broken = written(pendulum_data.text.replace("free: true", "fre: true"), "broken.yaml")
-    outcome = run_batch(list_batch_runs([pendulum, other, broken], None, QUICK), tmp_path / "batch", workers=Here())
+    outcome = run_batch(list_batch_runs([pendulum, other, broken], None, QUICK), tmp_path / "batch", workers=HERE)
     assert names(outcome) == {"pendulum": "converged", "other": "converged", "broken": "error"}
     assert "fre" in outcome.result["runs"][2]["message"]
     assert outcome.result["history"] is None
 
 
 def test_a_fleet_is_diagnosed(rubbing, tmp_path):
-    outcome = run_batch(list_batch_runs([rubbing]), tmp_path / "batch", "diagnose", Here())
+    outcome = run_batch(list_batch_runs([rubbing]), tmp_path / "batch", "diagnose", HERE)
     (entry,) = outcome.result["runs"]
     assert entry["effects"] == ["joint_coulomb@elbow"]
     assert entry["status"] == json.loads((tmp_path / "batch/runs/rubbing/result.json").read_text())["verdict"]
@@ -100,7 +101,7 @@ def test_what_cannot_be_a_batch_is_refused(pendulum, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes").write_text("")
     with pytest.raises(OutputError, match="no batch"):
-        run_batch(list_batch_runs([pendulum]), tmp_path / "full", workers=Here())
+        run_batch(list_batch_runs([pendulum]), tmp_path / "full", workers=HERE)
 
 
 def test_the_command_runs_the_fleet_in_processes(cli, pendulum, fleet, tmp_path):

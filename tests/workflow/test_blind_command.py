@@ -6,13 +6,13 @@ import hashlib
 import json
 
 import pytest
-from here import Here
 from PIL import Image
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.diagnosis.blind import BlindCaseScore, ensemble_success_rates
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import to_json_types
+from yid_ocp.parallel import InlineExecutor
 from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
 from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_results
@@ -48,7 +48,7 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
 
     watched.__module__, watched.__qualname__ = first.__module__, first.__qualname__
     monkeypatch.setattr(blind, "diagnose_case_task", watched)
-    outcome = run_blind([driven], folder, 2, 3, workers=Here())
+    outcome = run_blind([driven], folder, 2, 3, workers=InlineExecutor())
     text = (folder / "sealed" / "labels.json").read_bytes()
     assert sealed_at == [hashlib.sha256(text).hexdigest()] * 2
     labels = json.loads(text)
@@ -61,24 +61,24 @@ def test_a_proof_is_sealed_answered_and_not_done_again(driven, tmp_path, monkeyp
     assert outcome.result["code"] == outcome.result["code_of_cases"]
     assert {"detection.png", "confusion.png", "calibration.png", "table.md"} <= {p.name for p in folder.iterdir()}
 
-    again = run_blind([driven], folder, 2, 3, workers=Here())
+    again = run_blind([driven], folder, 2, 3, workers=InlineExecutor())
     assert len(sealed_at) == 2
     assert again.result | {"date": ""} == outcome.result | {"date": ""}
     with pytest.raises(OutputError, match=r"another ensemble \(2 cases, seed 3, for report\)"):
-        run_blind([driven], folder, 2, 3, workers=Here(), purpose="calibration")
+        run_blind([driven], folder, 2, 3, workers=InlineExecutor(), purpose="calibration")
     (folder / "sealed" / "labels.json").write_bytes(text.replace(b"case_001", b"case_002"))
     with pytest.raises(DataError, match="committed"):
-        run_blind([driven], folder, 2, 3, workers=Here())
+        run_blind([driven], folder, 2, 3, workers=InlineExecutor())
 
 
 def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli, monkeypatch):
     prescribed = load_config(pendulum)
     with pytest.raises(ConfigError, match=r"moves driven arms(.|\n)*model.arms.mode"):
-        run_blind([prescribed], tmp_path / "proof", 2, 3, workers=Here())
+        run_blind([prescribed], tmp_path / "proof", 2, 3, workers=InlineExecutor())
     with pytest.raises(ConfigError, match="two configurations are called pendulum"):
-        run_blind([driven, driven], tmp_path / "proof", 2, 3, workers=Here())
+        run_blind([driven, driven], tmp_path / "proof", 2, 3, workers=InlineExecutor())
     with pytest.raises(ConfigError, match="seed = -1"):
-        run_blind([driven], tmp_path / "proof", 2, -1, workers=Here())
+        run_blind([driven], tmp_path / "proof", 2, -1, workers=InlineExecutor())
     assert not (tmp_path / "proof").exists()
     monkeypatch.setattr("yid_ocp.parallel.dask_cluster._CONNECT_TIMEOUT", 0.5)
     options = [part for setting in SETTINGS for part in ("--set", setting)]

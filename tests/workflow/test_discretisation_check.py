@@ -18,7 +18,7 @@ WHOLE = ("north", "south", "east", "west")
 def folder(tmp_path_factory):
     """One branch, recorded."""
     made = tmp_path_factory.mktemp("branch")
-    record(made, ["north"])
+    record(made, ["north"], duration=0.8)
     return made
 
 
@@ -51,7 +51,7 @@ def test_too_few_links_are_told_and_counted(folder, tmp_path, cli):
 
 @pytest.mark.parametrize(("setting", "tried"), [("none", set()), ("time_step", {"time_step"})])
 def test_settings_say_what_is_refined(folder, tmp_path, setting, tried):
-    overrides = [f"output.discretisation_check={setting}", "solver.max_iterations=1", "problem.duration=0.8"]
+    overrides = [f"output.discretisation_check={setting}", "solver.max_iterations=1"]
     result = run_solve(load_config(configuration(folder, 4, ["north"]), overrides), tmp_path / "run").result
     moved = result["discretisation"].get("north.bend", {})
     assert {key for key in ("links", "time_step") if moved.get(key) is not None} == tried

@@ -6,10 +6,10 @@ import json
 from dataclasses import replace
 
 import pytest
-from here import Here
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import SolverError, WorkerError
+from yid_ocp.parallel import InlineExecutor
 from yid_ocp.workflow import identifiability as identifiability_command
 from yid_ocp.workflow.build import build_system, system_with_second_arm
 from yid_ocp.workflow.identifiability import IdentifiabilityOptions, run_identifiability
@@ -29,7 +29,7 @@ def test_workers_find_what_one_process_does(repository, tmp_path):
         interval_parameters="all", rank_changes=True, start_knowledge="unknown", grasp_offset_std=0.01
     )
     alone = run_identifiability(run, tmp_path / "alone", options=asked)
-    shared = run_identifiability(run, tmp_path / "shared", options=asked, workers=Here())
+    shared = run_identifiability(run, tmp_path / "shared", options=asked, workers=InlineExecutor())
     assert read(shared) == read(alone)
     assert {path.name for path in tmp_path.iterdir()} == {"alone", "shared"}
 
@@ -48,10 +48,10 @@ def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
     twice.__module__, twice.__qualname__ = done.__module__, done.__qualname__
     monkeypatch.setattr(identifiability_command, "profile_likelihood_task", twice)
     with pytest.raises(KeyboardInterrupt):
-        run_identifiability(run, tmp_path / "run", options=asked, workers=Here())
+        run_identifiability(run, tmp_path / "run", options=asked, workers=InlineExecutor())
     assert len(list((tmp_path / "run.partial" / "tasks").glob("*.json"))) == 1
     monkeypatch.setattr(identifiability_command, "profile_likelihood_task", done)
-    outcome = run_identifiability(run, tmp_path / "run", options=asked, workers=Here())
+    outcome = run_identifiability(run, tmp_path / "run", options=asked, workers=InlineExecutor())
     assert set(outcome.result["profiles"]) == {"spring_1.stiffness", "spring_2.stiffness"}
     assert not (tmp_path / "run.partial").exists()
 
@@ -66,7 +66,7 @@ def test_a_part_that_fails_is_said(repository, tmp_path, monkeypatch):
     words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
     with pytest.raises(WorkerError, match=words):
         run_identifiability(
-            run, tmp_path / "run", options=IdentifiabilityOptions(interval_parameters="all"), workers=Here()
+            run, tmp_path / "run", options=IdentifiabilityOptions(interval_parameters="all"), workers=InlineExecutor()
         )
 
 

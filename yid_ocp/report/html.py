@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import functools
 import gzip
 import logging
 import os
@@ -100,11 +101,12 @@ def _is_plotly_script(path: Path) -> bool:
     return path.is_file() and path.stat().st_size == len(own) and path.read_bytes() == own
 
 
+@functools.cache
 def _packed_script() -> str:
     """Plotly's script as text that the page unpacks: a third of its size."""
     import plotly.offline
 
-    small = gzip.compress(plotly.offline.get_plotlyjs().encode(), mtime=0)
+    small = gzip.compress(plotly.offline.get_plotlyjs().encode(), compresslevel=6, mtime=0)
     return base64.b64encode(small).decode("ascii")
 
 
