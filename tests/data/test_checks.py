@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.data.channel_checks import quantization_step
-from yid_ocp.data.checks import _shared_sample_count, duplicate_data_issue, recording_quality_issues, split_at_gaps
+from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_at_gaps
 from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.problem.options import SensorOptions
@@ -77,6 +77,22 @@ def test_a_joint_that_rests_on_one_step_of_its_encoder_is_not_stuck():
     rest = column(recording.joints.position, 1, lambda x: 0 * x + 0.3)
     still = column(recording.joints.velocity, 1, lambda v: 0 * v)
     assert causes(changed(recording, position=rest, velocity=still, position_std=None)) == set()
+
+
+@pytest.mark.parametrize("step", [1e-4, 2 * np.pi / 4096])
+def test_a_joint_that_stands_between_two_motions_is_not_stuck_but_one_that_misses_a_motion_is(step):
+    recording = made()
+    t = recording.joints.t
+    # to 0.6 rad, a rest of 2 s, and back
+    x = np.clip(np.where(t < 5, t - 1, 7 - t) / 2, 0, 1)
+    angle = 0.6 * (10 * x**3 - 15 * x**4 + 6 * x**5)
+    others = changed(recording, velocity=None, effort=None, position_std=None)
+    rounded = step * np.rint(angle / step)
+    assert "stuck" not in causes(changed(others, position=column(POSITION, 2, lambda _: rounded)))
+    if step > 1e-3:  # of which slow motion repeats many values
+        return
+    misses = np.where((t > 1.8) & (t < 2.3), rounded[np.searchsorted(t, 1.8)], rounded)
+    assert "stuck" in causes(changed(others, position=column(POSITION, 2, lambda _: misses)))
 
 
 def test_noise_from_a_clock_that_is_known_by_its_period_only_is_no_noise():
@@ -224,7 +240,27 @@ def test_one_measurement_listed_twice_is_told_also_in_part():
         "401 samples of part"
     )
     assert duplicate_data_issue(recording, made(2)) is None
-    assert _shared_sample_count(recording, made(2)) == 0
+
+
+def encoder_counts(seed: int, n: int = 3000) -> Recording:
+    """A slow motion of one joint, read to a 4096th of a turn at uneven times."""
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(0.0053 + 0.0005 * rng.uniform(-1, 1, n))
+    angle = np.sin(0.7 * t + seed) + 0.3 * np.sin(1.9 * t)
+    step = 2 * np.pi / 4096
+    return Recording(JointGroup(("a",), t - t[0], step * np.rint(angle / step)[:, None]), name=f"run_{seed}")
+
+
+def test_equal_counts_of_an_encoder_are_no_second_copy_but_a_copied_stretch_is():
+    one, other = encoder_counts(1), encoder_counts(2)
+    assert np.isin(other.joints.position, one.joints.position).mean() > 0.8
+    assert duplicate_data_issue(one, other) is None
+    steady = replace(one, joints=replace(one.joints, t=0.005 * np.arange(3000)))
+    alike = replace(other, joints=replace(other.joints, t=0.005 * np.arange(3000)))
+    assert duplicate_data_issue(steady, alike) is None
+    for whole in (one, steady):
+        part = replace(whole.time_slice(5.0, 8.0), name="part")
+        assert "samples of part are those of run_1 to the last digit" in duplicate_data_issue(whole, part).what
 
 
 def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():

@@ -197,7 +197,9 @@ def step_map_natural_frequencies(
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
-        return NaturalFrequencies(np.zeros(0), message="every coordinate is prescribed, nothing can swing")
+        return NaturalFrequencies(
+            np.zeros(0), message="every coordinate is driven or prescribed: with these held still nothing can swing"
+        )
     step = compile_step(still, time_step, force_split, constraint_force, use_compiler=False)
     known = np.array([posture[name] for name in still.prescribed])
     rest = EquilibriumSolver(step).solve(known, theta, guess=guess)

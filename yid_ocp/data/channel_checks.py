@@ -23,6 +23,8 @@ from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_DIFFERENCE_ORD
 
 _MAX_REPEATED_FRACTION = 0.1
 """Largest fraction of a channel's samples that may repeat the previous one."""
+_MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2
+"""Largest changes next to a rest, in smallest and in median changes of a channel."""
 _MIN_NOISE_FRACTION = 1e-2
 """Noise below this fraction of the stated noise means that the channel was computed, not measured."""
 _MAX_SAMPLE_PERIOD = 0.02
@@ -51,46 +53,62 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         if len(t) <= QUALITY_LIMITS.min_stuck_samples:
             continue
         same = np.all(np.diff(values.reshape(len(t), -1), axis=0) == 0, axis=1)
-        begin, end = _longest_run(same)
-        count, length = end - begin, float(t[end] - t[begin])
-        if count < QUALITY_LIMITS.min_stuck_samples or length < QUALITY_LIMITS.min_stuck_time:
-            continue
-        rest = np.delete(same, slice(begin, end))
-        usual = float(np.mean(rest)) if len(rest) >= count // 4 else 1.0
         quantity, _, name = channel.partition(".")
-        turned = 0.0
+        velocity = None
         if joints is not None and quantity == "position" and joints.velocity is not None:
-            speed = joints.velocity[begin : end + 1, joints.names.index(name)]
-            area = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t[begin : end + 1]))])
-            turned = float(np.ptp(area))
+            velocity = joints.velocity[:, joints.names.index(name)]
+        runs = [
+            (begin, end, 0.0 if velocity is None else _rotation(t[begin : end + 1], velocity[begin : end + 1]))
+            for begin, end in _repeated_stretches(same)
+            if end - begin >= QUALITY_LIMITS.min_stuck_samples and t[end] - t[begin] >= QUALITY_LIMITS.min_stuck_time
+        ]
+        unseen = QUALITY_LIMITS.max_unseen_rotation
+        rests = [run for run in runs if run[2] <= unseen and _comes_to_rest(values, *run[:2])]
+        if len(rests) == len(runs):
+            continue
+        begin, end, turned = longest = max((run for run in runs if run not in rests), key=lambda run: run[1] - run[0])
+        count = end - begin
+        elsewhere = np.delete(same, np.concatenate([np.arange(*run[:2]) for run in (longest, *rests)]))
+        usual = float(np.mean(elsewhere)) if len(elsewhere) >= count // 4 else 1.0
         # of a channel that changes from sample to sample in nine of ten, so long a run is no chance
         evidence = (count / QUALITY_LIMITS.min_stuck_samples) if usual < 0.1 else 0.0
         stated = joints is not None and quantity == "position" and bool(np.all(joints.position_std or 0))
-        if not len(rest) and stated:
+        if count == len(same) and stated:
             evidence = count / QUALITY_LIMITS.min_stuck_samples
-        evidence = max(
-            evidence,
-            turned / QUALITY_LIMITS.max_unseen_rotation if turned > QUALITY_LIMITS.max_unseen_rotation else 0.0,
-        )
+        if turned > unseen:
+            evidence = max(evidence, turned / unseen)
         if quantity == "effort" and values[begin] in (0.0, np.max(values), np.min(values)):
             continue  # no effort was recorded, or it is cut off: other causes
         if evidence >= 1:
             start, stop = float(t[begin]), float(t[end])
             what = f"{channel} repeats one value for {stop - start:.3g} s"
-            if turned > QUALITY_LIMITS.max_unseen_rotation:
+            if turned > unseen:
                 what += f", while its velocity turns it by {turned:.2g} rad"
             advice = "leave that stretch or that channel out, and look at the sensor"
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
 
-def _longest_run(same: BoolArray) -> tuple[int, int]:
-    """First and last index of the longest stretch of samples that are all the same."""
+def _rotation(t: Array, velocity: Array) -> float:
+    """Range of the angle that a velocity turns through [rad]."""
+    area = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t))])
+    return float(np.ptp(area))
+
+
+def _comes_to_rest(values: Array, begin: int, end: int) -> bool:
+    """Whether a channel slows down to a value and leaves it slowly, as the rounded angle of a joint at rest does."""
+    moves = np.abs(np.diff(values, axis=0))
+    moves = moves[moves > 0]
+    if values.ndim > 1 or not len(moves):
+        return False
+    near = np.concatenate([values[max(begin - 2, 0) : begin] - values[begin], values[end + 1 : end + 3] - values[end]])
+    slow = max(_MAX_STEPS_AT_REST * np.min(moves), _MAX_FRACTION_AT_REST * np.median(moves))
+    return bool(np.all(np.abs(near) < slow))
+
+
+def _repeated_stretches(same: BoolArray) -> list[tuple[int, int]]:
+    """First and last index of every stretch of samples that are all the same."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
-    if not len(edges):
-        return 0, 0
-    begins, ends = edges[::2], edges[1::2]
-    longest = int(np.argmax(ends - begins))
-    return int(begins[longest]), int(ends[longest])
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def white_noise_std(t: Array, values: Array) -> float:

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 import scipy.signal
 
-from yid_ocp.arrays import Array
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import (
     excess_noise_issues,
     overstated_noise_issues,
@@ -46,6 +46,9 @@ _MAX_CLOCK_JUMP_PERIODS = 5
 """A gap that the joints cross in fewer periods at their speed is a jump of the clock."""
 _MIN_JUMP_ROTATION = 0.05
 """Smallest rotation at joint speed over a gap that allows a clock jump to be detected [rad]."""
+
+_INTERVAL_GRID = math.sqrt(2.0) * 1e-6  # at which intervals are compared; no usual one lies on its edges [s]
+_HASH_BASE = np.uint64(0x9E3779B97F4A7C15)
 
 
 @dataclass(frozen=True)
@@ -328,12 +331,51 @@ def _smoothed(values: Array) -> Array:
 # -- several recordings -----------------------------------------------------------------------------------------------
 
 
-def _shared_sample_count(one: Recording, other: Recording) -> int:
-    """Number of bit-identical motion samples that two recordings share."""
-    if one.joints is not None and other.joints is not None:
-        return _common(_rows(one.joints), _rows(other.joints))
-    others = {group.name: group for group in other.points}
-    return max((_common(_rows(g), _rows(others[g.name])) for g in one.points if g.name in others), default=0)
+def _transitions(one: JointOrPointGroup, other: JointOrPointGroup) -> tuple[IntArray, IntArray]:
+    """Changes of the samples of two groups as numbers: from what to what, and after how long, are equal where they are.
+
+    Samples that repeat the one before them, as at rest, are passed over.
+    """
+    changes = []
+    for group in (one, other):
+        rows = _rows(group)
+        kept = np.concatenate([[True], np.any(np.diff(rows, axis=0) != 0, axis=1)])
+        rows, t = rows[kept], group.t[kept]
+        changes.append(np.hstack([rows[:-1], rows[1:], np.rint(np.diff(t) / _INTERVAL_GRID)[:, None]]))
+    if changes[0].shape[1] != changes[1].shape[1]:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    _, numbers = np.unique(np.vstack(changes), axis=0, return_inverse=True)
+    numbers = numbers.ravel()
+    return numbers[: len(changes[0])], numbers[len(changes[0]) :]
+
+
+def _longest_shared_run(one: IntArray, other: IntArray) -> int:
+    """Length of the longest stretch that two sequences have in common."""
+    least, most = 0, min(len(one), len(other))
+    # a stretch's hash is a difference of two sums of the powers of an odd number, modulo 2^64
+    size = max(len(one), len(other))
+    powers = np.cumprod(np.full(size + 1, _HASH_BASE))
+    terms = [(own.astype(np.uint64) + np.uint64(1)) * powers[: len(own)] for own in (one, other)]
+    sums = [np.concatenate([np.zeros(1, np.uint64), np.cumsum(own)]) for own in terms]
+    while least < most:
+        length = (least + most + 1) // 2
+        hashes = [(own[length:] - own[:-length]) * powers[size - np.arange(len(own) - length)] for own in sums]
+        least, most = (length, most) if np.intersect1d(*hashes).size else (least, length - 1)
+    return least
+
+
+def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
+    """Logarithm of how often two unrelated recordings share a run, from how often each meets its own samples again."""
+    again = again_twice = pairs = 0.0
+    for values in (one, other):
+        follow = np.unique(np.column_stack([values[:-1], values[1:]]), axis=0, return_counts=True)[1]
+        counts = np.unique(values, return_counts=True)[1]
+        again += float(np.sum(counts * (counts - 1.0))) / 2
+        again_twice += float(np.sum(follow * (follow - 1.0))) / 2
+        pairs += len(values) * (len(values) - 1.0) / 2
+    first = (again + 1) / (pairs + 1)
+    going_on = (again_twice + first) / (again + 1)
+    return math.log(len(one) * len(other) * first) + (length - 1) * math.log(going_on)
 
 
 def _rows(group: JointOrPointGroup) -> Array:
@@ -342,16 +384,16 @@ def _rows(group: JointOrPointGroup) -> Array:
     return group.position if group.effort is None else np.hstack([group.position, np.nan_to_num(group.effort)])
 
 
-def _common(one: Array, other: Array) -> int:
-    if one.shape[1] != other.shape[1]:
-        return 0
-    pairs = ({row.tobytes() for row in np.ascontiguousarray(rows)} for rows in (one, other))
-    return len(set.intersection(*pairs))
-
-
 def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
     """Issue naming the second recording if both hold the same measurement at least in part, else None."""
-    count = _shared_sample_count(one, other)
+    others = {group.name: group for group in other.groups}
+    count = 0
+    for group in one.groups if one.joints is None else (one.joints,):
+        if group.name in others:
+            numbers = _transitions(group, others[group.name])
+            length = _longest_shared_run(*numbers)
+            if length and _log_chance_of_run(*numbers, length) < math.log(QUALITY_LIMITS.max_chance_of_shared_run):
+                count = max(count, length + 1)
     few = min(len(group.t) for recording in (one, other) for group in recording.groups[:1])
     if count < min(QUALITY_LIMITS.min_shared_samples, 0.5 * few):
         return None

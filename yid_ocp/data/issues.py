@@ -44,6 +44,7 @@ class _QualityLimits:
     min_joint_motion: float = 0.01
     min_point_travel: float = 0.002
     min_shared_samples: int = 50
+    max_chance_of_shared_run: float = 1e-6
 
 
 QUALITY_LIMITS = _QualityLimits()
