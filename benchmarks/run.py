@@ -116,9 +116,9 @@ def main(arguments: list[str] | None = None) -> int:
         options.json.write_text(json.dumps(results, indent=2, sort_keys=True) + "\n", encoding="utf-8")
     if not options.gate:
         return 0
-    baseline = json.loads(BASELINE.read_text(encoding="utf-8"))
-    if options.quick:
-        baseline = {key: value for key, value in baseline.items() if not key.endswith("_seconds")}
+    others = ("warm_", "cold_", *(("compile_",) if options.quick else ()))  # those of whole commands
+    stored = json.loads(BASELINE.read_text(encoding="utf-8"))
+    baseline = {key: value for key, value in stored.items() if not key.startswith(others)}
     found = regressions(results, baseline, options.tolerance)
     for line in found:
         console.print(f"regression: {line}")

@@ -47,6 +47,7 @@ def pytest_configure(config):
     Most steps of the tests are compiled for a few rollouts; see `shipped_optimization` for the others.
     """
     os.environ.setdefault("YID_OCP_OPTIMIZE", "0")
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each command that a test starts would compile all modules again
     if "YID_OCP_CACHE" not in os.environ and hasattr(config, "cache"):
         folder = config.cache.mkdir("compiled")
         folder.chmod(0o700)
