@@ -26,25 +26,11 @@ from yid_ocp.options import (
 
 @dataclass(frozen=True)
 class SectionVariants:
-    """Alternative settings classes of one configuration section, and the key that selects one.
+    """Alternative settings classes of one configuration section, and the key that selects one."""
 
-    Attributes
-    ----------
-    classes : mapping of str to type
-        By the word that chooses one; a single one under the empty word.
-    selector_key : str
-        Which key holds the word, empty where there is no choice.
-    default_variant : str
-        The word where the key is absent, empty where it must be given.
-    variant_noun : str
-        What the classes are.
-    is_nullable : bool
-        Whether there may be none.
-    """
-
-    classes: Mapping[str, type]
-    selector_key: str = ""
-    default_variant: str = ""
+    classes: Mapping[str, type]  # by the word that chooses one; a single one under the empty word
+    selector_key: str = ""  # holds the word, empty where there is no choice
+    default_variant: str = ""  # the word where the key is absent, empty where it must be given
     variant_noun: str = ""
     is_nullable: bool = False
 

@@ -138,12 +138,7 @@ def values_before_after_figure(
 ) -> plotly.graph_objects.Figure:
     """Figure of values before and after, one row each; error bars are two standard deviations.
 
-    Parameters
-    ----------
-    axis : str
-        What the numbers are, with their unit.
-    words : (str, str, str)
-        For before, after and the marks.
+    `axis` says what the numbers are, with their unit; `words` name before, after and the marks.
     """
     figure = _rows_figure(110 + 32 * len(rows), list(rows), axis)
     moved = [(name, row.before, row.after) for name, row in rows.items() if row.after is not None]
@@ -178,21 +173,12 @@ def values_before_after_figure(
 
 @dataclass(frozen=True)
 class TimeHeatMapRow:
-    """One row of a heat map over time.
-
-    Attributes
-    ----------
-    group : str
-        Rows of one group stand together.
-    values : ndarray, shape (J,)
-        NaN where there is nothing to show.
-    hover_texts : sequence of str, length J
-    """
+    """One row of a heat map over time; rows of one group stand together."""
 
     name: str
     group: str
-    values: Array
-    hover_texts: Sequence[str]
+    values: Array  # shape (J,), NaN where there is nothing to show
+    hover_texts: Sequence[str]  # J
 
 
 def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> plotly.graph_objects.Figure:
@@ -200,8 +186,7 @@ def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str
 
     Parameters
     ----------
-    edges : ndarray, shape (J + 1,)
-        [s]
+    edges : ndarray, shape (J + 1,) [s]
     axis : str
         What the colors are.
     """
@@ -244,16 +229,10 @@ def _even(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class RankedCandidate:
-    """A candidate effect in a ranking.
-
-    Attributes
-    ----------
-    closure_interval_percent : (float, float, float) or None
-        What it was found to close, and its interval [%].
-    """
+    """A candidate effect in a ranking."""
 
     name: str
-    closure_interval_percent: tuple[float, float, float] | None
+    closure_interval_percent: tuple[float, float, float] | None  # what it was found to close, and its interval [%]
     predicted_decrease: float
 
 
@@ -262,10 +241,7 @@ def candidate_ranking_figure(
 ) -> plotly.graph_objects.Figure:
     """Figure that ranks candidates by refitted closure (where refitted) and by first-order predicted decrease.
 
-    Parameters
-    ----------
-    closed, promised : str
-        Titles of the two axes.
+    `closed` and `promised` are the titles of the two axes.
     """
     from plotly.subplots import make_subplots
 

@@ -99,14 +99,10 @@ class TimePlotData:
 
     Attributes
     ----------
-    axis_title : str
-        With the unit.
     lines : mapping of name to (t, value)
     t, measured : ndarray, shape (M,), optional
     band_half_height : float or None
         Half the height of what is shaded about zero.
-    marked_intervals : sequence of (float, float)
-        Stretches of time that are marked.
     """
 
     axis_title: str
@@ -142,7 +138,13 @@ def prediction_and_residual_plots(
     drawn = {name: (t, values) for name, values in lines.items()}
     if course is not None:
         drawn[next(iter(lines))] = course
-    left = {name: _broken_at_gaps(t[seen], factor * (values - measured)[seen]) for name, values in lines.items()}
+    # with NaN in long gaps between measurements
+    known, steps = t[seen], np.diff(t[seen])
+    breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
+    left = {
+        name: (np.insert(known, breaks, known[breaks]), np.insert(factor * (y - measured)[seen], breaks, np.nan))
+        for name, y in lines.items()
+    }
     noise = float(np.median(std[seen])) if seen.any() else 0.0
     above = TimePlotData(f"{title} [{unit}]", drawn, t, measured)
     return above, TimePlotData(
@@ -150,24 +152,12 @@ def prediction_and_residual_plots(
     )
 
 
-def _broken_at_gaps(t: Array, values: Array) -> tuple[Array, Array]:
-    """Times and values with NaN inserted in long gaps between measurements."""
-    steps = np.diff(t)
-    breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
-    return np.insert(t, breaks, t[breaks]), np.insert(values, breaks, np.nan)
-
-
 def time_plots_figure(
     curves: Sequence[TimePlotData], dots: str = LINE_COLORS[1], lines: Mapping[str, str] | None = None
 ) -> plotly.graph_objects.Figure:
     """Figure with measured points and lines, one row per plot.
 
-    Parameters
-    ----------
-    dots : str
-        Color of what is measured.
-    lines : mapping of name to str, optional
-        Color of the lines; one after the other when absent.
+    `dots` is the color of what is measured, `lines` are those of the lines by name; one after the other when absent.
     """
     import plotly.graph_objects as go
 

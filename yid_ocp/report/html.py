@@ -31,16 +31,8 @@ def write_report(path: Path, findings: ReportData) -> bool:
     """Write the HTML report and return whether it was written.
 
     Plotly's script is packed into it, so that it can be sent alone and needs no network; or it refers to a copy that
-    `write_shared_plotly_script` left in its folder, or up to two above.
-
-    Returns
-    -------
-    bool
-        False, with one notice, where the extra `report` is not installed.
-
-    Raises
-    ------
-    OutputError
+    `write_shared_plotly_script` left in its folder, or up to two above. Without the extra `report` there is one notice
+    and no report. Raises `OutputError`.
     """
     if not _installed():
         log.warning("no report: install it with  pip install 'yid-ocp[report]'")
@@ -64,12 +56,7 @@ def write_report(path: Path, findings: ReportData) -> bool:
 
 
 def write_shared_plotly_script(folder: Path) -> None:
-    """Write one copy of plotly's script to a folder, shared by pages up to two levels below.
-
-    Raises
-    ------
-    OutputError
-    """
+    """Write one copy of plotly's script to a folder, shared by pages up to two levels below; raises `OutputError`."""
     if _installed() and not _is_plotly_script(folder / _script_name()):
         import plotly.offline
 

@@ -23,13 +23,7 @@ BLIND_CALIBRATION_LABELS = {"intervals": "intervals of effects' parameters", "p_
 
 
 def draw_method_convergence(path: Path, comparison: MethodComparison) -> None:
-    """Write a PNG of each method's relative excess cost over iterations and over wall time.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
+    """Write a PNG of each method's relative excess cost over iterations and over wall time; raises `OutputError`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
@@ -55,12 +49,7 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     """Write `detection.png`, `confusion.png` and `calibration.png` of a `yid-blind/1` result.
 
     Detection against size with binomial 95 % intervals, what was said of what, and whether intervals and p-values keep
-    what they promise.
-
-    Raises
-    ------
-    OutputError
-        A file cannot be written.
+    what they promise. Raises `OutputError`.
     """
     from matplotlib.figure import Figure
 
@@ -131,17 +120,9 @@ _MAX_SINGLE_LABELS = 64  # rows or columns up to which each has its own label; b
 
 
 def draw_sparsity_patterns(path: Path, layout: Sequence[Sequence[SparsityPattern]]) -> None:
-    """Write a PNG of sparsity patterns in rows, with their blocks separated and named.
+    """Write a PNG of rows of sparsity patterns, their blocks separated and named; raises `OutputError`.
 
-    Parameters
-    ----------
-    layout : sequence of sequence of SparsityPattern
-        What stands beside what; patterns without rows or columns are left out.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
+    Patterns without rows or columns are left out.
     """
     from matplotlib.figure import Figure
 

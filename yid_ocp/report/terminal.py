@@ -36,25 +36,13 @@ class SummaryStatement:
 
 @dataclass(frozen=True)
 class SummaryTable:
-    """A table of text cells whose first row is the header; empty columns are not shown.
-
-    Attributes
-    ----------
-    title : str
-        For pages.
-    is_key_table : bool
-        Whether it stands beside the verdict on a page.
-    is_page_only : bool
-        Whether it is left out on a terminal.
-    links : mapping of str to str
-        Pages that cells of the first column lead to.
-    """
+    """A table of text cells whose first row is the header; empty columns are not shown."""
 
     rows: TableRows
     title: str = ""
-    is_key_table: bool = False
-    is_page_only: bool = False
-    links: Mapping[str, str] = field(default_factory=dict)
+    is_key_table: bool = False  # stands beside the verdict on a page
+    is_page_only: bool = False  # is left out on a terminal
+    links: Mapping[str, str] = field(default_factory=dict)  # pages that cells of the first column lead to
 
 
 @dataclass(frozen=True)

@@ -41,15 +41,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _BatchRun:
-    """Configuration and overrides of one run of a batch.
-
-    Attributes
-    ----------
-    name : str
-        Of its folder.
-    overrides : tuple of str
-        `a.b=c` each, over those of the file.
-    """
+    """Name (of its folder), configuration and overrides (`a.b=c` each) of one run of a batch."""
 
     name: str
     config_file: Path

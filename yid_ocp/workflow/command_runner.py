@@ -30,19 +30,7 @@ Output = TypeVar("Output")
 
 @dataclass(frozen=True)
 class CommandResult(Generic[Output]):
-    """Result of a command.
-
-    Attributes
-    ----------
-    folder : Path
-        Its run folder.
-    result : dict
-        Contents of result.json.
-    output : object
-        What the command computed.
-    is_successful : bool
-        Whether it reached its goal.
-    """
+    """Run folder of a command, contents of its result.json, what it computed, and whether it reached its goal."""
 
     folder: Path
     result: dict[str, Any]
@@ -69,11 +57,9 @@ def run_command_and_print(
     """Run a command's function, print the summary of its result and its run folder, and return its exit code."""
     with stderr_progress_display(arguments) as progress:
         outcome = work(progress)
-    near = os.path.relpath(outcome.folder)
-    place = str(outcome.folder) if near.startswith("..") else f"run folder: {near}"
-    print_result(
-        arguments, outcome.result, lambda: summary_terminal_lines(summary(outcome.result)), place, str(outcome.folder)
-    )
+    path, near = str(outcome.folder), os.path.relpath(outcome.folder)
+    place = path if near.startswith("..") else f"run folder: {near}"
+    print_result(arguments, outcome.result, lambda: summary_terminal_lines(summary(outcome.result)), place, path)
     return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 

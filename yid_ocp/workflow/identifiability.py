@@ -56,14 +56,13 @@ class IdentifiabilityOptions:
     Attributes
     ----------
     evaluation_point : "solution" or "initial"
-        Point at which to judge: where the solver ends, or the initial values, without solving.
+        Where the solver ends, or the initial values, without solving.
     start_knowledge : "assumed" or "unknown"
         Initial states as the settings have them, so that verdicts are those of `solve`, or all estimated along.
     grasp_offset_std : float or None
         Prior standard deviation of where the grasps sit [m]; None for grasps as the settings have them.
     interval_parameters : "auto", "all" or sequence of str
-        Parameters whose interval by profile likelihood is wanted; `auto` for all of a small problem, none of a large
-        one.
+        For profile likelihoods; `auto` for all parameters of a small problem, none of a large one.
     rank_changes : bool
         Whether to rank changes of the experiment.
     """

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from yid_ocp.problem import EstimationProblem, prediction_errors
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.report.animation import ModelTrajectory
+from yid_ocp.report.terminal import channel_or_group_unit
 from yid_ocp.solvers import Solution
 
 _WORSE_RATIO = 1.05  # two errors nearer than that are alike
@@ -79,7 +79,11 @@ def channels_worse_than_baseline(
         for channel in entry["rmse"]:
             if better := _clearly_better_baseline(entry, [channel]):
                 best, guess, error = better
-                said = {"recording": entry["recording"], "channel": channel, "unit": _unit(channel, units)}
+                said = {
+                    "recording": entry["recording"],
+                    "channel": channel,
+                    "unit": channel_or_group_unit(units, channel),
+                }
                 worse.append(said | {"rmse": error, "baseline": best, "guess": guess})
     return worse
 
@@ -98,21 +102,16 @@ def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapp
         for group, channels in groups.items():
             if better := _clearly_better_baseline(entry, channels):
                 best, guess, error = better
-                unit = _unit(channels[0], units)
+                unit = units[channels[0]]
                 what = (
-                    f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by "
-                    f"{guess:.3g} {unit}"
+                    f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by {guess:.3g}"
                 )
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_ISSUE_EVIDENCE
                 advice = "look at the residuals, and let `yid-ocp diagnose` say what the model lacks"
                 sensor, _, channel = group.partition(".")
                 at = (entry["recording"], sensor, channel)
-                found.append(Issue("worse_than_guess", what, "not_trusted", evidence, advice, *at))
+                found.append(Issue("worse_than_guess", f"{what} {unit}", "not_trusted", evidence, advice, *at))
     return found
-
-
-def _unit(channel: str, units: Mapping[str, str]) -> str:
-    return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
 def _errors(samples: Measurements, predicted: Array, fixed: float) -> dict[str, float]:
@@ -159,8 +158,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     Parameters
     ----------
     problem : EstimationProblem
-        With weights frozen near `x` (`whitened_at`); where it has none, or offsets are no part of the model, there is
-        nothing to say.
+        With weights frozen near `x`; without them, or where offsets are no part of the model, the result is empty.
     x : ndarray, shape (nx,)
     """
     if all(whitening is None for whitening in problem.whitening_filters):
@@ -168,18 +166,13 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     known = list(zip(problem.episodes, whitening.estimate_recording_torque_biases(problem, x), strict=True))
     apart = [e for e in problem.held_out if e.initial_state_shared_with is None and _has_torque_bias(e)]
     if apart:
-        held = (
-            problem if any(problem.held_out_whitening_filters) else whitening.problem_with_whitened_held_out(problem, x)
-        )
+        is_whitened = any(problem.held_out_whitening_filters)
+        held = problem if is_whitened else whitening.problem_with_whitened_held_out(problem, x)
         for (episode, result), own in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
-            if (
-                isinstance(own, whitening.WhiteningFilter)
-                and not isinstance(result, str)
-                and episode.initial_state_shared_with is None
-            ):
-                known.append(
-                    (episode, (whitening.estimate_episode_torque_bias(episode, result, own), own.torque_bias_std))
-                )
+            is_apart = episode.initial_state_shared_with is None
+            if is_apart and isinstance(own, whitening.WhiteningFilter) and not isinstance(result, str):
+                bias = whitening.estimate_episode_torque_bias(episode, result, own)
+                known.append((episode, (bias, own.torque_bias_std)))
     found = {}
     for episode, estimate in known:
         if estimate is not None and episode.input_errors is not None and _has_torque_bias(episode):
@@ -224,15 +217,14 @@ def write_solve_trajectories(
     the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor `GROUP/` with `t`,
     `measured`, `predicted`, `std` and the attributes `channels`, `unit`.
 
-    Raises
-    ------
-    OutputError
+    Raises `OutputError`.
     """
     pairs: list[tuple[str, Episode, EpisodePrediction | str]] = [("held_out", *pair) for pair in held_out]
     if solution.evaluation is not None:
         done = solution.episode_predictions
         pairs = [("estimate", e, r) for e, r in zip(problem.episodes, done, strict=True)] + pairs
-    with _file(path, SOLVE_TRAJECTORIES_FORMAT) as file:
+    with create_hdf5_atomically(path) as file:
+        file.attrs["format"] = SOLVE_TRAJECTORIES_FORMAT
         unknowns = file.create_group("unknowns")
         _store_texts(unknowns, {"names": solution.unknown_names})
         unknowns.create_dataset("x", data=solution.x)
@@ -276,11 +268,10 @@ def write_diagnosis_trajectories(
     `events/RECORDING/CHANNEL/` where a force acted as an event: `t` (M,) [s], `value` (M,) the force beside what model
     and recording have, `allowed` (M,) what the model may be wrong by; the attribute `unit`.
 
-    Raises
-    ------
-    OutputError
+    Raises `OutputError`.
     """
-    with _file(path, DIAGNOSIS_TRAJECTORIES_FORMAT) as file:
+    with create_hdf5_atomically(path) as file:
+        file.attrs["format"] = DIAGNOSIS_TRAJECTORIES_FORMAT
         for episode, before, after in predicted:
             for k, samples in enumerate(episode.measurements):
                 both = {"before": before.predicted_outputs[k], "after": after.predicted_outputs[k]}
@@ -310,13 +301,6 @@ def write_diagnosis_trajectories(
             group = file.create_group(f"events/{force.recording}/{force.channel}")
             group.attrs["unit"] = force.unit
             _store(group, {"t": force.t, "value": force.force, "allowed": force.allowed_model_error})
-
-
-@contextlib.contextmanager
-def _file(path: Path, form: str) -> Iterator[h5py.File]:
-    with create_hdf5_atomically(path) as file:
-        file.attrs["format"] = form
-        yield file
 
 
 def _store_sensor(parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, Array]) -> None:

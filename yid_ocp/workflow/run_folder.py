@@ -40,19 +40,15 @@ class RunFolder:
 
     Attributes
     ----------
-    final_path, path : Path
-        Its name when complete, and where it is now; the same in the end.
     resume_folder : Path
         Where an interrupted run may leave what the next one with the same name, or none, can use; not made here.
-    input_hashes : dict of str to str
-        SHA-256 of every file that the run reads, by name; see `record_run_start`.
     """
 
-    final_path: Path
-    path: Path
+    final_path: Path  # its name when complete
+    path: Path  # where it is now
     resume_folder: Path
     _log: TextIO = field(repr=False)
-    input_hashes: dict[str, str] = field(default_factory=dict)
+    input_hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 of every file that the run reads, by name
     _command_line: str = ""
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
@@ -217,11 +213,9 @@ def _reserved(targets: Sequence[Path]) -> tuple[Path, FileLock]:
         temporary = target.parent / f".{target.name}{_UNFINISHED}"
         temporary.mkdir(parents=True, exist_ok=True)
         if not _is_of_a_run(temporary):
-            what, allowed = (
-                "a hidden folder of this run's name is not a run's",
-                "no such folder, or one that a run left",
-            )
-            raise OutputError(what, where=str(temporary), allowed=allowed, hint="move it away, or choose another --out")
+            allowed, hint = "no such folder, or one that a run left", "move it away, or choose another --out"
+            what = "a hidden folder of this run's name is not a run's"
+            raise OutputError(what, where=str(temporary), allowed=allowed, hint=hint)
         lock = _locked(temporary)
         if lock is None:
             continue
@@ -299,10 +293,8 @@ def _targets(run: RunSettings, out: str | Path | None, stem: str) -> list[Path]:
         raise OutputError("this is no name of a folder", where="--out", allowed=allowed)
     try:
         target = Path(out).expanduser().absolute()
-        is_link = target.is_symlink()
-        is_folder = target.is_dir()
-        filled = is_folder and any(target.iterdir())
-        is_file = not is_folder and target.exists()
+        is_link, is_folder = target.is_symlink(), target.is_dir()
+        filled, is_file = is_folder and any(target.iterdir()), not is_folder and target.exists()
     except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL, an unknown user's home
         what = f"this cannot be a run folder: {os_error_reason(error)}"
         raise OutputError(what, where=str(out)[:200], hint="choose a writable folder with --out") from error

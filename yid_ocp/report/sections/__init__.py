@@ -7,12 +7,12 @@ outside the package does as well, once it is imported; its template `NAME.html` 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
@@ -31,8 +31,6 @@ class ReportData:
 
     Attributes
     ----------
-    name, description : str
-        Of the run.
     result : mapping
         Contents of result.json; `format` says of which command.
     animations : sequence of Animation
@@ -61,6 +59,7 @@ class ReportData:
         return found + [("held_out", e, r) for e, r in self.held_out if not isinstance(r, str)]
 
 
+_Row = TypeVar("_Row")
 _PrepareContext = Callable[[ReportData], Mapping[str, Any] | None]
 
 
@@ -105,6 +104,16 @@ def joint_channel_unit(system: System | None, names: Sequence[str], channel: str
     if any(sliding) and not all(sliding):
         return f"{_REVOLUTE_UNITS[channel]}, {_PRISMATIC_UNITS[channel]}"
     return _PRISMATIC_UNITS[channel] if names and all(sliding) else _REVOLUTE_UNITS[channel]
+
+
+def figures_by_unit(
+    rows: Iterable[tuple[str, str, _Row]], draw: Callable[[Mapping[str, _Row], str], Any], title: str = ""
+) -> list[tuple[str, Any]]:
+    """One titled figure for all rows (name, unit, row) of one unit."""
+    grouped: dict[str, dict[str, _Row]] = {}
+    for name, unit, row in rows:
+        grouped.setdefault(unit, {})[name] = row
+    return [(title, draw(own, unit)) for unit, own in grouped.items()]
 
 
 def render_sections(findings: ReportData, environment: jinja2.Environment) -> list[dict[str, str]]:

@@ -19,7 +19,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import categorical_charts, figures
 from yid_ocp.report.categorical_charts import RankedCandidate, TimeHeatMapRow, ValueBeforeAfter
 from yid_ocp.report.figures import TimePlotData
-from yid_ocp.report.sections import ReportData, register_report_section
+from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
 from yid_ocp.report.terminal import display_scale_and_unit, format_error_value_and_unit
 
 _MAX_CANDIDATES = 15  # candidates; the rest is in result.json
@@ -68,17 +68,13 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
     floor, changed = _floor(finding), bool(finding.accepted_effects)
-    by_unit: dict[str, dict[str, ValueBeforeAfter]] = {}
+    rows = []
     for channel, (error, unit) in before.items():
         factor, shown = display_scale_and_unit(unit)
         later = factor * after[channel][0] if changed and channel in after else None
         reference = factor * floor[channel] if channel in floor else None
-        by_unit.setdefault(shown, {})[channel] = ValueBeforeAfter(factor * error, later, reference=reference)
-    words = (_NOMINAL_LABEL, _EXTENDED_LABEL, "noise alone")
-    shown_figures = [
-        ("", categorical_charts.values_before_after_figure(rows, f"held-out error (rms) [{unit}]", words))
-        for unit, rows in by_unit.items()
-    ]
+        rows.append((channel, shown, ValueBeforeAfter(factor * error, later, reference=reference)))
+    shown_figures = _changes(rows, "held-out error (rms)", (_NOMINAL_LABEL, _EXTENDED_LABEL, "noise alone"))
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
     sentences = [
         "Errors on recordings that no fit has touched, channel by channel; the tick is what noise alone gives."
@@ -100,6 +96,13 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             "noise alone)."
         )
     return _Chapter("How large the gap is", sentences, shown_figures)
+
+
+def _changes(
+    rows: Sequence[tuple[str, str, ValueBeforeAfter]], axis: str, words: tuple[str, str, str]
+) -> list[tuple[str, Any]]:
+    draw = categorical_charts.values_before_after_figure
+    return figures_by_unit(rows, lambda own, unit: draw(own, f"{axis} [{unit}]", words))
 
 
 def _floor(finding: DiagnosisResult) -> dict[str, float]:
@@ -350,19 +353,14 @@ def _curves(
 def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
     if not finding.accepted_effects or not finding.nominal_changes:
         return None
-    by_unit: dict[str, dict[str, ValueBeforeAfter]] = {}
-    moved = []
+    rows, moved = [], []
     for entry in finding.nominal_changes:
         std, before, after = finding.nominal_model.std.get(entry.name, 0.0), entry.value_before, entry.value_after
-        by_unit.setdefault(entry.unit, {})[entry.name] = ValueBeforeAfter(before, after, std, entry.std_after)
+        rows.append((entry.name, entry.unit, ValueBeforeAfter(before, after, std, entry.std_after)))
         if abs(after - before) > 0.1 * max(abs(before), 1e-9):
             text = f"{entry.name} goes from {before:.3g} to {after:.3g} {entry.unit}"
             moved.append((abs(after - before) / max(abs(before), 1e-9), text))
-    words = ("fitted without the effects", _EXTENDED_LABEL, "")
-    shown = [
-        ("", categorical_charts.values_before_after_figure(rows, f"value [{unit}]", words))
-        for unit, rows in by_unit.items()
-    ]
+    shown = _changes(rows, "value", ("fitted without the effects", _EXTENDED_LABEL, ""))
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     sentences = [
         "A missing effect hides in the parameters that are free: this is how they move when it is added. Bars are two "

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +15,9 @@ from yid_ocp.analysis.profile import CHI2_QUANTILE_95
 from yid_ocp.report import categorical_charts, figures
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import BLIND_CALIBRATION_LABELS
-from yid_ocp.report.sections import ReportData, joint_channel_unit, register_report_section
+from yid_ocp.report.sections import ReportData, figures_by_unit, joint_channel_unit, register_report_section
 from yid_ocp.report.summaries import SUMMARY_BY_FORMAT
 from yid_ocp.report.terminal import SummaryBlock, SummaryStatement, SummaryTable
-
-_Row = TypeVar("_Row")
 
 
 @register_report_section("verdict", 0, "What was found")
@@ -51,16 +49,6 @@ def _without_verdicts(blocks: list[SummaryBlock]) -> list[SummaryBlock]:
     return [block for block in blocks if not (isinstance(block, SummaryStatement) and block.kind != "note")]
 
 
-def _by_unit(
-    rows: Iterable[tuple[str, str, _Row]], draw: Callable[[Mapping[str, _Row], str], Any], title: str = ""
-) -> list[tuple[str, Any]]:
-    """One titled figure for all rows (name, unit, row) of one unit."""
-    grouped: dict[str, dict[str, _Row]] = {}
-    for name, unit, row in rows:
-        grouped.setdefault(unit, {})[name] = row
-    return [(title, draw(own, unit)) for unit, own in grouped.items()]
-
-
 @register_report_section("estimates", 10, "Estimates")
 def _estimates(findings: ReportData) -> Mapping[str, Any] | None:
     """Free parameters ± 2 std, untrusted ones marked; one figure per unit."""
@@ -70,7 +58,7 @@ def _estimates(findings: ReportData) -> Mapping[str, Any] | None:
         if entry.get("free") and "initial" in entry:
             found = entry["verdict"] not in lost and result["status"] != "failed"
             rows.append((name, entry["unit"], (entry["value"], entry["std"], entry["initial"], found)))
-    return {"figures": _by_unit(rows, categorical_charts.estimates_figure)} if rows else None
+    return {"figures": figures_by_unit(rows, categorical_charts.estimates_figure)} if rows else None
 
 
 @register_report_section("search", 40, "How it was found")
@@ -109,7 +97,7 @@ def _parameter_history(findings: ReportData) -> Mapping[str, Any] | None:
         (name, entry["unit"], {run: (own["value"], own["std"]) for run, own in entry["values"].items()})
         for name, entry in result["parameters"].items()
     ]
-    return {"figures": _by_unit(rows, categorical_charts.parameter_values_by_source_figure)}
+    return {"figures": figures_by_unit(rows, categorical_charts.parameter_values_by_source_figure)}
 
 
 @register_report_section("methods", 10, "Methods")
@@ -127,7 +115,7 @@ def _method_comparison(findings: ReportData) -> Mapping[str, Any] | None:
     for run in comparison.method_results:
         history = [entry for entry in run.solution.history if not entry.note]
         costs[run.method] = ([entry.seconds for entry in history], [entry.cost for entry in history])
-    shown = _by_unit(rows, categorical_charts.parameter_values_by_source_figure, "Estimates")
+    shown = figures_by_unit(rows, categorical_charts.parameter_values_by_source_figure, "Estimates")
     return {"figures": [*shown, ("Cost over time", figures.excess_cost_over_time_figure(costs))]}
 
 
