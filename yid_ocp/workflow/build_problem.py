@@ -5,8 +5,7 @@ Recordings are checked before: those given twice count once, gaps are cut out; e
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -148,8 +147,7 @@ def build_problem(
     step = build_step(run, system) if step is None else step
     said = replace(options, data_issues=issues)
     problem = EstimationProblem(step, estimate, free, said, None, held_out)
-    with _mention_issues_in_errors(issues):
-        _check_grasps_close(run, problem)
+    _check_grasps_close(run, problem)
     more = _object_point_issues(problem)
     if more:
         _raise_for_issues(run, more)
@@ -172,16 +170,15 @@ def initial_grasp_closure_errors(problem: EstimationProblem, episode: Episode) -
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     """Raise an error for recordings at whose first configuration a grasp cannot be closed."""
+    hint = "check the object's lengths and mount, the grasp's frames and the recording's joints"
+    if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
+        hint = f"first look at what is in doubt: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
         for name, gap in initial_grasp_closure_errors(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
-                raise DataError(
-                    f"grasp '{name}' cannot be closed at the first posture of '{episode.name}': "
-                    f"{1e3 * gap:.3g} mm are missing",
-                    where=run.describe_location("model", "grasp", name),
-                    allowed=f"at most {1e3 * _MAX_GRASP_GAP:g} mm",
-                    hint="check the object's lengths and mount, the grasp's frames and the recording's joints",
-                )
+                where, allowed = run.describe_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
+                what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"
+                raise DataError(f"{what}: {1e3 * gap:.3g} mm are missing", where=where, allowed=allowed, hint=hint)
 
 
 def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
@@ -306,10 +303,8 @@ def _beside_the_model(
         found += check_joint_limits(arm, recording)
         if any(doubt.weight == "refused" for doubt in found):
             return found
-        told = [
-            *check_efforts_by_inverse_dynamics(arm, recording),
-            *check_robot_held_points(arm, recording, _choice(run)),
-        ]
+        told = list(check_efforts_by_inverse_dynamics(arm, recording))
+        told += check_robot_held_points(arm, recording, _choice(run))
         found += [doubt for doubt in told if not _is_modelled(system, doubt)]
     return found + list(check_point_distances(arm, system, system.parameters.vector(), recording, _choice(run)))
 
@@ -326,11 +321,8 @@ def _excitation(
     found = list(check_joint_excitation(recordings, asked, _choice(run)(JOINT_POSITION_GROUP_NAME)))
     if any(word in name for name in free for word in _MOTION_PARAMETER_WORDS):
         options = _choice(run)(JOINT_EFFORT_GROUP_NAME)
-        weak = [
-            list(check_inertial_effort_excitation(arm, one, options))
-            for one in recordings
-            if arm.has_all_angles_recorded(one)
-        ]
+        whole = [one for one in recordings if arm.has_all_angles_recorded(one)]
+        weak = [list(check_inertial_effort_excitation(arm, one, options)) for one in whole]
         if all(weak):  # one recording that tells is enough
             found += [doubt for doubts in weak for doubt in doubts]
     return found
@@ -371,19 +363,6 @@ def _raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
     more = [f"{doubt.where}: {doubt.what}" for doubt in others]
     what = "; ".join([f"{ISSUE_CAUSE_DESCRIPTIONS[first.cause]}: {first.what}", *more])
     raise DataError(what, where=first.where, hint=first.advice + (f" ({first.setting})" if first.setting else ""))
-
-
-@contextlib.contextmanager
-def _mention_issues_in_errors(doubts: Sequence[Issue]) -> Iterator[None]:
-    """Context manager that adds known issues of the recordings to a `DataError` raised in its block."""
-    try:
-        yield
-    except DataError as error:
-        if not doubts:
-            raise
-        said = "; ".join(f"{doubt.where}: {doubt.what}" for doubt in _gravest_first(doubts)[:_MAX_QUOTED_ISSUES])
-        hint = f"first look at what is in doubt: {said}"
-        raise DataError(error.what, where=error.where, allowed=error.allowed, hint=hint) from error
 
 
 def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:

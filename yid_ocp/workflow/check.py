@@ -90,8 +90,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "doubts": [] if problem is None else issues_to_plain_data(problem.options.data_issues),
             "warnings": warnings,
         }
-        written = folder.write_result(result)
-        folder.write_report_page(run, written, progress, **shown)
+        written = folder.write_result_and_report(run, progress, result, **shown)
     return CommandResult(folder.path, written, None, not (run.recordings.strict and warnings))
 
 

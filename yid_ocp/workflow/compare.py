@@ -65,9 +65,8 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
             "truth": truth,
             "judged": solve_result(own, judged, held_out),
         }
-        written = folder.write_result(_compare_result(problem, comparison) | about)
         known = {"problem": own, "solution": judged, "held_out": held_out, "section_data": {"comparison": comparison}}
-        folder.write_report_page(run, written, progress, **known)
+        written = folder.write_result_and_report(run, progress, _compare_result(problem, comparison) | about, **known)
     done = any(run.solution.status == Status.CONVERGED for run in comparison.method_results)
     return CommandResult(folder.path, written, None, done)
 

@@ -79,17 +79,11 @@ class _GroupNoise:
 
 @dataclass(frozen=True)
 class ConfigProposal:
-    """Proposed contents of a generated configuration.
-
-    Attributes
-    ----------
-    unused_joints, unrecorded_joints : tuple of str
-        Recorded joints that the model does not need or know, and movable ones of the URDF that were not recorded.
-    """
+    """Proposed contents of a generated configuration."""
 
     joints: tuple[str, ...]  # recorded ones that move the object, in the URDF's order
-    unused_joints: tuple[str, ...]
-    unrecorded_joints: tuple[str, ...]
+    unused_joints: tuple[str, ...]  # recorded ones that the model does not need or know
+    unrecorded_joints: tuple[str, ...]  # movable ones of the URDF
     arms: tuple[_ArmChain, ...]  # that hold the object, the first one its root
     holder_frame: str  # carries the object's root
     grasps: Mapping[str, str]  # point of the object by the frame that holds it
@@ -133,8 +127,6 @@ def propose_config(
 
     Parameters
     ----------
-    robot : str
-        URDF file, or `package:NAME`.
     recordings : sequence of Recording
         At least one, with joints.
     branches : sequence of Segment
@@ -149,9 +141,7 @@ def propose_config(
     Raises
     ------
     ConfigError
-        No recorded joint is in the URDF, or there is no such frame.
-    ModelError
-        As `read_urdf`.
+        No recorded joint is in the URDF, or there is no such frame; others as `read_urdf`.
     """
     first = recordings[0]
     recorded = first.joints

@@ -112,10 +112,9 @@ def run_diagnose(
             "torque_offsets": estimated_torque_offsets(last.problem, last.problem.vector(last.values)),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
-        written = folder.write_result(told | own)
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
         more = {"finding": finding, "predictions": predicted}
-        folder.write_report_page(run, written, progress, **known, section_data=more)
+        written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
     refits.delete_file()
     return CommandResult(folder.path, written, finding)
 

@@ -171,8 +171,7 @@ def run_identifiability(
                 )
         result = _identifiability_result(problem, solution, information, unknown, ranking, asked)
         folder.log_event("end", status=result["status"], message=result["message"])
-        written = folder.write_result(result)
-        folder.write_report_page(run, written, progress, problem=problem, solution=solution)
+        written = folder.write_result_and_report(run, progress, result, problem=problem, solution=solution)
     if tasks is not None:
         with contextlib.suppress(OSError):
             shutil.rmtree(tasks.results_folder)

@@ -36,7 +36,6 @@ from yid_ocp.export.equations import export_step_functions, write_equation_sheet
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepEquationLinearizations
-from yid_ocp.model import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_sparsity_patterns
@@ -66,9 +65,8 @@ class _LinearisationPoint:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_command_with_settings(
-        arguments, _run_inspect, inspect_summary, tuple(arguments.entries), arguments.export
-    )
+    asked = tuple(arguments.entries), arguments.export
+    return run_command_with_settings(arguments, _run_inspect, inspect_summary, *asked)
 
 
 def _run_inspect(
@@ -107,13 +105,18 @@ def _run_inspect(
             files = (*export_step_functions(symbols, Path(export), point.theta, step.time_step), sheet)
             write_equation_sheet(sheet, symbols, point.theta, free, step.time_step)
         dependences = _dependence(step, symbols, problem, point, rows)
+        driven, prescribed = step.system.driven, step.system.prescribed
+        roles = dict.fromkeys(driven, "driven") | dict.fromkeys(prescribed, "prescribed")
         blocks = {"rows": symbols.row_blocks, "columns": symbols.column_blocks}
         at = _columns_at(step, point) if chosen else np.zeros(0)
         result = {
             "format": _RESULT_FORMAT,
             "build_seconds": seconds,
             "compiled": step.is_compiled,
-            "variables": _variables(step.system),
+            "variables": [
+                {"name": joint.name, "unit": joint.coordinate_unit, "role": roles.get(joint.name, "free")}
+                for joint in step.system.mechanism.joints
+            ],
             "parameters": {
                 entry.name: {key: getattr(entry, key) for key in _PARAMETER_KEYS} | {"free": entry.name in free}
                 for entry in parameters
@@ -136,9 +139,8 @@ def _run_inspect(
             "entries": [_entry_result(entry, symbols, at) for entry in chosen],
             "exported": [str(path) for path in files],
         }
-        written = folder.write_result(result)
         shown = {"pictures": [path for path in pictures if path.exists()]}
-        folder.write_report_page(run, written, progress, section_data=shown)
+        written = folder.write_result_and_report(run, progress, result, section_data=shown)
     return CommandResult(folder.path, written, None)
 
 
@@ -254,14 +256,6 @@ def _entry_result(entry: EquationEntry, symbols: StepSymbols, at: Array) -> dict
         "value": entry.numeric_value(symbols.column_symbols, at),
         "lines": entry.text_lines,
     }
-
-
-def _variables(system: System) -> list[dict[str, str]]:
-    roles = dict.fromkeys(system.driven, "driven") | dict.fromkeys(system.prescribed, "prescribed")
-    return [
-        {"name": joint.name, "unit": joint.coordinate_unit, "role": roles.get(joint.name, "free")}
-        for joint in system.mechanism.joints
-    ]
 
 
 def _write_matrices(path: Path, step: Step, arrays: Mapping[str, Any]) -> None:

@@ -72,11 +72,11 @@ def run_plan(
         folder.write_text_file("trajectory.json", json.dumps(trajectory, indent=1) + "\n")
         folder.log_event("end", reached=found.is_successful, message=found.message)
         told = _plan_result(run, found) if isinstance(found, TargetMotionPlan) else _information_plan_result(run, found)
-        written = folder.write_result(_motion_result(run, found, source) | told)
         system, q = found.simulator.step.system, found.rollout.state[:, : found.simulator.step.system.n_coordinates]
         scene = make_animation("planned", [ModelTrajectory("planned", system, found.simulator.theta, found.t, q)])
         more = {"plan" if isinstance(found, TargetMotionPlan) else "information": found}
-        folder.write_report_page(run, written, progress, animations=[scene], section_data=more)
+        result = _motion_result(run, found, source) | told
+        written = folder.write_result_and_report(run, progress, result, animations=[scene], section_data=more)
     return CommandResult(folder.path, written, found, found.is_successful)
 
 

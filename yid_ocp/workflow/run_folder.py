@@ -84,11 +84,15 @@ class RunFolder:
         self.write_text_file(name, json.dumps(clean, indent=1, allow_nan=False) + "\n")
         return clean
 
-    def write_report_page(self, run: RunSettings, result: Mapping[str, Any], progress: Progress, **known: Any) -> None:
-        """Write report.html, unless the settings want none; `known`: attributes of `ReportData` beside the result."""
+    def write_result_and_report(
+        self, run: RunSettings, shown: Progress, result: Mapping[str, Any], name: str = "result.json", /, **known: Any
+    ) -> dict[str, Any]:
+        """`write_result`, and report.html unless the settings want none; `known`: more attributes of `ReportData`."""
+        written = self.write_result(result, name)
         if run.output.write_report:
-            progress.begin_stage("writing the report")
-            write_report(self.path / "report.html", ReportData(run.name, run.description, result, **known))
+            shown.begin_stage("writing the report")
+            write_report(self.path / "report.html", ReportData(run.name, run.description, written, **known))
+        return written
 
     def log_event(self, event: str, **entries: Any) -> None:
         """Add a line to log.jsonl."""

@@ -27,8 +27,7 @@ from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
 """Format identifiers of result.json by command, for commands that estimate parameters."""
-_OLD_FORMATS = ("yid-diagnosis/1",)
-"""Of earlier versions, which had other keys."""
+_OLD_FORMATS = ("yid-diagnosis/1",)  # of earlier versions, which had other keys
 _RENAMED_KEYS_HINT = "CHANGELOG.md has the table old -> new under Unreleased"
 _RESULT_FORMAT = "yid-history/1"
 _COMPARED_MODEL_SECTIONS = ("robot", "arms", "clamps", "object", "grasp", "springs", "gravity")
@@ -256,14 +255,12 @@ def require_distinct_recordings(
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_command_and_print(
-        arguments, lambda shown: _run_report(arguments.runs, arguments.out, shown), history_summary
-    )
+    paths = [Path(folder) for folder in arguments.runs]
+    return run_command_and_print(arguments, lambda shown: _run_report(paths, arguments.out, shown), history_summary)
 
 
-def _run_report(folders: Sequence[str | Path], out: str | Path | None, progress: Progress) -> CommandResult[None]:
+def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandResult[None]:
     """Compare runs of one model, given in the order of time, and write `history.json` and report.html."""
-    paths = [Path(folder) for folder in folders]
     if len(paths) < 2:
         hint = "add the runs of other days"
         raise ConfigError("one run has no history", where="report", allowed="two or more run folders", hint=hint)
@@ -277,9 +274,8 @@ def _run_report(folders: Sequence[str | Path], out: str | Path | None, progress:
     settings = RunSettings(name="history", description="Runs of one model side by side.")
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in paths}
-        folder.log_command_start(["report", *map(str, folders)])
-        written = folder.write_result(estimate_history_result(found), "history.json")
-        folder.write_report_page(settings, written, progress)
+        folder.log_command_start(["report", *map(str, paths)])
+        written = folder.write_result_and_report(settings, progress, estimate_history_result(found), "history.json")
     return CommandResult(folder.path, written, None)
 
 

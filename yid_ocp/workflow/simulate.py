@@ -47,13 +47,8 @@ def run_simulate(
     initial values, and every sensor is predicted at the times at which it measured. Without one, MuJoCo simulates a
     random motion of the driven arms. There is no recording where the rollout failed.
 
-    Parameters
-    ----------
-    seed : int
-        Of the motion and the noise.
-    noise : bool
-        Whether noise of the recorded standard deviations is added to what the model predicts (a virtual experiment
-        always has noise).
+    `noise` adds noise of the recorded standard deviations to what the model predicts (a virtual experiment always has
+    noise); `seed` is that of the motion and the noise.
     """
     with atomic_run_folder(run, out, "simulate") as folder:
         flags = [*(["--seed", str(seed)] if seed else []), *(["--noise"] if noise else [])]
@@ -72,9 +67,8 @@ def run_simulate(
             groups = {g.name: {"samples": len(g.t)} for g in recording.all_groups}
             truth = dict(recording.true_parameters)
             result |= {"duration": recording.duration, "groups": groups, "truth": truth}
-        written = folder.write_result(result)
         more = {"recordings": [] if recording is None else [recording], "system": system}
-        folder.write_report_page(run, written, progress, animations=scenes, section_data=more)
+        written = folder.write_result_and_report(run, progress, result, animations=scenes, section_data=more)
     return CommandResult(folder.path, written, recording, recording is not None)
 
 

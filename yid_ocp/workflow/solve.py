@@ -81,7 +81,10 @@ def run_solve(
             at = (solution.x, solution.evaluation, _requested_refinements(run))
             shifts, notes = measure_discretisation_shifts(run, problem, *at, progress)
         # the ± and the verdict of everything below count how far the estimate is from a fine model's
-        data_std, solution = solution.std, _with_discretisation_uncertainty(solution, shifts)
+        data_std = solution.std
+        sizes = {} if solution.problem is None else typical_parameter_magnitudes(solution.problem, solution.x)
+        inflated = inflate_estimates_by_discretisation(solution.parameters, shifts, sizes)
+        solution = replace(solution, parameters=inflated)
         progress.begin_stage("predicting the held-out recordings")
         held_out = problem.predict_held_out(solution.x)
         cable = clamped_cable_topology(run)
@@ -98,8 +101,9 @@ def run_solve(
             "stability": stability,
             "torque_offsets": {} if solution.evaluation is None else estimated_torque_offsets(problem, solution.x),
         }
-        written = folder.write_result(solve_result(problem, solution, held_out, cable) | more)
-        folder.write_report_page(run, written, progress, problem=problem, solution=solution, held_out=tuple(held_out))
+        result = solve_result(problem, solution, held_out, cable) | more
+        known = {"problem": problem, "solution": solution, "held_out": tuple(held_out)}
+        written = folder.write_result_and_report(run, progress, result, **known)
     return CommandResult(folder.path, written, solution, solution.status == Status.CONVERGED)
 
 
@@ -139,9 +143,8 @@ def solution_and_fit_issues(
     found = check_fit_residuals(problem, solution.x, solution.evaluation) + worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
-        solution = replace(
-            solution, goodness_of_fit=believed, parameters=estimates_marked_not_trusted(solution.parameters)
-        )
+        marked = estimates_marked_not_trusted(solution.parameters)
+        solution = replace(solution, goodness_of_fit=believed, parameters=marked)
     return solution, (*problem.options.data_issues, *found)
 
 
@@ -229,7 +232,7 @@ def measure_discretisation_shifts(
     at_x : Evaluation
         With its Jacobian.
     models_alone : bool
-        At a point that is no estimate; see `discretisation_estimate_shifts`.
+        For a point that is no estimate.
     """
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
@@ -250,11 +253,6 @@ def measure_discretisation_shifts(
     links, steps = found.get("links", {}), found.get("time_step", {})
     names = problem.shared_parameters if found else ()
     return {name: DiscretisationEstimateShift(links.get(name), steps.get(name)) for name in names}, notes
-
-
-def _with_discretisation_uncertainty(solution: Solution, shifts: Mapping[str, DiscretisationEstimateShift]) -> Solution:
-    sizes = {} if solution.problem is None else typical_parameter_magnitudes(solution.problem, solution.x)
-    return replace(solution, parameters=inflate_estimates_by_discretisation(solution.parameters, shifts, sizes))
 
 
 def _with_twice_the_links(run: RunSettings, problem: EstimationProblem) -> FinerDiscretisationProblem:
@@ -284,10 +282,8 @@ def stability_checked_solution(problem: EstimationProblem, solution: Solution) -
     Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not
     stable and leave that place; one that ends there has followed the step's own errors.
     """
-    begin, end = (
-        largest_alternating_error_growth(problem, problem.initial_unknowns),
-        largest_alternating_error_growth(problem, solution.x),
-    )
+    begin = largest_alternating_error_growth(problem, problem.initial_unknowns)
+    end = largest_alternating_error_growth(problem, solution.x)
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.is_stable:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status

@@ -115,10 +115,9 @@ def _run_track(
             told = [make_animation("tracked", [shape], tracked)]
             result["truth_errors"] = {} if made is None else _truth_errors(system, found, made)
         result |= {"doubts": issues_to_plain_data(doubts), "refused": "" if refused is None else refused.what}
-        written = folder.write_result(result)
         files = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]
         more = {"pictures": [path for path in files if path.exists()]}
-        folder.write_report_page(run, written, progress, animations=told, section_data=more)
+        written = folder.write_result_and_report(run, progress, result, animations=told, section_data=more)
         tasks.delete_files()
     if tracked is None:
         assert refused is not None
