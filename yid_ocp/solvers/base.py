@@ -373,7 +373,7 @@ class _MultiStartSearch:
         note = f"start {self._n_starts} of at most {most}: {what}"
         log.info("starting again: %s", note)
         try:
-            again = _fit_from(self._problem, self._solver, x, _noting(self._callback, note))
+            again = _fit_from(self._problem, self._solver, x, _noting(self._callback, note), self._fits)
         except YidError as error:
             # another start is a chance, never a reason to lose what is there
             log.info("no fit from there: %s", error)
@@ -427,8 +427,17 @@ def _noting(callback: IterationCallback | None, note: str) -> IterationCallback 
     return lambda entry: callback(replace(entry, note=f"{note}, {entry.note}" if entry.note else note))
 
 
-def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None) -> _Fit:
-    """The fit of one start, by shorter horizons where the rollout fails there."""
+def _fit_from(
+    problem: EstimationProblem,
+    solver: Solver,
+    x: Array,
+    callback: IterationCallback | None,
+    known: Sequence[_Fit] = (),
+) -> _Fit:
+    """The fit of one start, by shorter horizons where the rollout fails there.
+
+    A search that has come to one of the `known` fits is not weighted again: it would end there.
+    """
     history: list[Iterate] = []
     evaluations = 0
     if getattr(solver, "needs_rollout", True) and not problem.evaluate(x, derivatives=False).ok:
@@ -459,10 +468,19 @@ def _fit_from(problem: EstimationProblem, solver: Solver, x: Array, callback: It
         # the second pass is the first about torque offsets that are not guessed
         if number and len(result.history) < 2:
             break
+        if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:
+            return replace(same, n_evaluations=evaluations, history=history)
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
         # it had the errors themselves as unknowns; what is judged is their likelihood about its answer
         weighted = problem_whitened_at(problem, x, warm, rounds=2)
     return _Fit(result, weighted.evaluate(x, equilibrium_guesses=warm), weighted, evaluations, history)
+
+
+def _is_at(fit: _Fit, x: Array) -> bool:
+    """Whether a point lies within the noise of a fit: its chi2 there, to second order, is the fit's and less than 1."""
+    if not fit.evaluation.ok or fit.evaluation.jacobian is None:
+        return False
+    return float(np.sum((fit.evaluation.jacobian @ (x - fit.result.x)) ** 2)) < 1.0
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:
