@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 from yid_ocp.cli import main
-from yid_ocp.data import JointGroup, Recording, write_recording
+from yid_ocp.data import JointGroup, Recording, read_recording, write_recording
+from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.workflow.build_problem import load_problem
 
 TRUTH = {"shoulder.stiffness": 4.0, "shoulder.damping": 0.3, "elbow.damping": 0.2}
 EFFORT_STD = 0.01
@@ -82,6 +85,35 @@ def pendulum_data(tmp_path_factory, urdf_folder):
         urdf=urdf_folder / "double_pendulum.urdf", estimate=folder / "estimate.h5", held_out=folder / "held_out.h5"
     )
     return SimpleNamespace(folder=folder, text=text, truth=TRUTH)
+
+
+@pytest.fixture(scope="session")
+def solved_pendulum(pendulum_data):
+    """The pendulum's problem, its solution, and the predictions held out."""
+    file = pendulum_data.folder / "solved.yaml"
+    file.write_text(pendulum_data.text)
+    problem = load_problem(file)
+    solution = solve(problem, GaussNewton())
+    return problem, solution, problem.predict_held_out(solution.x)
+
+
+@pytest.fixture(scope="session")
+def rubbing(tmp_path_factory, pendulum_data):
+    """The configuration of a pendulum whose elbow rubs, which its model does not know."""
+    folder = tmp_path_factory.mktemp("rubbing")
+    for name in ("estimate", "held_out"):
+        recording = read_recording(pendulum_data.folder / f"{name}.h5")
+        joints = recording.joints
+        rubbed = joints.effort.copy()
+        rubbed[:, 1] += 0.03 * np.sign(np.gradient(joints.position[:, 1]))
+        write_recording(replace(recording, joints=replace(joints, effort=rubbed)), folder / f"{name}.h5")
+    text = pendulum_data.text.replace(str(pendulum_data.folder), str(folder))
+    file = folder / "rubbing.yaml"
+    file.write_text(
+        f"{text}diagnosis: {{candidates: [joint_coulomb, effort_offset, link_mass@elbow], max_effects: 1}}\n"
+        "output: {write_report: false}\n"
+    )
+    return file
 
 
 @pytest.fixture

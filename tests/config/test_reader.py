@@ -51,8 +51,6 @@ def test_numbers_as_in_yaml_1_2(written):
 def test_a_solver_has_the_settings_of_its_method(written):
     run = load_config(written("solver: {name: steepest_descent, max_iterations: 7, backtracking_factor: 0.3}\n"))
     assert run.solver == SteepestDescent(max_iterations=7, backtracking_factor=0.3)
-    with pytest.raises(ConfigError, match="there is no key 'backtracking_factor'"):
-        load_config(written("solver: {name: gauss_newton, backtracking_factor: 0.3}\n"))
 
 
 def test_paths_are_relative_to_the_file(written, tmp_path):
@@ -106,99 +104,71 @@ def test_settings_over_the_file_keep_what_they_do_not_touch():
     assert "line" in run.describe_location("parameters", "T2.bend", "free")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("model:\n  object: {links: 4}\n", "line 2: model.object"),
-        ("model:\n  object: {kind: cube}\n", "there is no kind 'cube'"),
-        ("model:\n  object: 3\n", "model.object = 3 is not a section"),
-        ("model:\n  object:\n    kind: segments\n    segments: {a: {length: 1, radius: 0.1}}\n", "'mass' is missing"),
-        ("model:\n  grasp: {left: {holder_frame: x}}\n", "'held_frame' is missing"),
-        ("model:\n  grasp: [left]\n", "model.grasp"),
-        ("model:\n  gravity: [0, 0]\n", "a list of 3"),
-        ("model:\n  arms: {joints: left_s0}\n", "a list"),
-        ("problem:\n  duration: true\n", "a number"),
-        ("problem:\n  time_step: '0.01'\n", "a number"),
-        ("problem:\n  proportional_gains: []\n", "problem.proportional_gains"),
-        ("description: 2024-01-01\n", "description"),
-        ("sensors:\n  points: {std: 0}\n", "above 0"),
-    ],
-)
-def test_refusals(written, text, message):
-    with pytest.raises(ConfigError) as caught:
-        load_config(written(text))
-    assert message in str(caught.value)
-    assert "run.yaml" in str(caught.value)
-    assert "line" in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "key", ["time_step", "force_split", "use_compiler", "initial_state", "path_cutoff", "weighting", "huber_threshold"]
-)
-def test_misplaced_keys_are_told_their_section(written, key):
-    with pytest.raises(ConfigError, match=f"there is no key '{key}' in solver") as caught:
-        load_config(written(f"solver: {{{key}: 1}}\n"))
-    assert f"'{key}' is a key of `problem`" in caught.value.hint
-    with pytest.raises(ConfigError) as caught:
-        load_config(None, [f"solver.{key}=1"])
-    assert f"'{key}' is a key of `problem`" in caught.value.hint
-
-
-@pytest.mark.parametrize(
-    ("text", "hint"),
-    [
-        ("problem: {iteration: 3}", f"did you mean 'duration'?; {RENAMED}"),
-        (
-            "problem: {max_iterations: 3}",
-            "'max_iterations' is a key of `solver`, `compare.methods.NAME`, `track.options.shape_fit`",
-        ),
-        (
-            "solver: {name: steepest_descent, step_tolerance: 1}",
-            "'step_tolerance' is a key of `solver` with name: gauss_newton, multiple_shooting",
-        ),
-        ("solver: {held_out: []}", f"'held_out' is a key of `recordings`; {RENAMED}"),
-        ("solver: {parameters: {}}", f"'parameters' is a key of the file itself; {RENAMED}"),
-        ("xyzzy: 3", RENAMED),
-    ],
-)
-def test_hints_on_unknown_keys(written, text, hint):
-    with pytest.raises(ConfigError) as caught:
-        load_config(written(f"{text}\n"))
-    assert hint in caught.value.hint
-
-
-def test_what_only_code_sets_is_no_key(written):
-    for text in (
-        "problem: {known_initial_states: {}}",
-        "problem: {prior_stds: {a: 1}}",
-        "key_locations: {}",
-        "name: a",
-    ):
-        with pytest.raises(ConfigError, match="there is no key"):
-            load_config(written(text))
-
-
 METHOD = "compare.methods.multiple_shooting"
 METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n      VALUE\n"
 
 
 @pytest.mark.parametrize(
-    ("value", "words"),
+    ("text", "words"),
     [
-        ("max_iterations: abc", (f"{METHOD}.max_iterations", "a whole number from 1", "line 5")),
-        ("max_iterations: -3", (f"{METHOD}.max_iterations = -3", "a whole number from 1", "line 5")),
-        ("max_iterations: 3.0", ("a whole number from 1",)),
-        ("step_tolerance: 0", ("a number above 0",)),
-        ("max_iteration: 3", (f"there is no key 'max_iteration' in {METHOD}", "did you mean 'max_iterations'?")),
-        ("first_trial_step: last", ("there is no key 'first_trial_step'", "node_interval", "line 5")),
-        ("name: multiple_shooting", ("there is no key 'name'",)),
+        ("model:\n  object: {links: 4}\n", ["line 2: model.object"]),
+        ("model:\n  object: {kind: cube}\n", ["there is no kind 'cube'"]),
+        ("model:\n  object: 3\n", ["model.object = 3 is not a section"]),
+        ("model:\n  object:\n    kind: segments\n    segments: {a: {length: 1, radius: 0.1}}\n", ["'mass' is missing"]),
+        ("model:\n  grasp: {left: {holder_frame: x}}\n", ["'held_frame' is missing"]),
+        ("model:\n  grasp: [left]\n", ["model.grasp"]),
+        ("model:\n  gravity: [0, 0]\n", ["a list of 3"]),
+        ("model:\n  arms: {joints: left_s0}\n", ["a list"]),
+        ("problem:\n  duration: true\n", ["a number"]),
+        ("problem:\n  time_step: '0.01'\n", ["a number"]),
+        ("problem:\n  proportional_gains: []\n", ["problem.proportional_gains"]),
+        ("description: 2024-01-01\n", ["description"]),
+        ("sensors:\n  points: {std: 0}\n", ["above 0"]),
+        # unknown keys: the nearest one, and the sections that have it
+        ("problem: {iteration: 3}", [f"did you mean 'duration'?; {RENAMED}"]),
+        ("problem: {max_iterations: 3}", ["key of `solver`, `compare.methods.NAME`, `track.options.shape_fit`"]),
+        (
+            "solver: {name: steepest_descent, step_tolerance: 1}",
+            ["'step_tolerance' is a key of `solver` with name: gauss_newton, multiple_shooting"],
+        ),
+        ("solver: {held_out: []}", [f"'held_out' is a key of `recordings`; {RENAMED}"]),
+        ("solver: {parameters: {}}", [f"'parameters' is a key of the file itself; {RENAMED}"]),
+        ("solver: {name: gauss_newton, backtracking_factor: 0.3}", ["there is no key 'backtracking_factor'"]),
+        ("xyzzy: 3", [RENAMED]),
+        # what only code sets
+        ("problem: {known_initial_states: {}}", ["there is no key"]),
+        ("problem: {prior_stds: {a: 1}}", ["there is no key"]),
+        ("key_locations: {}", ["there is no key"]),
+        ("name: a", ["there is no key"]),
+        # compared methods are typed like the solver
+        (METHODS.replace("VALUE", "max_iterations: abc"), [f"{METHOD}.max_iterations", "number from 1", "line 5"]),
+        (METHODS.replace("VALUE", "max_iterations: -3"), [f"{METHOD}.max_iterations = -3", "number from 1", "line 5"]),
+        (METHODS.replace("VALUE", "max_iterations: 3.0"), ["a whole number from 1"]),
+        (METHODS.replace("VALUE", "step_tolerance: 0"), ["a number above 0"]),
+        (
+            METHODS.replace("VALUE", "max_iteration: 3"),
+            [f"'max_iteration' in {METHOD}", "mean 'max_iterations'?"],
+        ),
+        (METHODS.replace("VALUE", "first_trial_step: last"), ["no key 'first_trial_step'", "node_interval", "line 5"]),
+        (METHODS.replace("VALUE", "name: multiple_shooting"), ["there is no key 'name'"]),
+        (
+            "compare: {methods: {newton: {}}}\n",
+            ["no solver 'newton'", "'gauss_newton'?", "1: compare.methods.newton"],
+        ),
     ],
 )
-def test_compared_methods_are_typed_like_the_solver(written, value, words):
+def test_refusals(written, text, words):
     with pytest.raises(ConfigError) as caught:
-        load_config(written(METHODS.replace("VALUE", value)))
-    for word in words:
+        load_config(written(text))
+    for word in (*words, "run.yaml", "line"):
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["time_step", "use_compiler", "initial_state", "weighting"])
+def test_misplaced_keys_are_told_their_section(written, key):
+    with pytest.raises(ConfigError, match=f"there is no key '{key}' in solver") as caught:
+        load_config(written(f"solver: {{{key}: 1}}\n"))
+    assert f"'{key}' is a key of `problem`" in caught.value.hint
 
 
 def test_compared_methods(written):
@@ -206,33 +176,6 @@ def test_compared_methods(written):
     assert list(run.compare.methods) == ["gauss_newton", "multiple_shooting"]
     chosen = run.compare.methods["multiple_shooting"]
     assert (chosen.max_iterations, chosen.name) == (7, "multiple_shooting")
-    with pytest.raises(ConfigError, match="there is no solver 'newton'") as caught:
-        load_config(written("compare: {methods: {newton: {}}}\n"))
-    assert caught.value.hint == "did you mean 'gauss_newton'?"
-    assert "line 1: compare.methods.newton" in caught.value.where
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ("compare.methods.gauss_newton.max_iterations=abc", "a whole number from 1"),
-        ("compare.methods.gauss_newton.max_iterations=0", "a whole number from 1"),
-        ("compare.methods.gauss_newton.max_iteration=3", "did you mean 'max_iterations'?"),
-        ("compare.methods.newton.max_iterations=3", "did you mean 'gauss_newton'?"),
-        ("solver.max_iterations=-3", "a whole number from 1"),
-        ("solver.time_step=0.01", "'time_step' is a key of `problem`"),
-        ("problem.time_stp=0.01", "did you mean 'time_step'?"),
-        ("problem.time_step=fast", "a number"),
-        ("parameters.shoulder.stiffness.initail=3", "did you mean 'parameters.shoulder.stiffness.initial'?"),
-        ("problem.time_step.deeper=1", "no keys below 'deeper'"),
-        ("problem.time_step=[1", "not valid YAML"),
-    ],
-)
-def test_refused_settings_over_the_file(setting, message):
-    with pytest.raises(ConfigError) as caught:
-        load_config(None, [setting])
-    assert message in str(caught.value)
-    assert f"--set {setting.split('=')[0]}" in str(caught.value)
 
 
 SET = """\
@@ -275,18 +218,29 @@ def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
 @pytest.mark.parametrize(
     ("setting", "words"),
     [
-        ("sensors.points.sdt=3", ("there is no key 'sdt'", "did you mean 'std'?")),
-        ("sensors.camera.sdt=3", ("sensors.camera.sdt = 3 is not a section", "did you mean 'sensors.camera.std'?")),
-        ("parameters.T2.bend=5", ("is not a section", "add a key, as in parameters.T2.bend.initial")),
-        ("sensors={points: {sdt: 3}}", ("there is no key 'sdt' in sensors.points", "--set sensors", "'std'?")),
-        ("solver={name:single_shooting}", ("put a space behind the colon, as in {name: single_shooting}",)),
-        ("parameters.T2.bend.free=maybe", ("--set parameters.T2.bend.free", "true or false")),
+        ("sensors.points.sdt=3", ["there is no key 'sdt'", "did you mean 'std'?"]),
+        ("sensors.camera.sdt=3", ["sensors.camera.sdt = 3 is not a section", "did you mean 'sensors.camera.std'?"]),
+        ("parameters.T2.bend=5", ["is not a section", "add a key, as in parameters.T2.bend.initial"]),
+        ("sensors={points: {sdt: 3}}", ["there is no key 'sdt' in sensors.points", "'std'?"]),
+        ("parameters.T2.bend.free=maybe", ["true or false"]),
+        ("compare.methods.gauss_newton.max_iterations=abc", ["a whole number from 1"]),
+        ("compare.methods.gauss_newton.max_iterations=0", ["a whole number from 1"]),
+        ("compare.methods.gauss_newton.max_iteration=3", ["did you mean 'max_iterations'?"]),
+        ("compare.methods.newton.max_iterations=3", ["did you mean 'gauss_newton'?"]),
+        ("solver.max_iterations=-3", ["a whole number from 1"]),
+        ("solver.time_step=0.01", ["'time_step' is a key of `problem`"]),
+        ("problem.time_stp=0.01", ["did you mean 'time_step'?"]),
+        ("problem.time_step=fast", ["a number"]),
+        ("parameters.shoulder.stiffness.initail=3", ["did you mean 'parameters.shoulder.stiffness.initial'?"]),
+        ("problem.time_step.deeper=1", ["no keys below 'deeper'"]),
+        ("problem.time_step=[1", ["not valid YAML"]),
+        ("solver={name:single_shooting}", ["put a space behind the colon, as in {name: single_shooting}"]),
     ],
 )
 def test_what_is_set_wrong_is_told_with_the_nearest_key(written, setting, words):
     with pytest.raises(ConfigError) as caught:
         load_config(written(SET), [setting])
-    for word in words:
+    for word in (*words, f"--set {setting.split('=')[0]}"):
         assert word in str(caught.value)
 
 

@@ -23,8 +23,6 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.synthetic_recording import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.terminal import torque_offset_table_rows
-from yid_ocp.solvers import GaussNewton, solve
-from yid_ocp.workflow.build_problem import load_problem
 from yid_ocp.workflow.check import _input_noise
 from yid_ocp.workflow.prediction_outputs import (
     estimated_torque_offsets,
@@ -35,17 +33,8 @@ from yid_ocp.workflow.prediction_outputs import (
 )
 
 
-@pytest.fixture(scope="module")
-def solved(pendulum_data, tmp_path_factory):
-    file = tmp_path_factory.mktemp("solved") / "pendulum.yaml"
-    file.write_text(pendulum_data.text)
-    problem = load_problem(file)
-    solution = solve(problem, GaussNewton())
-    return problem, solution, problem.predict_held_out(solution.x)
-
-
-def test_a_solution_with_its_predictions(solved, tmp_path):
-    problem, solution, held_out = solved
+def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
+    problem, solution, held_out = solved_pendulum
     unpredicted = [(held_out[0][0], "step 3 did not converge")]
     write_solve_trajectories(tmp_path / "t.h5", problem, solution, unpredicted)
     with h5py.File(tmp_path / "t.h5") as file:
@@ -73,8 +62,8 @@ def test_a_solution_with_its_predictions(solved, tmp_path):
         assert np.max(inside) < 0.5 * problem.step.time_step
 
 
-def test_a_diagnosis_without_a_gap_has_predictions_alone(solved, tmp_path):
-    ((episode, outcome),) = solved[2]
+def test_a_diagnosis_without_a_gap_has_predictions_alone(solved_pendulum, tmp_path):
+    ((episode, outcome),) = solved_pendulum[2]
     other = SimpleNamespace(predicted_outputs=[2 * array for array in outcome.predicted_outputs])
     finding = SimpleNamespace(smoother_result=None, events=NO_EVENTS)
     write_diagnosis_trajectories(tmp_path / "t.h5", finding, [(episode, outcome, other)])
@@ -87,13 +76,13 @@ def test_a_diagnosis_without_a_gap_has_predictions_alone(solved, tmp_path):
         assert group["t"].shape == (len(group["measured"]),)
 
 
-def test_a_file_that_cannot_be_written(solved, tmp_path):
+def test_a_file_that_cannot_be_written(solved_pendulum, tmp_path):
     with pytest.raises(OutputError, match="does not exist"):
-        write_solve_trajectories(tmp_path / "no" / "t.h5", *solved)
+        write_solve_trajectories(tmp_path / "no" / "t.h5", *solved_pendulum)
 
 
-def test_a_held_out_recording_beside_a_guess_without_a_model(solved):
-    problem, _, held_out = solved
+def test_a_held_out_recording_beside_a_guess_without_a_model(solved_pendulum):
+    problem, _, held_out = solved_pendulum
     entry = prediction_error_entry(problem, *held_out[0])
     assert entry["recording"] == "held_out"
     samples = held_out[0][0].measurements[0]
