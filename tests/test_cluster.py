@@ -18,7 +18,7 @@ from light_tasks import deadly, squared
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import WorkerError
 from yid_ocp.parallel import InlineExecutor, Task, WorkerConfig, run_tasks
-from yid_ocp.parallel.dask_cluster import dask_executor as connected
+from yid_ocp.parallel.resumable_tasks import _dask_executor as connected
 from yid_ocp.progress import NullProgress
 from yid_ocp.version import software_fingerprint
 from yid_ocp.workflow.blind import run_blind
@@ -100,11 +100,11 @@ def test_a_task_that_ends_every_worker_fails_alone(scheduler, tmp_path, caplog):
 
 def test_a_worker_of_another_version_is_refused(scheduler, tmp_path, monkeypatch):
     other = {**software_fingerprint(), "yid-ocp": "99.0", "code": "b" * 64}
-    monkeypatch.setattr("yid_ocp.parallel.dask_cluster.software_fingerprint", lambda: other)
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: other)
     with pytest.raises(WorkerError, match=r"of another version: yid-ocp \S+ instead of 99.0, code \w+ instead of bbb"):
         scheduler.config.check_available()
     older = {**software_fingerprint(), "python": "2.7"}
-    monkeypatch.setattr("yid_ocp.parallel.dask_cluster.software_fingerprint", lambda: older)
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: older)
     with pytest.raises(WorkerError, match=r"python 3\.\S+ instead of 2.7"):
         scheduler.config.check_available()
 
@@ -116,8 +116,8 @@ def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeyp
         connected(scheduler.address, squared_elsewhere, tmp_path),
     ):
         pass
-    monkeypatch.setattr("yid_ocp.parallel.dask_cluster.Path.write_text", lambda *_, **__: 0)
-    monkeypatch.setattr("yid_ocp.parallel.dask_cluster.Path.unlink", lambda *_, **__: None)
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.Path.write_text", lambda *_, **__: 0)
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.Path.unlink", lambda *_, **__: None)
     with pytest.raises(WorkerError, match=f"does not see {tmp_path}"), connected(scheduler.address, squared, tmp_path):
         pass
 
@@ -132,7 +132,7 @@ def test_workers_of_several_threads_are_refused():
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere", "a:b:c"])
 def test_a_scheduler_that_is_not_there_is_said(address, monkeypatch):
-    monkeypatch.setattr("yid_ocp.parallel.dask_cluster._CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks._CONNECT_TIMEOUT", 0.5)
     with pytest.raises(WorkerError, match="no scheduler answers") as caught:
         WorkerConfig(scheduler_address=address).check_available()
     assert address in str(caught.value)

@@ -80,7 +80,7 @@ def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli, monke
     with pytest.raises(ConfigError, match="seed = -1"):
         run_blind([driven], tmp_path / "proof", 2, -1, workers=InlineExecutor())
     assert not (tmp_path / "proof").exists()
-    monkeypatch.setattr("yid_ocp.parallel.dask_cluster._CONNECT_TIMEOUT", 0.5)
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks._CONNECT_TIMEOUT", 0.5)
     options = [part for setting in SETTINGS for part in ("--set", setting)]
     done = cli("blind", pendulum, *options, "--scheduler", "127.0.0.1:1", "--out", tmp_path / "proof")
     assert done.code == 2
