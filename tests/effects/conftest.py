@@ -167,7 +167,7 @@ def made_cable() -> tuple[CableTopology, Recording]:
     where = {name: [0.1 * i, 0.0, 1.0] for i, name in enumerate(PARENT)}
     where |= {"c1": [0.3, 0.1, 1.0], "c2": [0.3, 0.2, 1.0]}
     layout = CableTopology(PARENT, {"a": ("p3", "c1", "c2")}, where)
-    t = H * np.arange(21)
+    t = H * np.arange(9)
     points = np.tile(np.array([where[name] for name in layout.vertices]), (len(t), 1, 1))
     points[:, :, 2] -= 0.02 * np.sin(np.pi * points[0, :, 0] / 0.6)
     points[:, -4:, 1] += 0.01 * np.sin(9 * t)[:, None]
@@ -205,10 +205,11 @@ def cable() -> tuple[CableTopology, Recording, System]:
 
 @pytest.fixture(scope="session")
 def all_effects() -> Callable[[System], list[EffectBase]]:
+    """Every kind at the last of the places where it can be in a system."""
+
     def every(system: System) -> list[EffectBase]:
-        return [
-            make_effect(kind, place, system) for kind, place in candidate_kinds_and_locations(system, _SENSOR_KINDS)
-        ]
+        places = dict(candidate_kinds_and_locations(system, _SENSOR_KINDS))
+        return [make_effect(kind, place, system) for kind, place in places.items()]
 
     return every
 

@@ -166,22 +166,6 @@ def test_a_search_begins_with_the_other_sign_too(mass, moments, other) -> None:
     assert found == (None if other is None else {"payload@hand.mass": pytest.approx(other)})
 
 
-def test_two_frames_of_one_link_say_the_same() -> None:
-    nominal = arm()
-    values = {"mass": 0.5, "mx": 0.01, "my": -0.02, "mz": 0.03}
-    place = TURNED[:3, :3] @ [0.01, -0.02, 0.03] + 0.5 * TURNED[:3, 3]
-    other = {"mass": 0.5} | dict(zip(("mx", "my", "mz"), map(float, place), strict=True))
-    found = [
-        [np.array(x) for x in mechanics(system)([0.3, -0.4, 0.8], [0.5, 1.0, -0.7], system.parameters.vector())]
-        for system in (
-            nominal.with_effects([make_effect("payload", frame, nominal, given)])
-            for frame, given in (("hand", values), ("link2", other))
-        )
-    ]
-    for one, two in zip(*found, strict=True):
-        np.testing.assert_allclose(one, two, rtol=1e-2, atol=1e-4)
-
-
 def test_places_for_a_mass() -> None:
     one = baxter_foam_y_system(1)
     frames = arm_link_frame_names(one)

@@ -95,13 +95,6 @@ def test_candidates_of_the_papers_system(one_arm) -> None:
         candidate_kinds_and_locations(one_arm, ["kamera"])
 
 
-def test_places_of_two_arms() -> None:
-    two = baxter_foam_y_system(2)
-    assert {name: len(joints) for name, joints in places.joint_names_by_arm(two).items()} == {"left": 7, "right": 7}
-    found = candidate_kinds_and_locations(two, _SENSOR_KINDS)
-    assert {("effort_delay", "left"), ("effort_delay", "right"), ("grasp_offset", "right")} <= set(found)
-
-
 def test_places_of_a_beam_on_a_gripper(beam) -> None:
     found = candidate_kinds_and_locations(beam, ["joints.position", "joints.effort"])
     assert ("mount_compliance", "base") in found
