@@ -145,16 +145,10 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         (METHODS.replace("VALUE", "max_iterations: -3"), [f"{METHOD}.max_iterations = -3", "number from 1", "line 5"]),
         (METHODS.replace("VALUE", "max_iterations: 3.0"), ["a whole number from 1"]),
         (METHODS.replace("VALUE", "step_tolerance: 0"), ["a number above 0"]),
-        (
-            METHODS.replace("VALUE", "max_iteration: 3"),
-            [f"'max_iteration' in {METHOD}", "mean 'max_iterations'?"],
-        ),
+        (METHODS.replace("VALUE", "max_iteration: 3"), [f"'max_iteration' in {METHOD}", "mean 'max_iterations'?"]),
         (METHODS.replace("VALUE", "first_trial_step: last"), ["no key 'first_trial_step'", "node_interval", "line 5"]),
         (METHODS.replace("VALUE", "name: multiple_shooting"), ["there is no key 'name'"]),
-        (
-            "compare: {methods: {newton: {}}}\n",
-            ["no solver 'newton'", "'gauss_newton'?", "1: compare.methods.newton"],
-        ),
+        ("compare: {methods: {newton: {}}}\n", ["no solver 'newton'", "'gauss_newton'?", "1: compare.methods.newton"]),
     ],
 )
 def test_refusals(written, text, words):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import yid_ocp as yid
+from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import dump_config
 from yid_ocp.errors import ConfigError, ModelError
@@ -257,3 +258,11 @@ def test_their_encoders_are_measurements_and_the_points_of_the_arm_are_not(repos
     options = problem_options(run, build_system(run), read_recordings(run))
     used = {group: said.use for group, said in options.sensors.items()}
     assert used == {"joints.position": True, "points_arm": False}
+
+
+@pytest.mark.parametrize("name", PAPER_ESTIMATES)
+def test_the_papers_configurations_ask_for_its_answers(repository, cli, name):
+    file = repository / "configs" / f"{name}.yaml"
+    assert load_config(file).compare.paper_experiment == name
+    refused = cli("compare", file, "--set", "compare.paper_experiment=triple")
+    assert (refused.code, "no experiment 'triple'" in refused.err) == (2, True)

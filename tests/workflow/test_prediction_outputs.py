@@ -138,13 +138,8 @@ def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
         assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
     alone = problem_whitened_at(problem_of(step, held_out=False), problem.initial_unknowns)
     assert list(estimated_torque_offsets(alone, problem.initial_unknowns)) == ["first"]
-
-
-def test_where_offsets_are_no_part_of_the_model_nothing_is_said(step):
-    problem = problem_of(step, bias=0.0)
-    assert (
-        estimated_torque_offsets(problem_whitened_at(problem, problem.initial_unknowns), problem.initial_unknowns) == {}
-    )
+    unbiased = problem_whitened_at(problem_of(step, bias=0.0), problem.initial_unknowns)
+    assert estimated_torque_offsets(unbiased, problem.initial_unknowns) == {}
 
 
 def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():

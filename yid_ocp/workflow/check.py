@@ -100,10 +100,10 @@ def _mechanics(
     system = step.system
     theta, posture = system.parameters.vector(), np.zeros(system.n_coordinates)
     if problem is not None:
-        theta = problem.predictor.theta_with_episode_values(problem.episodes[0], theta)
-        posture[[*system.driven_coordinate_indices, *system.prescribed_coordinate_indices]] = problem.episodes[
-            0
-        ].initial_known_coordinates
+        first = problem.episodes[0]
+        theta = problem.predictor.theta_with_episode_values(first, theta)
+        known = [*system.driven_coordinate_indices, *system.prescribed_coordinate_indices]
+        posture[known] = first.initial_known_coordinates
     found = {"built": compare_system_with_pinocchio(system, theta, posture)}
     if run.model.robot is not None:
         # the file's own numbers, not those that settings or effects put in their place

@@ -84,12 +84,8 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             files = list(export_csv(recording, out))
     paths = [str(file) for file in files]
-    own = {
-        "format": EXPORT_MANIFEST_FORMAT,
-        "file": paths,
-        "kind": form or "csv",
-        "notes": [*contents["notes"], *notes],
-    }
+    own = {"format": EXPORT_MANIFEST_FORMAT, "file": paths, "kind": form or "csv"}
+    own |= {"notes": [*contents["notes"], *notes]}
     print_result(arguments, contents | own, lambda: [*notes, *texts], "\n".join(paths), "\n".join(paths))
     return EXIT_DONE
 
@@ -144,9 +140,8 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         raise DataError("the result has no parameters", where=where, hint="run it again") from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
-    return _CalibratedModel(
-        settings_with_effect_values(nominal, effect_parameter_values_by_label(values)), nominal, values, std
-    )
+    whole = settings_with_effect_values(nominal, effect_parameter_values_by_label(values))
+    return _CalibratedModel(whole, nominal, values, std)
 
 
 def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dict[str, Any]:
@@ -159,22 +154,20 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
     progress.begin_stage("building the model")
     full = calibrated.system()
     if form == "yaml":
-        write_text(out, dump_config(_settings_with_estimates(calibrated, full)))
-        return {
-            "format": EXPORT_MANIFEST_FORMAT,
-            "file": str(out),
-            "kind": form,
-            "effects": {},
-            "parameters": {},
-            "gate": None,
-        }
-    system, said = _expressible(calibrated, full, form)
+        chosen = settings_by_parameter_name(calibrated.settings, full.parameters)
+        for name in calibrated.parameter_stds:
+            said = chosen.get(name, ParameterSettings(free=True))
+            chosen[name] = replace(said, initial=calibrated.parameter_values[name])
+        write_text(out, dump_config(replace(calibrated.settings, parameters=chosen)))
+        head = {"format": EXPORT_MANIFEST_FORMAT, "file": str(out), "kind": form}
+        return head | {"effects": {}, "parameters": {}, "gate": None}
+    system, supports = _expressible(calibrated, full, form)
     text = calibrated.text(form, system)
     grasp = FormatSupport("not representable", f"{form.upper()} describes a tree: close the loop in the engine")
     if form == "mjcf":
         grasp = FormatSupport("native", "equality constraints between sites, or a tendon where it gives way")
     parameters = {}
-    for name, entry in parameter_format_support(full, said, form).items():
+    for name, entry in parameter_format_support(full, supports, form).items():
         own, stds = full.parameters[name], calibrated.parameter_stds
         known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
         parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}
@@ -184,7 +177,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
         "kind": form,
         "run": str(folder.resolve()),
         "result": file_sha256(folder / "result.json"),
-        "effects": {label: vars(entry) for label, entry in said.items()},
+        "effects": {label: vars(entry) for label, entry in supports.items()},
         "parameters": parameters,
         "grasps": {own.name: vars(grasp) for own in full.grasps},
         "gate": None,
@@ -203,24 +196,12 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
     return manifest
 
 
-def _settings_with_estimates(calibrated: _CalibratedModel, system: System) -> RunSettings:
-    chosen = settings_by_parameter_name(calibrated.settings, system.parameters)
-    estimates = {
-        name: replace(chosen.get(name, ParameterSettings(free=True)), initial=calibrated.parameter_values[name])
-        for name in calibrated.parameter_stds
-    }
-    return replace(calibrated.settings, parameters=chosen | estimates)
-
-
 def _expressible(calibrated: _CalibratedModel, full: System, form: str) -> tuple[System, dict[str, FormatSupport]]:
     """The system without the effects that a format cannot tell, and what it makes of each."""
     said = effect_format_support(full, calibrated.values_for(full), form)
     for _ in range(len(said) + 1):
-        kept = [
-            label
-            for label, entry in said.items()
-            if entry.status != "not representable" and not entry.how.startswith("neutral")
-        ]
+        told = {label: entry for label, entry in said.items() if entry.status != "not representable"}
+        kept = [label for label, entry in told.items() if not entry.how.startswith("neutral")]
         system = calibrated.system(kept)
         try:
             calibrated.text(form, system)
@@ -324,10 +305,8 @@ def _recordings(file: h5py.File, form: str) -> dict[str, list[RosTopicTimeSeries
         found.setdefault(name, []).extend(_unknown_signals(group))
     for name, channels in file.get("events", {}).items():
         for channel, group in channels.items():
-            values = {"effort": np.array(group["value"])[:, None]}
-            signal = RosTopicTimeSeries(
-                f"/events/{_topic(channel)}", "joints", np.array(group["t"]), values, (channel,)
-            )
+            t, values = np.array(group["t"]), {"effort": np.array(group["value"])[:, None]}
+            signal = RosTopicTimeSeries(f"/events/{_topic(channel)}", "joints", t, values, (channel,))
             found.setdefault(name, []).append(signal)
     return {name: signals for name, signals in found.items() if any(len(signal.t) for signal in signals)}
 

@@ -12,7 +12,6 @@ from typing import Any
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ImportSettings
 from yid_ocp.data import Recording, preview_file, read_any, write_recording
-from yid_ocp.data.readers import FilePreview
 from yid_ocp.data.readers.base import parse_quantity_units
 from yid_ocp.errors import ConfigError
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -20,6 +19,8 @@ from yid_ocp.report.terminal import recording_summary_lines, third_party_file_su
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
 _RESULT_FORMAT = "yid-import/1"
+_RENAMED_SOURCE_KEYS = {"count": "n_samples", "rate": "mean_rate", "becomes": "imported_as"}
+_SOURCE_KEYS = ("name", "kind", "count", "rate", "becomes", "note")
 _LISTS = ("joint_topics", "joints")
 _MAPPINGS: Mapping[str, type] = {"points": str, "columns": str, "torque_constants": float, "gears": float}
 _SINGLE = ("command_topic", "pose_axes", "header", "skip_bad_lines", "delimiter", "episode", "clock", "sensor", "frame")
@@ -35,7 +36,10 @@ def run(arguments: argparse.Namespace) -> int:
             progress.begin_stage(f"reading {file}")
             contents = preview_file(file, progress)
         if arguments.json:
-            print_json({"format": _RESULT_FORMAT, "recording": None, **_preview_result(contents)})
+            keys = {key: _RENAMED_SOURCE_KEYS.get(key, key) for key in _SOURCE_KEYS}
+            sources = [{key: getattr(own, name) for key, name in keys.items()} for own in contents.sources]
+            told = {"sources": sources, "options": contents.reader_options, "notes": contents.notes}
+            print_json({"format": _RESULT_FORMAT, "recording": None, **told})
             return EXIT_DONE
         lines = third_party_file_summary_lines(contents)
         if not has_native_recording_suffix(file):
@@ -61,15 +65,6 @@ def recording_contents_summary(recording: Recording) -> dict[str, Any]:
     """Contents of a recording as plain data: duration, groups and notes."""
     groups = {group.name: {"samples": len(group.t), "names": list(group.names)} for group in recording.all_groups}
     return {"duration": recording.duration, "groups": groups, "notes": list(recording.notes)}
-
-
-def _preview_result(contents: FilePreview) -> dict[str, Any]:
-    keys = {"count": "n_samples", "rate": "mean_rate", "becomes": "imported_as"}
-    sources = [
-        {key: getattr(own, keys.get(key, key)) for key in ("name", "kind", "count", "rate", "becomes", "note")}
-        for own in contents.sources
-    ]
-    return {"sources": sources, "options": contents.reader_options, "notes": contents.notes}
 
 
 def read_third_party_recording(

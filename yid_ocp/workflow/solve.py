@@ -123,10 +123,7 @@ def solve_and_log(
 
 
 def solution_and_fit_issues(
-    problem: EstimationProblem,
-    solution: Solution,
-    held_out: Sequence[_Prediction],
-    cable: CableTopology | None = None,
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[_Prediction], cable: CableTopology | None = None
 ) -> tuple[Solution, tuple[Issue, ...]]:
     """The solution, its verdicts set to untrusted where the fit is poor, and all issues of data and fit.
 
@@ -157,10 +154,7 @@ def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dic
 
 
 def solve_result(
-    problem: EstimationProblem,
-    solution: Solution,
-    held_out: Sequence[_Prediction],
-    cable: CableTopology | None = None,
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[_Prediction], cable: CableTopology | None = None
 ) -> dict[str, Any]:
     """Contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = _prediction_errors(problem, solution, held_out, cable)

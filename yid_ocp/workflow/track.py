@@ -269,11 +269,7 @@ def simulate_recording_and_camera_frames(
             system, seed=settings.seed, initial_joint_angles=posture, excitation=excitation
         )
         experiment = VirtualExperiment(
-            simulation=simulation,
-            camera=None,
-            seed=settings.seed,
-            recording_name=run.name,
-            description=run.description,
+            simulation=simulation, camera=None, seed=settings.seed, recording_name=run.name, description=run.description
         )
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
         recording = record_simulation(system, None, experiment, truth)
