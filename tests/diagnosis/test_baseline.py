@@ -44,9 +44,9 @@ TRUTH = {"beam.bend": 0.02, "beam.damping": 5e-5}
 
 
 def swing(folder, name, seed, effects="[]"):
-    """A recording of 2.2 s of the beam let go from 0.1 rad a joint, and its file."""
-    t = np.arange(221) * 0.01
-    empty = Recording(None, (PointGroup("points", ("w_beam",), t, np.zeros((221, 1, 3)), NOISE),))
+    """A recording of 1.6 s of the beam let go from 0.1 rad a joint, and its file."""
+    t = np.arange(161) * 0.01
+    empty = Recording(None, (PointGroup("points", ("w_beam",), t, np.zeros((161, 1, 3)), NOISE),))
     write_recording(empty, folder / "bare.h5")
     (folder / "beam.yaml").write_text(BEAM, encoding="utf-8")
     run = load_config(folder / "beam.yaml", (f"model.effects={effects}",))

@@ -19,15 +19,7 @@ pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pi
 JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
 CENTRE = np.array([0.1, -0.5, 0.2, 1.0, -0.1, 0.8, 0.0])
 DAMPING, NOISE, TIME_STEP = 0.3, 0.05, 0.01
-CANDIDATES = (
-    "joint_spring",
-    "joint_viscous",
-    "joint_coulomb",
-    "effort_gain",
-    "effort_offset",
-    "link_mass",
-    "gravity_tilt",
-)
+CANDIDATES = ("joint_spring", "joint_coulomb", "effort_offset", "link_mass")
 
 
 @lru_cache(maxsize=2)
@@ -43,7 +35,7 @@ def recording(side: str, seed: int, extra) -> Recording:
     """A multi-sine motion with the efforts of inverse dynamics, viscous friction and whatever `extra` adds."""
     names, _, model = robot(side)
     data, rng = model.createData(), np.random.default_rng(seed)
-    t = TIME_STEP * np.arange(301)
+    t = TIME_STEP * np.arange(251)
     frequency = rng.uniform([0.1, 0.3, 0.7], [0.25, 0.6, 1.2], (7, 3))
     phase = rng.uniform(0, 2 * np.pi, (7, 3))
     amplitude = 0.12 / frequency**0.7
@@ -59,26 +51,18 @@ def recording(side: str, seed: int, extra) -> Recording:
         for target, source in zip(full, (q[k], v[k], a[k]), strict=True):
             target[column] = source
         effort[k] = pin.rnea(model, data, *full)[column]
-    effort += DAMPING * v + extra(names, q, v, effort) + NOISE * rng.standard_normal(q.shape)
+    effort += DAMPING * v + extra(names, q, v) + NOISE * rng.standard_normal(q.shape)
     joints = JointGroup(names, t, q, velocity=v, effort=effort, effort_std=NOISE, position_std=0.0)
     return Recording(joints, name=f"{side}_{seed}")
 
 
-def spring(joint: str, stiffness: float, rest: float):
-    def extra(names, q, v, effort):
-        added = np.zeros_like(q)
+def at_one(joint: str, law):
+    """Effort that one joint needs beside inverse dynamics, by its angle and speed."""
+
+    def extra(names, q, v):
         at = names.index(joint)
-        added[:, at] = stiffness * (q[:, at] - rest)
-        return added
-
-    return extra
-
-
-def dry(joint: str, size: float):
-    def extra(names, q, v, effort):
         added = np.zeros_like(q)
-        at = names.index(joint)
-        added[:, at] = size * np.tanh(v[:, at] / 0.02)
+        added[:, at] = law(q[:, at], v[:, at])
         return added
 
     return extra
@@ -94,26 +78,25 @@ def diagnosed(side: str, extra):
         ProblemOptions(path_cutoff=float("inf")),
         held_out=[recording(side, 2, extra)],
     )
-    return diagnose(problem, CANDIDATES, thresholds=Thresholds(max_effects=2))
+    return diagnose(problem, CANDIDATES, thresholds=Thresholds(max_effects=2, n_refit_per_round=3))
 
 
-@pytest.mark.parametrize(("side", "joint", "stiffness"), [("left", "left_e1", 8.0), ("right", "right_w1", 3.0)])
-def test_a_spring_is_found_at_any_joint_of_either_arm(side, joint, stiffness):
-    finding = diagnosed(side, spring(joint, stiffness, -0.4))
+def test_a_spring_is_found_at_a_wrist():
+    finding = diagnosed("right", at_one("right_w1", lambda q, v: 3.0 * (q + 0.4)))
     assert finding.verdict in ("effect", "confusable")
-    assert finding.accepted_effects[0].label == f"joint_spring@{joint}"
-    assert finding.gap_locations[0].location == joint
+    assert finding.accepted_effects[0].label == "joint_spring@right_w1"
+    assert finding.gap_locations[0].location == "right_w1"
     assert finding.gap_closure.fraction > 0.95
     found = finding.final_model.reported_parameters(finding.accepted_effects[0])
-    assert found["stiffness"].value == pytest.approx(stiffness, rel=0.05)
+    assert found["stiffness"].value == pytest.approx(3.0, rel=0.05)
 
 
 def test_dry_friction_is_told_from_a_spring():
-    finding = diagnosed("left", dry("left_e1", 1.5))
+    finding = diagnosed("left", at_one("left_e1", lambda q, v: 1.5 * np.tanh(v / 0.02)))
     assert finding.accepted_effects[0].label == "joint_coulomb@left_e1"
     assert finding.gap_locations[0].location == "left_e1"
 
 
 def test_an_arm_as_the_model_says_has_no_gap():
-    finding = diagnosed("left", lambda names, q, v, effort: np.zeros_like(q))
+    finding = diagnosed("left", lambda names, q, v: np.zeros_like(q))
     assert finding.verdict == "no_gap"

@@ -69,7 +69,6 @@ def test_too_few_samples_by_another_measure(bench):
     [
         ({"min_gap_closed": 0.999}, "unknown"),
         ({"min_excess_chi2": 1e3, "min_channel_excess_chi2": 1e3}, "no_gap"),
-        ({"max_effects": 1}, "effect"),
     ],
 )
 def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):

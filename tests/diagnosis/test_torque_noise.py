@@ -237,7 +237,7 @@ def test_noise_of_torques_is_not_mistaken_for_what_they_multiply(step, monkeypat
     """By recorded torques absent inertias, gains and lags are on average three to five standard deviations off."""
     monkeypatch.setattr("test_torque_noise.WHITE", 6 * WHITE)
     absent, z = with_absent(step, effect), []
-    for seed in range(20, 28):
+    for seed in range(20, 26):
         problem = weighted_at_truth(absent, recorded(step, seed), "proportional")
         residual, jacobian = linearization_without_weak_priors(problem, problem.evaluate(problem.initial_unknowns))
         covariance = np.linalg.inv(jacobian.T @ jacobian)
@@ -307,32 +307,33 @@ def test_a_refit_is_as_sure_as_a_solution(step, friction):
     assert (std > 1.5 * noise) == (friction > 0)
 
 
-def test_offsets_are_named_where_they_leave_what_was_expected(step):
+LIBRARY = ["joint_viscous@shoulder", "effort_offset@shoulder"]
+
+
+@pytest.fixture(scope="module")
+def within(step):
+    """A diagnosis of recordings whose offsets are as was expected."""
+    return diagnose(problem_of(step, [recorded(step, 1)], [recorded(step, 2)]), LIBRARY)
+
+
+def test_offsets_are_named_where_they_leave_what_was_expected(step, within):
     """Within their prior they are no gap; six times as large they are, and named."""
-    library = ["joint_viscous", "effort_offset@shoulder"]
-    within = diagnose(problem_of(step, [recorded(step, 1)], [recorded(step, 2)]), library)
     assert within.verdict == "no_gap"
     far = [recorded(step, seed, 6 * OFFSET) for seed in (3, 4)]
-    beyond = diagnose(problem_of(step, far[:1], far[1:]), library)
+    beyond = diagnose(problem_of(step, far[:1], far[1:]), LIBRARY)
     assert [effect.label for effect in beyond.accepted_effects] == ["effort_offset@shoulder"]
     found = beyond.final_model.values["effort_offset@shoulder.offset"]
     assert found == pytest.approx(6 * OFFSET, abs=4 * OFFSET)
 
 
-def test_an_effect_is_found_beside_the_noise_of_torques(step):
+def test_an_effect_is_found_beside_the_noise_of_torques(step, within):
     """A gear whose friction is ten times what could be noticed."""
-    library = ["joint_viscous", "effort_offset@shoulder"]
-    clean = problem_of(step, [recorded(step, 5)], [recorded(step, 6)])
-    seen = diagnose(clean, library).detectability
-    detectable = next(e.detectable_amplitudes for e in seen if e.effect.label == "joint_viscous@shoulder")
-    more = 10 * detectable["joint_viscous@shoulder.b"]
+    name = "joint_viscous@shoulder.b"
+    more = 10 * next(e.detectable_amplitudes[name] for e in within.detectability if name in e.detectable_amplitudes)
     rubbing = [recorded(step, seed, friction=more) for seed in (5, 6)]
-    finding = diagnose(problem_of(step, rubbing[:1], rubbing[1:]), library)
+    finding = diagnose(problem_of(step, rubbing[:1], rubbing[1:]), LIBRARY)
     assert [effect.label for effect in finding.accepted_effects] == ["joint_viscous@shoulder"]
-    found = finding.final_model
-    assert found.values["joint_viscous@shoulder.b"] == pytest.approx(
-        more, abs=4 * found.std["joint_viscous@shoulder.b"]
-    )
+    assert finding.final_model.values[name] == pytest.approx(more, abs=4 * finding.final_model.std[name])
 
 
 def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):

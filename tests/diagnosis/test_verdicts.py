@@ -18,81 +18,42 @@ from yid_ocp.errors import YidError
 from yid_ocp.inference.smoother import select_and_smooth_unknowns
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
-NUMBER, TEXT = {"type": "number"}, {"type": "string"}
+NUMBER, TEXT, PART = {"type": "number"}, {"type": "string"}, {"type": "number", "minimum": 0, "maximum": 1}
 MAYBE = {"type": ["number", "null"]}
-PLACES = {
-    "type": "array",
-    "items": {
-        "type": "object",
-        "properties": {
-            "location": TEXT,
-            "share": {"type": "number", "minimum": 0, "maximum": 1},
-            "observable": {"type": "boolean"},
-            "windows": {"type": "array", "items": {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2}},
-        },
-        "required": ["location", "share", "observable", "windows"],
-    },
-}
-EFFECT = {"type": "object", "properties": {"kind": TEXT, "location": TEXT}, "required": ["kind", "location"]}
-STATE = {
-    "type": "object",
-    "properties": {
-        "rmse": {"type": "object", "additionalProperties": NUMBER},
-        "chi2_per_dof": NUMBER,
-        "p_value": {"type": "number", "minimum": 0, "maximum": 1},
-    },
-    "required": ["rmse", "chi2_per_dof", "p_value"],
-}
-SCHEMA = {
-    "type": "object",
-    "properties": {
-        "format": {"const": "yid-diagnosis/2"},
-        "verdict": {"enum": ["effect", "confusable", "no_gap", "unknown", "insufficient_data"]},
-        "gap": {
-            "type": "object",
-            "properties": {
-                "before": STATE,
-                "after": STATE,
-                "closure": MAYBE,
-                "closure_ci": {"type": ["array", "null"], "items": MAYBE, "minItems": 2, "maxItems": 2},
-                "held_out": {"type": "array", "items": TEXT, "minItems": 1},
-            },
-            "required": ["before", "after", "closure", "closure_ci", "held_out"],
-        },
-        "where": PLACES,
-        "which": {
-            "type": "array",
-            "items": {
-                "type": "object",
-                "properties": {
-                    "kind": TEXT,
-                    "location": TEXT,
-                    "parameters": {
-                        "type": "object",
-                        "additionalProperties": {
-                            "type": "object",
-                            "properties": {"value": MAYBE, "std": MAYBE, "unit": TEXT},
-                            "required": ["value", "std", "unit"],
-                        },
-                    },
-                    "score": NUMBER,
-                    "p_value": NUMBER,
-                    "closure": MAYBE,
-                },
-                "required": ["kind", "location", "parameters", "score", "p_value", "closure"],
-            },
-        },
-        "effects": {"type": "array", "items": EFFECT},
-        "remaining": {
-            "type": "object",
-            "properties": {"p_value": NUMBER, "where": PLACES},
-            "required": ["p_value", "where"],
-        },
-        "confusable": {"type": "array", "items": {"type": "array", "items": EFFECT, "minItems": 2}},
-        "next_experiment": TEXT,
-    },
-    "required": ["format", "verdict", "gap", "where", "which", "effects", "remaining", "confusable", "next_experiment"],
-}
+
+
+def record(**fields):
+    """An object that has all these fields."""
+    return {"type": "object", "properties": fields, "required": list(fields)}
+
+
+def listed(items, least=0):
+    return {"type": "array", "items": items, "minItems": least}
+
+
+def by_name(values):
+    return {"type": "object", "additionalProperties": values}
+
+
+INTERVAL = {"type": ["array", "null"], "items": MAYBE, "minItems": 2, "maxItems": 2}
+PLACES = listed(
+    record(
+        location=TEXT, share=PART, observable={"type": "boolean"}, windows=listed(listed(NUMBER, 2) | {"maxItems": 2})
+    )
+)
+EFFECT, STATE = record(kind=TEXT, location=TEXT), record(rmse=by_name(NUMBER), chi2_per_dof=NUMBER, p_value=PART)
+VALUES = by_name(record(value=MAYBE, std=MAYBE, unit=TEXT))
+SCHEMA = record(
+    format={"const": "yid-diagnosis/2"},
+    verdict={"enum": ["effect", "confusable", "no_gap", "unknown", "insufficient_data"]},
+    gap=record(before=STATE, after=STATE, closure=MAYBE, closure_ci=INTERVAL, held_out=listed(TEXT, 1)),
+    where=PLACES,
+    which=listed(record(kind=TEXT, location=TEXT, parameters=VALUES, score=NUMBER, p_value=NUMBER, closure=MAYBE)),
+    effects=listed(EFFECT),
+    remaining=record(p_value=NUMBER, where=PLACES),
+    confusable=listed(listed(EFFECT, 2)),
+    next_experiment=TEXT,
+)
 FRICTION = ("joint_coulomb", "link_mass@elbow", "effort_offset@elbow")
 
 
@@ -144,8 +105,13 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert "joint_coulomb@elbow with tau_c" in result["summary"]
 
 
-def test_a_model_that_is_right_has_no_gap(bench):
-    _, result = found(bench, {}, FRICTION)
+@pytest.fixture(scope="module")
+def clean(bench):
+    return found(bench, {}, FRICTION)
+
+
+def test_a_model_that_is_right_has_no_gap(clean):
+    _, result = clean
     assert result["verdict"] == "no_gap"
     assert result["gap"]["closure"] is None
     assert result["gap"]["before"] == result["gap"]["after"]
@@ -268,8 +234,8 @@ def test_the_papers_weighting_cannot_be_diagnosed(bench):
     refused(lambda: diagnose(problem, FRICTION), "whitened")
 
 
-def test_a_barely_significant_excess_without_shape_is_chance(bench):
-    finding = diagnose(bench.problem([bench.recording({}, 1)]), FRICTION, [bench.recording({}, 2)])
+def test_a_barely_significant_excess_without_shape_is_chance(clean):
+    finding, _ = clean
     nominal = finding.nominal_model
     smoothed = select_and_smooth_unknowns(nominal.problem, nominal.problem.vector(nominal.values), nominal.evaluation)
     limits = Thresholds()

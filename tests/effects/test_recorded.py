@@ -16,7 +16,7 @@ from yid_ocp.problem.recorded_inputs import recorded_sensor_kinds
 from yid_ocp.sensors import recorded_camera_pose, sensor_reading_function
 from yid_ocp.solvers import MultipleShooting
 
-H, STEPS = 0.01, 20
+H, STEPS = 0.01, 24
 NAMES = ("left_a", "left_b", "left_c")
 KINDS = {
     "encoder_offset": {"left_b": {"offset": 0.01}},
