@@ -86,7 +86,7 @@ def effect(label="friction@elbow", *quantities: ParameterDefinition, alone=False
 def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTestResult:
     """The outcome of a null test."""
     channels = {"points.tip": chi2} if channels is None else channels
-    return NullTestResult(chi2, degrees, p, dict(channels), dict.fromkeys(channels, 0.5), tuple(windows))
+    return NullTestResult(chi2, degrees, p, dict(channels), tuple(windows))
 
 
 # -- screening --------------------------------------------------------------------------------------------------------

@@ -28,7 +28,11 @@ def robot(side: str):
     system = System.build(read_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
     model = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
     locked = [j for j in range(1, model.njoints) if model.names[j] not in names]
-    return names, compile_step(system, TIME_STEP), pin.buildReducedModel(model, locked, pin.neutral(model))
+    return (
+        names,
+        compile_step(system, TIME_STEP, use_compiler=False),
+        pin.buildReducedModel(model, locked, pin.neutral(model)),
+    )
 
 
 def recording(side: str, seed: int, extra) -> Recording:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, _EventForceSeries, _Overspeed
-from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse
+from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, _Overspeed
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
 from yid_ocp.report import categorical_charts, figures
 from yid_ocp.report.categorical_charts import RankedCandidate, TimeHeatMapRow, ValueBeforeAfter
 from yid_ocp.report.figures import TimePlotData
@@ -156,7 +156,7 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     events = EventSet(
         (event,),
         (_Overspeed("run", "elbow", 1.5),),
-        (_EventForceSeries("run", "elbow", "N m", t, pulse.filtered_force_at(t), 0.1 + 0 * t),),
+        (ForceEstimate("run", "elbow", "elbow", "N m", t, pulse.filtered_force_at(t), np.eye(21), 0.1 + 0 * t, 0 * t),),
     )
     page = page_of(replace(found["no_gap"], events=events), tmp_path / "report.html")
     assert 'id="events"' in page

@@ -95,24 +95,12 @@ class _Overspeed:
 
 
 @dataclass(frozen=True)
-class _EventForceSeries:
-    """Time series of the unknown force at a coordinate with an event, for plots; shape (M,) each."""
-
-    recording: str
-    channel: str
-    unit: str
-    t: Array  # since the start of the recording [s]
-    force: Array  # beside what the model and the recording have, each point for itself, in `unit`
-    allowed_model_error: Array  # what the model may be wrong by, in `unit`
-
-
-@dataclass(frozen=True)
 class EventSet:
-    """All events of a diagnosis by recording and time, the force time series, and overspeeds."""
+    """All events of a diagnosis by recording and time, overspeeds, and the unknown force where an event is."""
 
     disturbances: tuple[DisturbanceEvent, ...] = ()
     overspeeds: tuple[_Overspeed, ...] = ()
-    force_series: tuple[_EventForceSeries, ...] = ()
+    force_estimates: tuple[ForceEstimate, ...] = ()
 
     def __bool__(self) -> bool:
         return bool(self.disturbances or self.overspeeds)
@@ -196,18 +184,7 @@ def find_disturbance_events(
         forces = single
     everything = sorted([*forces, *wrong], key=lambda event: (event.recording, event.start_time, event.location))
     there = {(event.recording, event.channel) for event in forces}
-    shown = tuple(
-        _EventForceSeries(
-            h.recording,
-            h.coordinate,
-            h.unit,
-            h.t,
-            h.max_likelihood_forces,
-            np.hypot(h.model_error_std, h.friction_limit),
-        )
-        for h in cut
-        if (h.recording, h.coordinate) in there
-    )
+    shown = tuple(history for history in cut if (history.recording, history.coordinate) in there)
     return EventSet(tuple(everything), ends.overspeeds, shown)
 
 

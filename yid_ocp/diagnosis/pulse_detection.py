@@ -163,6 +163,11 @@ class ForceEstimate:
         return replace(self, information=information, **parts)
 
     @property
+    def allowed_model_error(self) -> Array:
+        """What the model may be wrong by at every time point, shape (M,), in `unit`."""
+        return np.hypot(self.model_error_std, self.friction_limit)
+
+    @property
     def max_likelihood_forces(self) -> Array:
         """Maximum-likelihood force at every time point, shape (M,)."""
         least = 1e-6 * max(float(np.mean(np.diag(self.information))), 1e-300)

@@ -1,4 +1,4 @@
-"""Null test: whether a residual is larger or less random than noise alone explains.
+"""Null test: whether a residual is larger than noise alone explains.
 
 Under the null hypothesis the whitened residual r is noise of unit standard deviation whose colour rho is known (white,
 or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a chi-squared
@@ -7,7 +7,6 @@ variable with n/(1 + 2 sum rho_l^2) degrees of freedom; a free parameter takes o
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -68,13 +67,12 @@ class ChannelNoiseLevel:
 
 @dataclass(frozen=True)
 class _ResidualWindow:
-    """Test of one channel in a time window [s]: excess of r'r in standard deviations, flagged beyond chance."""
+    """Test of one channel in a time window [s], flagged where its r'r is more than chance."""
 
     recording: str
     channel: str
     start_time: float
     end_time: float
-    z_score: float
     is_flagged: bool
 
 
@@ -82,15 +80,13 @@ class _ResidualWindow:
 class NullTestResult:
     """Result of the null test: chi2 per degree of freedom, and the probability of one this large under noise alone.
 
-    Degrees of freedom are effective ones, of coloured noise. By channel there are the mean square of its whitened
-    residual, and the p-value of its first autocorrelations (Ljung-Box; NaN for smoothed channels).
+    Degrees of freedom are effective ones, of coloured noise; by channel there is the mean square of its residual.
     """
 
     chi2_per_dof: float
     degrees_of_freedom: float
     p_value: float
     channel_chi2: dict[str, float]
-    whiteness_p_values: dict[str, float]
     windows: tuple[_ResidualWindow, ...]
 
 
@@ -130,13 +126,11 @@ def run_null_test(
     total = float(sum(np.sum(residual[s.residual_indices] ** 2) for s in series))
     ratio = total / max(count - parameters, 1)
     p_value = float(scipy.stats.chi2.sf(ratio * effective, effective))
-    channels, whiteness = {}, {}
+    channels = {}
     for channel in dict.fromkeys(s.channel for s in series):
-        own = [s for s in series if s.channel == channel]
-        parts = [residual[s.residual_indices] for s in own]
+        parts = [residual[s.residual_indices] for s in series if s.channel == channel]
         channels[channel] = float(np.mean(np.concatenate(parts) ** 2))
-        whiteness[channel] = _whiteness(parts) if len(own[0].noise_autocorrelation) == 1 else math.nan
-    return NullTestResult(ratio, effective, p_value, channels, whiteness, _windows(series, residual, level, window))
+    return NullTestResult(ratio, effective, p_value, channels, _windows(series, residual, level, window))
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
@@ -165,26 +159,10 @@ def min_bonferroni_p_value(tests: Sequence[NullTestResult]) -> float:
     return min(1.0, len(tests) * min(test.p_value for test in tests))
 
 
-def _whiteness(parts: Sequence[Array], lags: int = 10) -> float:
-    """Ljung-Box p-value, doi:10.1093/biomet/65.2.297."""
-    statistic, degrees = 0.0, 0
-    for r in parts:
-        n = len(r)
-        if n <= 3 * lags or not np.any(r):
-            continue
-        # whitened noise has mean zero: an offset is part of what must be noticed
-        power = float(r @ r)
-        for lag in range(1, lags + 1):
-            rho = float(r[lag:] @ r[:-lag]) / power
-            statistic += n * (n + 2) * rho**2 / (n - lag)
-        degrees += lags
-    return float(scipy.stats.chi2.sf(statistic, degrees)) if degrees else math.nan
-
-
 def _windows(
     series: Sequence[ResidualChannelSamples], residual: Array, level: float, length: float
 ) -> tuple[_ResidualWindow, ...]:
-    raw: list[tuple[str, str, float, float, float]] = []
+    raw: list[tuple[str, str, float, float]] = []
     p_values: list[float] = []
     merged: dict[tuple[str, str], list[ResidualChannelSamples]] = {}
     for s in series:
@@ -200,8 +178,7 @@ def _windows(
                 degrees += len(r) / _variance_inflation(s.noise_autocorrelation)
             if count:
                 p_values.append(float(scipy.stats.chi2.sf(total / count * degrees, degrees)))
-                z = (total / count - 1) * math.sqrt(degrees / 2)
-                raw.append((recording, channel, begin, min(begin + length, last), z))
+                raw.append((recording, channel, begin, min(begin + length, last)))
     flagged = benjamini_hochberg_mask(p_values, len(raw), level)
     return tuple(_ResidualWindow(*entry, flag) for entry, flag in zip(raw, flagged, strict=True))
 

@@ -297,10 +297,11 @@ def write_diagnosis_trajectories(
                 "prior": np.sqrt(variance) * trace.reference_std,
             }
             _store(group, arrays)
-        for force in finding.events.force_series:
-            group = file.create_group(f"events/{force.recording}/{force.channel}")
+        for force in finding.events.force_estimates:
+            group = file.create_group(f"events/{force.recording}/{force.coordinate}")
             group.attrs["unit"] = force.unit
-            _store(group, {"t": force.t, "value": force.force, "allowed": force.allowed_model_error})
+            arrays = {"t": force.t, "value": force.max_likelihood_forces, "allowed": force.allowed_model_error}
+            _store(group, arrays)
 
 
 def _store_sensor(parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, Array]) -> None:

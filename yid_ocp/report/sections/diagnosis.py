@@ -217,19 +217,19 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         "The force beside what the model and the recording have, point by point. Between the grey lines is what a good "
         "model may be wrong by; windows of events are shaded, and the line is their shape. They are taken out of what "
         "is judged below, as far as that can be done."
-        if events.force_series
+        if events.force_estimates
         else "",
         *joint_overspeed_messages(events),
     ]
     by_recording: dict[str, list[TimePlotData]] = {}
-    for force in events.force_series:
-        found = [event for event in events.for_recording(force.recording) if event.channel == force.channel]
+    for force in events.force_estimates:
+        found = [event for event in events.for_recording(force.recording) if event.channel == force.coordinate]
         pulses = [(e.detected_pulse, e.start_time, e.end_time) for e in found if e.detected_pulse is not None]
         shape = sum((pulse.filtered_force_at(force.t) for pulse, *_ in pulses), np.zeros(len(force.t)))
         courses = (shape, force.allowed_model_error, -force.allowed_model_error)
         lines = {name: (force.t, values) for name, values in zip(_EVENT_COLORS, courses, strict=True)}
-        title, spans = f"{force.channel} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
-        plot = TimePlotData(title, lines, force.t, force.force, marked_intervals=spans)
+        title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
+        plot = TimePlotData(title, lines, force.t, force.max_likelihood_forces, marked_intervals=spans)
         by_recording.setdefault(force.recording, []).append(plot)
     shown = [
         (f"Recording {name}", figures.time_plots_figure(plots, figures.BEFORE_COLOR, _EVENT_COLORS))
