@@ -83,10 +83,7 @@ def load_config(
 def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> list[str]:
     """Dotted keys that `overrides` may set and that begin with a prefix, with the names used in a given file.
 
-    Raises
-    ------
-    ConfigError
-        The file cannot be read.
+    `ConfigError` where the file cannot be read.
     """
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
     return list(iter_settable_key_completions(RunSettings, prefix, data))

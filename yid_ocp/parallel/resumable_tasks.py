@@ -72,10 +72,7 @@ class TaskResult:
 class WorkerConfig:
     """The workers of a run: processes on this machine, or those of a Dask scheduler (address or scheduler file).
 
-    Raises
-    ------
-    ConfigError
-        No process at all, or both.
+    `ConfigError` where there is no process at all, or both are given.
     """
 
     n_processes: int | None = None
@@ -92,10 +89,7 @@ class WorkerConfig:
     def check_available(self) -> None:
         """Check before long work that the workers are available.
 
-        Raises
-        ------
-        WorkerError
-            Dask is not installed, no scheduler answers, or a worker is not fit for the work.
+        `WorkerError` where Dask is not installed, no scheduler answers, or a worker is not fit for the work.
         """
         if self.scheduler_address:
             with _dask_executor(self.scheduler_address):
@@ -169,12 +163,7 @@ def run_tasks(
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
     """Values of tasks that must all have succeeded.
 
-    Raises
-    ------
-    WorkerError
-        One failed for a reason that its reader can mend.
-    RuntimeError
-        One failed for another reason.
+    `WorkerError` where one failed for a reason that its reader can mend, `RuntimeError` where for another one.
     """
     failed = [entry for entry in results if entry.error]
     if not failed:

@@ -50,10 +50,7 @@ def available_processor_count() -> int:
 def max_threads() -> int:
     """Number of threads that the caller may use: the process's limit, or its share within `map_in_threads`.
 
-    Raises
-    ------
-    ConfigError
-        `YID_OCP_THREADS` is no number of threads.
+    `ConfigError` where `YID_OCP_THREADS` is no number of threads.
     """
     said = os.environ.get(_THREADS_VARIABLE, "")
     if said and not (said.isdecimal() and int(said)):
@@ -190,8 +187,7 @@ def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable
     """Results of a function for all items, run concurrently so that their `batched_call` calls are batched.
 
     As many run as there are threads to use; they wait for each other wherever one calls `batched_call`, so that all are
-    answered at once.
-    Which questions meet depends on the items alone. No item may hold a lock that others want while it asks.
+    answered at once. Which questions meet depends on the items alone. No item may hold a lock while it asks.
     """
     entries = list(items)
     if len(entries) < 2 or getattr(_SHARE, "march", None) is not None:

@@ -74,10 +74,7 @@ def list_batch_runs(
     overrides : sequence of str
         `a.b=c` each, for every run.
 
-    Raises
-    ------
-    ConfigError
-        A configuration is not there or given twice, or no recording matches.
+    `ConfigError` where a configuration is not there or given twice, or no recording matches.
     """
     paths = [Path(config) for config in configs]
     for i, path in enumerate(paths):
@@ -134,11 +131,7 @@ def run_batch(
     command_line : str
         The command line that does the same, for the report.
 
-    Raises
-    ------
-    OutputError
-        The folder holds something else, or cannot be made.
-    WorkerError
+    `OutputError` where the folder holds something else or cannot be made, `WorkerError` as `run_tasks`.
     """
     folder = _folder(Path(out))
     write_shared_plotly_script(folder)

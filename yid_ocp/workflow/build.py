@@ -204,10 +204,7 @@ def _matches(name: str, key: str) -> bool:
 def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
     """Settings by parameter name, for every name or pattern that matches; later keys override earlier ones.
 
-    Raises
-    ------
-    ConfigError
-        A name or pattern that matches nothing.
+    `ConfigError` for a name or pattern that matches nothing.
     """
     result: dict[str, ParameterSettings] = {}
     for key, given in run.parameters.items():
@@ -327,14 +324,8 @@ def marker_positions_from_reference_pose(
 ) -> dict[str, dict[str, float]]:
     """Marker positions on the object per recording, as parameter values, from its straight reference pose [m].
 
-    The object stands in the world: without its weight it is straight. Empty where no frame is placed so.
-
-    Raises
-    ------
-    ConfigError
-        The object does not stand in the world, or a marker is no point of a recording.
-    DataError
-        A recording without `straight`.
+    The object stands in the world: without its weight it is straight. Empty where no frame is placed so. `ConfigError`
+    where it does not, or a marker is no point of a recording; `DataError` for a recording without `straight`.
     """
     names = [name for name, said in run.model.frames.items() if said.marker_reference_pose]
     if not names:

@@ -70,17 +70,9 @@ def recording_contents_summary(recording: Recording) -> dict[str, Any]:
 def read_third_party_recording(
     file: str | Path, options: Mapping[str, Any], progress: Progress = NULL_PROGRESS
 ) -> Recording:
-    """Recording read from a file of another tool, with the file's hash in `source`.
+    """Recording read from a file of another tool with options of its reader, the file's hash in `source`.
 
-    Parameters
-    ----------
-    options : mapping of str to object
-        Named options of its reader.
-
-    Raises
-    ------
-    DataError
-        As `read_any`.
+    Errors as `read_any`.
     """
     progress.begin_stage(f"reading {file}")
     recording = read_any(file, progress=progress, **options)
@@ -95,13 +87,7 @@ def has_native_recording_suffix(file: str | Path) -> bool:
 
 
 def reader_options_from_arguments(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Reader options from the command-line flags.
-
-    Raises
-    ------
-    ConfigError, DataError
-        A flag that cannot be understood.
-    """
+    """Reader options from the command-line flags; `ConfigError` or `DataError` for one that cannot be understood."""
     options = {name: getattr(arguments, name) for name in _SINGLE if getattr(arguments, name) is not None}
     for key in (*_LISTS, *_MAPPINGS):
         if entries := _split(getattr(arguments, key)):

@@ -110,10 +110,8 @@ def identified_parameters_with_covariance(
 ) -> tuple[Array, ParameterCovariance, dict[str, Any]]:
     """Parameters, their covariance, and where both come from: a run folder of `solve`, or the settings.
 
-    Raises
-    ------
-    ConfigError, DataError
-        The folder is none of `solve`, its solve failed, or it had effects that this model has not.
+    `ConfigError` or `DataError` where the folder is none of `solve`, its solve failed, or it had effects that this
+    model has not.
     """
     parameters = step.system.parameters
     theta = parameters.vector()

@@ -129,19 +129,13 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
     """Context manager for a new run folder, which appears under its name only if the block ends without an error.
 
     The name is reserved first: two runs never write to one folder, and a run that ends finds its name free. What
-    killed runs left beside it is cleared away.
+    killed runs left beside it is cleared away. `OutputError` where the folder exists and is not empty, another run is
+    making it, or it cannot be made or written to.
 
     Parameters
     ----------
     out : str or Path, optional
-        Its name; `NAME-YYYYmmdd-HHMMSS` in `output.runs_folder` when absent.
-    command : str
-        Enters the name: `NAME-COMMAND-...`.
-
-    Raises
-    ------
-    OutputError
-        The folder exists and is not empty, another run is making it, or it cannot be made or written to.
+        Its name; `NAME-COMMAND-YYYYmmdd-HHMMSS` in `output.runs_folder` when absent.
     """
     stem = "-".join(filter(None, (run.name, command)))
     targets = _targets(run, out, stem)

@@ -38,11 +38,8 @@ _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
 def read_estimates(folder: str | Path) -> RunEstimates:
     """Estimates and covariance of the free parameters that a `solve` or `diagnose` found, read from its run folder.
 
-    Raises
-    ------
-    DataError
-        There is no finished run, its result cannot be read, is one of another command or of an older format, or its
-        solve failed.
+    `DataError` where there is no finished run, its result cannot be read, is one of another command or of an older
+    format, or its solve failed.
     """
     file, result = Path(folder) / "result.json", read_estimation_result(folder)
     try:
@@ -102,10 +99,7 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
 def read_result_file(file: Path) -> dict[str, Any]:
     """Contents of a result.json of whatever command.
 
-    Raises
-    ------
-    DataError
-        It is not there, cannot be read, or is of an earlier version, whose keys had other names.
+    `DataError` where it is not there, cannot be read, or is of an earlier version, whose keys had other names.
     """
     if not is_file(file):
         hint = "give the run folder that `solve` or `diagnose` printed"
@@ -123,10 +117,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
 def baseline_estimates(run: RunSettings) -> tuple[RunEstimates, ...]:
     """Estimates of the runs listed in `diagnosis.baseline`, in that order.
 
-    Raises
-    ------
-    ConfigError, DataError
-        As `read_estimates`; a run of another model, or one that is given twice.
+    Errors as `read_estimates`; `ConfigError` for a run of another model, or one that is given twice.
     """
     found: list[RunEstimates] = []
     for i, folder in enumerate(run.diagnosis.baseline):

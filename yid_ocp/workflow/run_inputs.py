@@ -22,9 +22,7 @@ from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.registry import Registry
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS
 
-_ENTRY_POINT_GROUP = "yid_ocp.effects"
-"""Entry points of this group are modules that register effects or sensors when they are imported."""
-
+_ENTRY_POINT_GROUP = "yid_ocp.effects"  # of modules that register effects or sensors when they are imported
 _REGISTRIES: tuple[Registry[Any], ...] = (EFFECTS, SENSOR_READERS, CHANNEL_KINDS)
 _loaded: dict[str, str] = {}  # what this process has run: file or entry point, and the hash or distribution
 
@@ -32,11 +30,8 @@ _loaded: dict[str, str] = {}  # what this process has run: file or entry point, 
 def load_plugins(run: RunSettings) -> None:
     """Import the files of `plugins` and the entry points of `_ENTRY_POINT_GROUP`, each once per process.
 
-    Raises
-    ------
-    ConfigError
-        A file that is missing, raises, registers nothing, or uses a name that is taken; one that changed after this
-        process ran it. Nothing of it stays registered.
+    `ConfigError` for a file that is missing, raises, registers nothing, or uses a name that is taken; for one that
+    changed after this process ran it. Nothing of it stays registered.
     """
     for entry in _installed():
         name, of = f"entry point {entry.name}", _distribution(entry)
