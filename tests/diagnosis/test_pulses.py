@@ -109,14 +109,6 @@ def test_a_filter_widens_what_is_seen_and_not_what_is_told():
     assert pulse.filtered_force_at(T, cutoff) == pytest.approx(seen, abs=0.06)
 
 
-def test_a_few_windows_among_many_are_chance():
-    assert benjamini_hochberg_mask([1e-3], 1000, 0.01) == [False]
-    assert benjamini_hochberg_mask([1e-5, 1.9e-5, 1e-2], 1000, 0.01) == [True, True, False]
-    # the second carries a first that would not pass alone
-    assert benjamini_hochberg_mask([1.5e-5, 1.9e-5], 1000, 0.01) == [True, True]
-    assert benjamini_hochberg_mask([], 1000, 0.01) == []
-
-
 def test_the_evidence_is_a_gaussians():
     """Sigma^-1 y and the evidence against dense algebra."""
     from yid_ocp.diagnosis.pulse_detection import _MODEL_ERROR_TIME, _SLOW_FORCE_TIME, _Rest

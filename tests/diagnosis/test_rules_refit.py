@@ -18,7 +18,6 @@ from yid_ocp.diagnosis.refit import (
     _conditional_amplitude_std,
     _half_done,
     _held_out_loss,
-    _mark_uninformative_std,
     load_stored_refit,
     refit_with_each_effect,
     refit_with_effects,
@@ -130,12 +129,6 @@ def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monk
     monkeypatch.setattr(module, "_relinearizing", lambda problem: problem.evaluate)
     refit_with_effects(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
     assert len(solved.runs) == runs
-
-
-def test_a_spread_far_beyond_what_one_would_expect_is_no_knowledge():
-    low, high = FRICTION.prior_ranges[A]
-    std = {"k": 1e9, A: 101 * (high - low), S: 99 * (FRICTION.prior_ranges[S][1] - FRICTION.prior_ranges[S][0])}
-    assert _mark_uninformative_std([FRICTION], std) == {**std, A: math.inf}
 
 
 # -- is a refit half done ---------------------------------------------------------------------------------------------
@@ -256,18 +249,6 @@ def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatc
 
 
 # -- what is remembered -----------------------------------------------------------------------------------------------
-
-
-def test_a_refit_is_stored_under_its_effects_or_its_name(solved):
-    store = Memory()
-    refit_with_effects(Problem(lambda values: 5.0), [FRICTION], START, store)
-    assert set(store) == {"friction@elbow"}
-    refit_with_effects(Problem(lambda values: 5.0), [FRICTION], START, store, "another")
-    assert set(store) == {"friction@elbow", "another"}
-    kept = store["another"]
-    assert (kept.values, kept.solver_message) == (START, "done")
-    assert set(kept.std.values()) == {0.1}
-    assert kept.amplitude_std == {A: 0.1}
 
 
 def test_a_stored_refit_is_evaluated_and_not_solved(solved):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import get_args
 
 import pytest
@@ -27,7 +26,6 @@ from factories import (
 
 from yid_ocp.diagnosis.diagnosis_messages import _UNKNOWN_REASON_TEXTS
 from yid_ocp.diagnosis.diagnosis_result import _ranked_candidates
-from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.verdict import UnknownVerdictReason
 
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
@@ -133,12 +131,6 @@ def test_candidates_are_listed_with_what_was_added_first():
     assert listed[2]["closure_ci"] is None
 
 
-def test_a_refit_without_a_score_is_listed_as_insignificant():
-    made = finding(candidate_scores=(), single_effect_models=(fit([OFFSET]),), selected_effects=())
-    [entry] = _ranked_candidates(made)
-    assert (entry["kind"], entry["score"], entry["p_value"]) == ("offset", 0.0, 1.0)
-
-
 def test_an_unknown_gap_lists_refits_before_scores():
     made = finding("unknown", single_effect_models=(fit([OFFSET]),), candidate_scores=(score(FRICTION), score(OFFSET)))
     assert [entry["kind"] for entry in _ranked_candidates(made)] == ["offset", "friction"]
@@ -155,13 +147,6 @@ def test_rejected_candidates_say_what_they_close_and_why_they_are_none():
     [entry] = told["carried_over"]
     assert (entry["value"], entry["again"], entry["agrees"]) == (0.5, 0.9, False)
     assert finding("unknown", unknown_reason="little").to_dict()["rejected_candidates"] == []
-
-
-def test_places_and_recordings_that_are_cut_are_in_the_result():
-    at = replace(place("T3"), indistinguishable_from=("T1", "T2"))
-    made = finding(gap_locations=(at,), truncated_recordings=(TruncatedHeldOutRecording("other", 1.8, 5.0),)).to_dict()
-    assert made["where"][0]["indistinguishable_from"] == ["T1", "T2"]
-    assert made["gap"]["cut"] == [{"recording": "other", "kept": 1.8, "whole": 5.0}]
 
 
 @pytest.mark.parametrize("reason", get_args(UnknownVerdictReason))

@@ -12,7 +12,6 @@ from made_series import series
 
 from yid_ocp.diagnosis import screening
 from yid_ocp.diagnosis.screening import (
-    _basis,
     _coloured,
     _newey_west_covariance,
     _shape_grid,
@@ -59,27 +58,6 @@ def test_shapes_are_tried_evenly_over_their_range(expected, count, values):
 # -- projection and noise ---------------------------------------------------------------------------------------------
 
 
-@cases(
-    "matrix, rank",
-    {
-        "plain": ([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]], 2),
-        "whatever the size": ([[1.0, 1e-12], [1.0, 1e-12], [0.0, 1e-12]], 2),
-        "dependent": ([[1.0, 1.0 + 1e-09], [1.0, 1.0], [0.0, 0.0]], 1),
-        "nearly dependent": ([[1.0, 1.0 + 1e-05], [1.0, 1.0], [0.0, 0.0]], 2),
-        "one without effect": ([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]], 1),
-        "none": ([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]], 0),
-    },
-)
-def test_the_basis_of_what_a_fit_explains(matrix, rank):
-    matrix = np.array(matrix)
-    basis = _basis(matrix)
-    assert basis.shape == (3, rank)
-    np.testing.assert_allclose(basis.T @ basis, np.eye(rank), atol=1e-12)
-    size = np.linalg.norm(matrix, axis=0)
-    left = matrix - basis @ (basis.T @ matrix)
-    assert np.all(np.linalg.norm(left, axis=0) <= 1e-8 * size)
-
-
 def toeplitz(colour, count):
     lags = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
     return np.where(lags < len(colour), np.array(colour)[np.minimum(lags, len(colour) - 1)], 0.0)
@@ -93,15 +71,6 @@ def test_the_noise_of_a_signature_has_the_colour_of_its_rows(colour):
     found = _coloured(columns, parts)
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
     np.testing.assert_array_equal(found, found.T)
-
-
-def test_rows_that_hardly_move_do_not_count():
-    columns = np.array([[1e6], [1.0], [0.5]])
-    assert _coloured(columns, [series([1, 2]), series([0])]) == pytest.approx(1e12, rel=1e-14)
-    assert _coloured(1e-16 * columns, [series([1, 2])]) == pytest.approx(0.0)
-    assert _coloured(1e-16 * columns, [series([0])]) == pytest.approx(1e-20, rel=1e-9, abs=0.0)
-    assert _coloured(columns * [[1.0], [2.0], [0.0]], [series([1, 2])]) == pytest.approx(4.0)
-    assert _coloured(np.zeros((3, 1)), [series([0, 1, 2])]) == pytest.approx(0.0)
 
 
 @pytest.mark.parametrize("count", [1, 4, 9, 17])
@@ -149,17 +118,6 @@ def test_the_range_counts_from_the_neutral_value():
         False,
         True,
     ]
-
-
-def test_amplitudes_that_do_the_same_hide_each_other_less_than_they_add():
-    [found] = candidate_detectability(point([0.0] * 2, signature(PAIR, [[1.0, 1.0], [0.0, 1.0]])), detection_z=2.0)
-    assert found.detectable_amplitudes == {
-        "tilt@world.x": pytest.approx(2 * math.sqrt(2)),
-        "tilt@world.y": pytest.approx(2.0),
-    }
-    [one] = candidate_detectability(point([0.0], signature(PAIR, [[3.0, 0.0]])), detection_z=2.0)
-    assert one.detectable_amplitudes["tilt@world.y"] == math.inf
-    assert one.is_detectable
 
 
 @pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
@@ -253,13 +211,6 @@ def test_two_amplitudes_have_two_degrees_of_freedom():
     assert found.p_value == pytest.approx(float(CHI2.sf(statistic, 2)))
 
 
-def test_amplitudes_that_do_the_same_share_the_step():
-    found = only(PAIR, [[1.0, 1.0], [1.0, 1.0]], [-1.0, -1.0])
-    assert list(found.predicted_values.values()) == pytest.approx([0.5, 0.5])
-    assert found.predicted_chi2_decrease == pytest.approx(2.0)
-    assert found.lm_statistic == pytest.approx(2.0)
-
-
 def test_the_best_of_many_shapes_counts_as_the_best_of_that_many_tries():
     r = np.array([-1.5, -1.5, 0.0, 0.0])
     columns = [np.array(c) for c in ([1.0, 0.0, 1.0, 0.0], [1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0])]
@@ -293,15 +244,6 @@ def test_a_signature_explained_by_another():
     found = confusability_matrix(score_candidates_jointly(at))
     assert found.labels == ("a@x", "b@x")
     np.testing.assert_allclose(found.overlap_fractions, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
-
-
-def test_amplitudes_count_by_half_the_range_that_is_expected():
-    wide = effect("pair@x", amplitude("x", expected=(0.0, 4.0)), amplitude("y", expected=(-1.0, 1.0)))
-    one = effect("one@x", amplitude())
-    at = point([0.0] * 2, signature(wide, np.eye(2)), signature(one, [1.0, 0.0]))
-    np.testing.assert_allclose(
-        confusability_matrix(score_candidates_jointly(at)).overlap_fractions, [[1.0, 4.0 / 5.0], [1.0, 1.0]], atol=1e-12
-    )
 
 
 def test_nothing_is_like_what_moves_nothing():

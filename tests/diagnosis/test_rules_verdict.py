@@ -111,18 +111,6 @@ def test_an_offset_beyond_what_was_stated_needs_no_channel_above_noise(label, p,
     assert has_significant_gap(outcome(), outcome(), LIMITS, ranked, stated) is gap
 
 
-def test_the_level_and_the_smallest_gap_are_thresholds():
-    tests = (outcome(p=0.02, chi2=1.2), outcome())
-    assert has_significant_gap(*tests, Thresholds(significance_level=0.05))
-    assert not has_significant_gap(*tests, Thresholds(significance_level=0.05, min_excess_chi2=0.3))
-    by_one = Thresholds(candidate_significance_level=0.05)
-    assert has_significant_gap(outcome(), outcome(chi2=1.2), by_one, scored(0.03))
-    assert not has_significant_gap(
-        outcome(), outcome(chi2=1.2), replace(by_one, min_channel_excess_chi2=0.3), scored(0.03)
-    )
-    assert not has_significant_gap(outcome(), outcome(chi2=1.2), Thresholds(significance_level=0.05), scored(0.03))
-
-
 # -- is it chance -----------------------------------------------------------------------------------------------------
 
 SILENT = smoothed({FORCE: 0.0, BIAS: 0.0})
@@ -249,11 +237,6 @@ def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
     )
 
 
-def test_without_a_smoother_the_explained_part_is_whole():
-    assert compute_explained_chi2_fraction(fit(), (added(ONE),), None) == 1.0
-    assert compute_explained_chi2_fraction(fit(), (), SPEAKING) == 1.0
-
-
 @cases(
     "costs, chi2, degrees, part",
     {
@@ -271,6 +254,7 @@ def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, par
     first = added(OTHER, fitted=fit([OTHER], cost=1e3))
     found = smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees)
     assert compute_explained_chi2_fraction(nominal, (first, last), found) == pytest.approx(part)
+    assert compute_explained_chi2_fraction(nominal, (first, last), None) == 1.0
 
 
 # -- on which side ----------------------------------------------------------------------------------------------------

@@ -261,15 +261,6 @@ def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
     np.testing.assert_allclose(more - acting, 0.01 * (episode.torque - noise), atol=1e-12)
 
 
-def test_what_is_found_does_not_depend_on_the_tracking_filter(geared, step):
-    recording = recorded(step, 7)
-    one, other = (weighted_at_truth(geared, recording, name) for name in ("proportional", "lqr"))
-    first, second = (problem.evaluate(problem.initial_unknowns) for problem in (one, other))
-    np.testing.assert_allclose(first.residual, second.residual, atol=0.02)
-    size = np.linalg.norm(first.jacobian, axis=0)
-    np.testing.assert_allclose(np.linalg.norm(first.jacobian - second.jacobian, axis=0) / size, 0.0, atol=0.01)
-
-
 @pytest.mark.parametrize("feedback", ["proportional", "lqr"])
 def test_squares_of_innovations_are_the_least_over_all_errors(geared, step, feedback):
     """What sensors and torques must have been wrong by along the smoothed motion, in units of their noise."""

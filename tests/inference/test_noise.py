@@ -80,12 +80,6 @@ def dense_covariance(problem, x, angle):
     return total + angle**2 * by_first @ by_first.T
 
 
-@pytest.fixture
-def point(urdf_folder):
-    problem = problem_of(urdf_folder, encoders=False)
-    return problem, problem.initial_unknowns * 1.1
-
-
 @pytest.mark.parametrize(
     ("how", "effects", "together"),
     [
@@ -197,14 +191,6 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     seen = 1 - (whitening.torque_bias_std[0] / BIAS) ** 2
     assert seen > 0.05
     assert (found[1] - found[0]) / error == pytest.approx(seen, rel=0.01)
-
-
-def test_what_cannot_be_rolled_out_has_no_constant_error(point, monkeypatch):
-    problem, x = point
-    weighted = problem_whitened_at(problem, x)
-    assert len(estimate_recording_torque_biases(weighted, x)[0]) == 2
-    monkeypatch.setattr(type(weighted.predictor), "predict_episode", lambda *_: "it snaps")
-    assert estimate_recording_torque_biases(weighted, x) == [None]
 
 
 def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):

@@ -12,7 +12,7 @@ import threadpoolctl
 
 from yid_ocp.diagnosis.localise import localise_gap
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.inference import smoother, smoother_model
+from yid_ocp.inference import smoother
 from yid_ocp.inference.smoother_model import LinearResidualModel, SmoothedUnknownGroup, _IntervalModel
 
 FORCE, OTHER_FORCE, BIAS = (
@@ -264,12 +264,6 @@ def test_what_is_explained_is_the_fall_of_the_residual_and_the_degrees_that_it_t
     assert found.dof_after == pytest.approx(found.dof_before - taken, rel=1e-8)
 
 
-def test_degrees_never_fall_below_one(monkeypatch):
-    model = made(5, parameters=COUNT * (ROWS + 2) + 5)
-    found = smoothed(monkeypatch, [model])
-    assert found.dof_before == found.dof_after == 1.0
-
-
 def test_traces_hold_the_posterior_with_the_uncertainty_of_parameters(monkeypatch):
     models = [made(5, size=np.array([3.0, 0.0, 0.0])), made(6, size=np.array([3.0, 0.0, 0.0]), recording="second")]
     found = smoothed(monkeypatch, models)
@@ -313,26 +307,6 @@ def test_what_is_said_of_one_unknowns_history_is_that_of_dense_algebra(unknown):
     score, information = smoother.force_log_likelihood_coefficients(model, variance, unknown)
     assert score == pytest.approx(response.T @ reference.inverse @ reference.y, rel=1e-7, abs=1e-9)
     assert information == pytest.approx(response.T @ reference.inverse @ response, rel=1e-7, abs=1e-9)
-
-
-def test_known_noise_of_torques_is_as_strong_at_low_frequencies_as_the_unknown_force_for_it():
-    held, span, decay = 3 * 0.005, 0.1, 0.7
-    errors = SimpleNamespace(sample_of_step=np.repeat(np.arange(20), 3), torque_std=np.array([0.4, 0.2]))
-    errors.torque_bias_std = np.array([0.0, 0.3])
-    course = SimpleNamespace(
-        episode=SimpleNamespace(input_errors=errors),
-        system=SimpleNamespace(driven=("a", "b")),
-        problem=SimpleNamespace(step=SimpleNamespace(time_step=0.005)),
-    )
-    reference = np.array([2.0, 5.0, 4.0])
-    unknowns = SimpleNamespace(names=("b", "free", "a", "encoder.a"), forced=(1, 2, 0), reference=reference)
-    known = smoother_model._torque_noise(course, unknowns, span, decay)
-    # autocovariances of a force with memory, summed over all lags, are those of held white noise
-    lags = 1 + 2 * sum(decay**k for k in range(1, 200))
-    white = np.array([0.4, 0.2]) ** 2 * held / (span * lags)
-    np.testing.assert_allclose(known, [(white[1] + 0.3**2) / 4.0, 0.0, white[0] / 16.0, 0.0], rtol=1e-9)
-    course.episode.input_errors = None
-    np.testing.assert_array_equal(smoother_model._torque_noise(course, unknowns, span, decay), np.zeros(4))
 
 
 HERE, LIKE, OTHER = (

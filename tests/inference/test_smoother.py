@@ -11,8 +11,6 @@ import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.localise import (
-    GapLocation,
-    attribute_gap_to_effects,
     localise_gap,
     smoothed_unknown_z_scores,
 )
@@ -179,13 +177,6 @@ def test_efforts_of_prescribed_joints_say_which(bench):
     assert places[0].gap_share > 0.8
     assert found.explainable_gap_fraction > 0.5
     assert found.gap_origin == "either", "a force at a measured joint and its sensor's bias are the same"
-
-
-def test_effects_take_the_share_that_they_close():
-    before = (GapLocation("T1", 0.9, True, ((0.0, 1.0),)), GapLocation("T2", 0.1, True, ()))
-    found = attribute_gap_to_effects(before, {"world": 0.8}, (GapLocation("T2", 1.0, True, ()),), ((0.5, 1.0),))
-    assert [(p.location, round(p.gap_share, 3)) for p in found] == [("world", 0.8), ("T2", 0.2), ("T1", 0.0)]
-    assert found[0].time_windows == ((0.5, 1.0),)
 
 
 # -- pushes on segments ------------------------------------------------------------------------------------------------
