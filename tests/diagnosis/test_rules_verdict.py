@@ -139,8 +139,12 @@ def test_a_barely_significant_excess_without_shape_is_chance(found, p_values, be
 
 # -- the verdict ------------------------------------------------------------------------------------------------------
 
-SEEN = (visible(ONE),)
-CERTAIN = closed(0.45, 0.4, 0.49)
+SEEN, UNSEEN = (visible(ONE),), (visible(ONE, seen=False),)
+CERTAIN, HALF, HARDLY_HALF = closed(0.45, 0.4, 0.49), closed(0.9, 0.5, 0.95), closed(0.9, 0.49, 0.95)
+NO_INTERVAL = closed(0.9, math.nan, math.nan)
+ALIKE = (added(ONE, [OTHER]),)
+TWO, THREE = (added(ONE), added(OTHER)), (added(ONE), added(OTHER), added(THIRD))
+ONE_LAW, TWO_LOADS = (added(ONE), added(ELSEWHERE)), (added(LOADS[0]), added(LOADS[1]))
 
 
 @cases(
@@ -148,9 +152,9 @@ CERTAIN = closed(0.45, 0.4, 0.49)
     {
         "an effect": ({}, "effect"),
         "too few samples": ({"enough": False}, "insufficient_data"),
-        "nothing could be seen": ({"visible": (visible(ONE, seen=False),)}, "insufficient_data"),
+        "nothing could be seen": ({"visible": UNSEEN}, "insufficient_data"),
         "no candidate": ({"visible": ()}, "insufficient_data"),
-        "one could be seen": ({"visible": (visible(ONE, seen=False), visible(OTHER))}, "effect"),
+        "one could be seen": ({"visible": (*UNSEEN, visible(OTHER))}, "effect"),
         "too few samples and no gap": ({"enough": False, "gap": False}, "insufficient_data"),
         "no gap": ({"gap": False}, "no_gap"),
         "no gap and nothing added": ({"gap": False, "added": ()}, "no_gap"),
@@ -158,55 +162,31 @@ CERTAIN = closed(0.45, 0.4, 0.49)
         "closure sure by too little, however large": ({"total": closed(0.9, 0.04, 1.0)}, "unknown"),
         "lower end at the limit": ({"total": closed(0.9, 0.05, 1.0)}, "unknown"),
         "lower end just above the limit": ({"total": closed(0.06, 0.051, 0.07)}, "effect"),
-        "no interval": ({"total": closed(0.9, math.nan, math.nan)}, "unknown"),
+        "no interval": ({"total": NO_INTERVAL}, "unknown"),
         "smoother explains more than twice as much": ({"explained": 0.49}, "unknown"),
         "smoother explains twice as much": ({"explained": 0.5}, "effect"),
-        "little where it was fitted, half of the held-out gap": (
-            {"explained": 0.1, "total": closed(0.9, 0.5, 0.95)},
-            "effect",
-        ),
-        "little where it was fitted, hardly half of the held-out gap": (
-            {"explained": 0.1, "total": closed(0.9, 0.49, 0.95)},
-            "unknown",
-        ),
-        "little where it was fitted, no interval on held-out motions": (
-            {"explained": 0.1, "total": replace(closed(0.9, math.nan, math.nan), is_decisive=True)},
-            "unknown",
-        ),
+        "little, half of the held-out gap": ({"explained": 0.1, "total": HALF}, "effect"),
+        "little, hardly half of the held-out gap": ({"explained": 0.1, "total": HARDLY_HALF}, "unknown"),
+        "little, no interval": ({"explained": 0.1, "total": replace(NO_INTERVAL, is_decisive=True)}, "unknown"),
         "smoother explains less": ({"explained": 7.0}, "effect"),
-        "two that do the same": ({"added": (added(ONE, [OTHER]),)}, "confusable"),
-        "two that do the same, and more": ({"added": (added(ONE, [OTHER]), added(OTHER))}, "confusable"),
+        "two that do the same": ({"added": ALIKE}, "confusable"),
+        "two that do the same, and more": ({"added": (*ALIKE, added(OTHER))}, "confusable"),
         "only later ones do the same": ({"added": (added(ONE), added(OTHER, [ONE]))}, "effect"),
-        "confusable but explains little": ({"added": (added(ONE, [OTHER]),), "explained": 0.1}, "unknown"),
-        "two explain too little for two": ({"added": (added(ONE), added(OTHER)), "explained": 0.74}, "unknown"),
-        "two explain enough": ({"added": (added(ONE), added(OTHER)), "explained": 0.75}, "effect"),
-        "two explain little where they were fitted, however much of the held-out gap": (
-            {"added": (added(ONE), added(OTHER)), "explained": 0.1, "total": closed(0.95, 0.9, 0.98)},
+        "confusable but explains little": ({"added": ALIKE, "explained": 0.1}, "unknown"),
+        "two explain too little for two": ({"added": TWO, "explained": 0.74}, "unknown"),
+        "two explain enough": ({"added": TWO, "explained": 0.75}, "effect"),
+        "two explain little, however much of the held-out gap": (
+            {"added": TWO, "explained": 0.1, "total": closed(0.95, 0.9, 0.98)},
             "unknown",
         ),
-        "three explain too little for three": (
-            {"added": (added(ONE), added(OTHER), added(THIRD)), "explained": 0.87},
-            "unknown",
-        ),
-        "three explain enough": ({"added": (added(ONE), added(OTHER), added(THIRD)), "explained": 0.88}, "effect"),
-        "one law at two places explains too little": (
-            {"added": (added(ONE), added(ELSEWHERE)), "explained": 0.49},
-            "unknown",
-        ),
-        "one law at two places explains enough": (
-            {"added": (added(ONE), added(ELSEWHERE)), "explained": 0.5},
-            "effect",
-        ),
-        "loads at two places explain too little for two": (
-            {"added": (added(LOADS[0]), added(LOADS[1])), "explained": 0.74},
-            "unknown",
-        ),
-        "loads at two places explain enough for two": (
-            {"added": (added(LOADS[0]), added(LOADS[1])), "explained": 0.75},
-            "effect",
-        ),
+        "three explain too little for three": ({"added": THREE, "explained": 0.87}, "unknown"),
+        "three explain enough": ({"added": THREE, "explained": 0.88}, "effect"),
+        "one law at two places explains too little": ({"added": ONE_LAW, "explained": 0.49}, "unknown"),
+        "one law at two places explains enough": ({"added": ONE_LAW, "explained": 0.5}, "effect"),
+        "loads at two places explain too little for two": ({"added": TWO_LOADS, "explained": 0.74}, "unknown"),
+        "loads at two places explain enough for two": ({"added": TWO_LOADS, "explained": 0.75}, "effect"),
         "one law at two places, half of the held-out gap": (
-            {"added": (added(ONE), added(ELSEWHERE)), "explained": 0.1, "total": closed(0.9, 0.5, 1.0)},
+            {"added": ONE_LAW, "explained": 0.1, "total": HALF},
             "effect",
         ),
         "does not carry over": ({"carried": False}, "unknown"),
@@ -214,10 +194,13 @@ CERTAIN = closed(0.45, 0.4, 0.49)
     },
 )
 def test_the_verdict(changed, verdict):
-    usual = {"gap": True, "visible": SEEN, "added": (added(ONE),), "total": CERTAIN, "enough": True, "explained": 1.0}
-    said = usual | {"carried": True} | changed
-    reason = find_unknown_verdict_reason(said["added"], said["total"], LIMITS, said["explained"], said["carried"])
-    assert decide_verdict(said["gap"], said["enough"], said["visible"], reason, said["added"]) == verdict
+    said = {"gap": True, "visible": SEEN, "added": (added(ONE),), "enough": True} | changed
+    assert decide_verdict(said["gap"], said["enough"], said["visible"], reason_of(changed), said["added"]) == verdict
+
+
+def reason_of(changed):
+    said = {"added": (added(ONE),), "total": CERTAIN, "explained": 1.0, "carried": True} | changed
+    return find_unknown_verdict_reason(said["added"], said["total"], LIMITS, said["explained"], said["carried"])
 
 
 @pytest.mark.parametrize(
@@ -231,10 +214,7 @@ def test_the_verdict(changed, verdict):
     ],
 )
 def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
-    said = {"added": (added(ONE),), "total": CERTAIN, "explained": 1.0, "carried": True} | changed
-    assert (
-        find_unknown_verdict_reason(said["added"], said["total"], LIMITS, said["explained"], said["carried"]) == reason
-    )
+    assert reason_of(changed) == reason
 
 
 @cases(

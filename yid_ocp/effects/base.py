@@ -40,37 +40,21 @@ _CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class ParameterDefinition:
-    """The definition of one parameter of an effect.
-
-    Attributes
-    ----------
-    neutral_value : float
-        Value at which the effect is absent; for an `is_shape_parameter`, any value, from which a search may start.
-    lower, upper : float
-        Physical bounds.
-    prior_range : (float, float)
-        Range that an engineer would expect.
-    is_shape_parameter : bool
-        Whether it has no influence while the others are neutral (a relaxation time, a yield angle).
-    reported_reciprocal : str
-        `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or a factor that
-        goes through infinity when it changes its sign.
-    reciprocal_power : int
-        p in value = reported value^-p.
-    range_scale : callable of (System, location), optional
-        What bounds and range are multiples of at a location; 1 where it is absent.
-    """
+    """The definition of one parameter of an effect, neutral where the effect is absent."""
 
     name: str
     unit: str
-    neutral_value: float
-    lower: float
+    neutral_value: float  # any value for a shape parameter, from which a search may start
+    lower: float  # physical bounds
     upper: float
-    prior_range: tuple[float, float]
+    prior_range: tuple[float, float]  # that an engineer would expect
     description: str
-    is_shape_parameter: bool = False
+    is_shape_parameter: bool = False  # no influence while the others are neutral (a relaxation time, a yield angle)
+    # `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or a factor that
+    # goes through infinity when it changes its sign; p in value = reported value^-p
     reported_reciprocal: str = ""
     reciprocal_power: int = 1
+    # what bounds and range are multiples of at a location; 1 where it is absent
     range_scale: Callable[[System, str], float] | None = None
 
     def _at_location(self, system: System, location: str) -> ParameterDefinition:
@@ -109,49 +93,27 @@ class ReportedParameter:
 
 @dataclass(frozen=True)
 class EffectBase:
-    """The base of all effects, which changes nothing; a kind declares itself and overrides what it does.
-
-    Attributes
-    ----------
-    definitions : tuple of ParameterDefinition
-        Those of `parameters`, at this location.
-    parameters : Parameters
-        Named `kind@location.parameter`.
-    internal_coordinates : mapping of str to casadi.SX
-        Named `kind@location.joint`.
-    arm_joints : tuple of str
-        Names of the arm's joints where `location` is an arm.
-    equation : str
-        Equation that the kind adds, as text.
-    required_excitation : str
-        What a motion has to vary to distinguish the kind from others: one of `EXCITATION_DESCRIPTIONS`, or words that
-        continue "vary ...".
-    required_sensors : frozenset of str
-        Sensors without which the effect is not observable.
-    is_local : bool
-        Whether its presence at one location says nothing about others, as for a mass; not so for friction.
-    possible_locations : callable of System
-        Names of all places where the effect can act, as a function of this module gives them.
-    candidate_locations : callable of System, optional
-        Names of the places that a diagnosis tries; `possible_locations` where it is absent.
-    declared_parameters : tuple of ParameterDefinition
-        What `parameter_definitions` puts at a location.
-    """
+    """The base of all effects, which changes nothing; a kind declares itself and overrides what it does."""
 
     kind: str
     location: str
-    definitions: tuple[ParameterDefinition, ...]
-    parameters: Parameters
-    internal_coordinates: Mapping[str, ca.SX] = field(default_factory=dict)
-    arm_joints: tuple[str, ...] = ()
+    definitions: tuple[ParameterDefinition, ...]  # those of `parameters`, at this location
+    parameters: Parameters  # named `kind@location.parameter`
+    internal_coordinates: Mapping[str, ca.SX] = field(default_factory=dict)  # named `kind@location.joint`
+    arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
 
-    equation: ClassVar[str] = ""
+    equation: ClassVar[str] = ""  # that the kind adds, as text
+    # what a motion has to vary to distinguish the kind from others: one of `EXCITATION_DESCRIPTIONS`, or words that
+    # continue "vary ..."
     required_excitation: ClassVar[str] = ""
-    required_sensors: ClassVar[frozenset[str]] = frozenset()
+    required_sensors: ClassVar[frozenset[str]] = frozenset()  # without which the effect is not observable
+    # whether its presence at one location says nothing about others, as for a mass; not so for friction
     is_local: ClassVar[bool] = False
+    # names of all places where the effect can act, as a function of this module gives them, and of those that a
+    # diagnosis tries: all where absent
     possible_locations: ClassVar[Callable[[System], Collection[str]]]
     candidate_locations: ClassVar[Callable[[System], Collection[str]] | None] = None
-    declared_parameters: ClassVar[tuple[ParameterDefinition, ...]] = ()
+    declared_parameters: ClassVar[tuple[ParameterDefinition, ...]] = ()  # put at a location by `parameter_definitions`
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:

@@ -62,40 +62,20 @@ class SmoothedUnknowns:
 
 @dataclass(frozen=True)
 class SmootherResult:
-    """Result of the weak-constraint smoother: smoothed unknowns and the evidence of every group.
-
-    Attributes
-    ----------
-    group_variance : dict of SmoothedUnknownGroup to float
-        Of every group, in units of its squared reference, at the largest evidence.
-    log_evidence_drop : dict of SmoothedUnknownGroup to float
-        Fall of the log evidence when the group is left out.
-    detectable_std : dict of SmoothedUnknownGroup to float
-        Smallest standard deviation of every group's unknowns that would be noticed, in units of the reference, from the
-        model alone.
-    chi2_before, chi2_after : float
-        r'r, after the free parameters' refit, without and with the unknowns.
-    dof_before, dof_after : float
-        Measurements less what the parameters, and the unknowns, take of the noise.
-    log_evidence : dict of str to float
-        Log evidence of unknown forces and offsets alone ("plant"), of biases alone ("sensor"), of both, above that of
-        neither ("none" is 0).
-    min_log_bayes_factor : float
-        Rise of the log evidence that is more than chance.
-    alternative_groups : dict of SmoothedUnknownGroup to tuple of SmoothedUnknownGroup
-        Groups that would do nearly as well in the place of each group at work.
-    """
+    """Result of the weak-constraint smoother: smoothed unknowns and the evidence of every group."""
 
     smoothed_unknowns: tuple[SmoothedUnknowns, ...]
-    group_variance: dict[SmoothedUnknownGroup, float]
-    log_evidence_drop: dict[SmoothedUnknownGroup, float]
-    detectable_std: dict[SmoothedUnknownGroup, float]
-    chi2_before: float
+    group_variance: dict[SmoothedUnknownGroup, float]  # at the largest evidence [squared reference]
+    log_evidence_drop: dict[SmoothedUnknownGroup, float]  # when the group is left out
+    detectable_std: dict[SmoothedUnknownGroup, float]  # smallest that would be noticed, by the model alone [reference]
+    chi2_before: float  # r'r, after the free parameters' refit, without and with the unknowns
     chi2_after: float
-    dof_before: float
+    dof_before: float  # measurements less what the parameters, and the unknowns, take of the noise
     dof_after: float
+    # of unknown forces and offsets alone ("plant"), biases alone ("sensor") and both, above that of neither ("none", 0)
     log_evidence: dict[str, float]
-    min_log_bayes_factor: float = DEFAULT_SMOOTHER_THRESHOLDS.min_log_bayes_factor
+    min_log_bayes_factor: float = DEFAULT_SMOOTHER_THRESHOLDS.min_log_bayes_factor  # rise that is more than chance
+    # groups that would do nearly as well in the place of each group at work
     alternative_groups: Mapping[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]] = field(default_factory=dict)
 
     @property

@@ -235,61 +235,32 @@ def _generalized_forces_per_newton(system: System, theta: Array, q: Array, segme
 
 @dataclass(frozen=True)
 class _IntervalModel:
-    """Linear model of one interval: residual, transition of the state at its beginning, input of the unknowns.
+    """Linear model of one interval: residual, transition of the state at its beginning, input of the unknowns."""
 
-    Attributes
-    ----------
-    negative_residual_jacobian : ndarray, shape (r, 1 + ntheta)
-        Whitened residual with the opposite sign, then its derivative by the free parameters, with that sign too.
-    state_jacobian, unknown_jacobian : ndarray, shape (r, ns), (r, nd)
-    state_transition, unknown_input_matrix : ndarray, shape (ns, ns), (ns, nd)
-    unreachable_products : ndarray, shape (1 + ntheta, 1 + ntheta)
-        Products of what no state or unknown can reach.
-    sample_count : int
-        Before rows were compressed.
-    """
-
+    # whitened residual, then its derivative by the free parameters, both with the opposite sign, shape (r, 1 + ntheta)
     negative_residual_jacobian: Array
-    state_jacobian: Array
-    unknown_jacobian: Array
-    state_transition: Array
-    unknown_input_matrix: Array
-    unreachable_products: Array
-    sample_count: int
+    state_jacobian: Array  # shape (r, ns)
+    unknown_jacobian: Array  # shape (r, nd)
+    state_transition: Array  # shape (ns, ns)
+    unknown_input_matrix: Array  # shape (ns, nd)
+    unreachable_products: Array  # of what no state or unknown can reach, shape (1 + ntheta, 1 + ntheta)
+    sample_count: int  # before rows were compressed
 
 
 @dataclass(frozen=True)
 class LinearResidualModel:
-    """Linear state-space model of the residual of one recording, interval by interval.
-
-    Attributes
-    ----------
-    interval_edges : ndarray, shape (J + 1,)
-        Beginnings of the intervals and the end [s].
-    unknown_names, unknown_groups : tuple, length nd
-        Coordinate, grasp or channel of each unknown, and its group.
-    reference_std : ndarray, shape (nd,)
-        Reference standard deviation of each; the matrices are by unknowns in this unit.
-    initial_state_jacobian : ndarray, shape (ns, nd)
-        How the first state follows the first unknowns.
-    initial_state_std : ndarray, shape (ns,)
-        Standard deviation of the first state beside that.
-    interval_correlation : float
-        Correlation of an unknown with itself one interval later.
-    torque_noise_variance : ndarray, shape (nd,)
-        Variance that each has whatever its group's is: noise of recorded torques [squared reference].
-    """
+    """Linear state-space model of the residual of one recording, interval by interval."""
 
     recording: str
     intervals: tuple[_IntervalModel, ...]
-    interval_edges: Array
-    unknown_names: tuple[str, ...]
+    interval_edges: Array  # beginnings of the intervals and the end, shape (J + 1,) [s]
+    unknown_names: tuple[str, ...]  # coordinate, grasp or channel of each unknown
     unknown_groups: tuple[SmoothedUnknownGroup, ...]
-    reference_std: Array
-    initial_state_jacobian: Array
-    initial_state_std: Array
-    interval_correlation: float
-    torque_noise_variance: Array
+    reference_std: Array  # shape (nd,): the matrices are by unknowns in this unit
+    initial_state_jacobian: Array  # how the first state follows the first unknowns, shape (ns, nd)
+    initial_state_std: Array  # of the first state beside that, shape (ns,)
+    interval_correlation: float  # of an unknown with itself one interval later
+    torque_noise_variance: Array  # that each has whatever its group's is, shape (nd,) [squared reference]
 
     def unknown_variances_from_groups(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
         """Variances of all unknowns from those of their groups and torque noise, shape (nd,) [squared reference]."""

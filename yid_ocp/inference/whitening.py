@@ -92,27 +92,13 @@ class _SmoothedInputErrors:
 
 @dataclass(frozen=True)
 class WhiteningFilter:
-    """Kalman filter, linearized along one rollout, that whitens the residual of a recording.
+    """Kalman filter, linearized along one rollout, that whitens the residual of a recording."""
 
-    Attributes
-    ----------
-    filter_steps : tuple
-        One for every node.
-    input_errors : InputErrorModel
-        With the values of b and w about which it is linearised.
-    initial_covariance : ndarray, shape (na, na)
-        Of (d, w, b) before all measurements.
-    state_mask : ndarray of bool, shape (nx,)
-        States that d is made up of.
-    torque_bias_std : ndarray, shape (nu,)
-        Standard deviation of b after all measurements [N m].
-    """
-
-    filter_steps: tuple[_FilterStep, ...]
-    input_errors: InputErrorModel
-    initial_covariance: Array
-    state_mask: BoolArray
-    torque_bias_std: Array
+    filter_steps: tuple[_FilterStep, ...]  # one for every node
+    input_errors: InputErrorModel  # with the values of b and w about which it is linearised
+    initial_covariance: Array  # of (d, w, b) before all measurements, shape (na, na)
+    state_mask: BoolArray  # states that d is made up of, shape (nx,)
+    torque_bias_std: Array  # of b after all measurements, shape (nu,) [N m]
 
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Normalized innovations (r, c) of the Kalman filter, and the torque biases from all rows (nu, c) [N m].
