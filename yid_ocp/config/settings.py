@@ -23,7 +23,7 @@ from yid_ocp.inference.null_test import ExcessResidualCriteria
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.model.objects import OBJECT_KINDS, ObjectKind
 from yid_ocp.model.objects.base import MountSettings
-from yid_ocp.model.servos_and_springs import CommandInterpolation
+from yid_ocp.model.servos_and_springs import PositionServoOptions
 from yid_ocp.options import OptionInfo, RegistryChoice, dataclass_options, split_annotated
 from yid_ocp.planning.joint_paths import PlanOptions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
@@ -99,19 +99,6 @@ class EffectSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ServoSettings:
-    """How position servos process commands; gains and limits are parameters such as JOINT.servo_gain."""
-
-    command_interpolation: Annotated[
-        CommandInterpolation,
-        OptionInfo("what a servo follows between two commands: the last one held, or straight lines"),
-    ] = "held"
-    has_gravity_compensation: Annotated[
-        bool, OptionInfo("whether the controller carries the robot's own weight, so that the servos need not")
-    ] = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class ArmSettings:
     """Moving joints of the robot and how each is driven."""
 
@@ -124,7 +111,9 @@ class ArmSettings:
             "encoders correct"
         ),
     ] = "driven"
-    servo: Annotated[ServoSettings, OptionInfo("of the mode servo")] = ServoSettings()
+    servo: Annotated[PositionServoOptions, OptionInfo("of the mode servo")] = field(
+        default_factory=PositionServoOptions
+    )
     passive_joints: Annotated[
         tuple[str, ...], OptionInfo("joints among them that nothing drives, whatever the mode")
     ] = ()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import casadi as ca
 
 from yid_ocp.model.mechanism import Joint, Mechanism
 from yid_ocp.model.parameters import Parameter
+from yid_ocp.options import OptionInfo
 
 CommandInterpolation = Literal["held", "interpolated"]
 TORQUE_SATURATION_EXPONENT = 16
@@ -33,10 +34,15 @@ class RobotJointSpring:
 
 @dataclass(frozen=True)
 class PositionServoOptions:
-    """What servos follow between two commands, and whether the controller carries the robot's own weight."""
+    """How position servos process commands; gains and limits are parameters such as JOINT.servo_gain."""
 
-    command_interpolation: CommandInterpolation = "held"
-    has_gravity_compensation: bool = False
+    command_interpolation: Annotated[
+        CommandInterpolation,
+        OptionInfo("what a servo follows between two commands: the last one held, or straight lines"),
+    ] = "held"
+    has_gravity_compensation: Annotated[
+        bool, OptionInfo("whether the controller carries the robot's own weight, so that the servos need not")
+    ] = False
 
 
 @dataclass(frozen=True)

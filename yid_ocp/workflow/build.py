@@ -23,7 +23,7 @@ from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.objects.base import CableTopology, ClampedObject
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
-from yid_ocp.model.servos_and_springs import PositionServoOptions, RobotJointSpring
+from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.workflow.run_inputs import (
@@ -93,7 +93,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
             gravity=model.gravity,
             point_frames=model.points,
             springs={name: RobotJointSpring(s.stiffness, s.rest_position) for name, s in model.springs.items()},
-            servos=PositionServoOptions(**vars(arms.servo)) if mode == "servo" else None,
+            servos=arms.servo if mode == "servo" else None,
         )
     if any(said.marker_reference_pose for said in model.frames.values()) and run.recordings.estimate:
         # where markers sit when nobody says which recording is meant
