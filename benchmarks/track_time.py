@@ -65,7 +65,7 @@ def main() -> int:
 
 def _film(run: RunSettings, folder: Path, count: int = 0) -> Recording:
     """Write a virtual film as depth images, over and over until it has so many frames; the joints' recording."""
-    recording, made = simulate_recording_and_camera_frames(run, build_system(run), run.track.virtual_frames)
+    recording, made = simulate_recording_and_camera_frames(run, build_system(run))
     write_frame_folder(made.sequence, folder)
     joints, lens, o3d = recording.joints, made.sequence.intrinsics, import_open3d()
     assert joints is not None

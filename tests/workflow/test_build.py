@@ -47,7 +47,7 @@ def test_parameters_of_a_run(written):
             "model: {object: {kind: foam_y}}\n"
             "parameters:\n"
             "  T*.bend: {initial: 5, free: true, bounds: [0, 50]}\n"
-            "  T2.bend: {initial: 7, prior_std: 2.0}\n"
+            "  T2.bend: {initial: 7}\n"
             "  T1.mass: {initial: 0.07}\n"
         )
     )
@@ -55,7 +55,6 @@ def test_parameters_of_a_run(written):
     assert [system.parameters[f"T{i}.bend"].value for i in (1, 2, 3)] == [5, 7, 5]
     assert system.parameters["T3.bend"].upper == 50
     assert system.parameters["T1.mass"].value == 0.07
-    assert problem_options(run, system).prior_stds == {"T2.bend": 2.0}
 
 
 def test_an_object_of_segments_on_a_robots_hand(built):

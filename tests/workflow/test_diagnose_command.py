@@ -247,12 +247,11 @@ def test_every_row_is_so_many_times_larger_and_the_fit_the_same(problem_of):
         assert other.cost == pytest.approx(one.cost / SHARE**2)
 
 
-def test_a_whole_fraction_and_no_weak_prior_stay_as_they_are(problem_of):
-    problem = problem_of("prescribed", weak_prior_factor=0.0)
-    assert _with_noise_only_stds(problem, settings(1.0)) is problem
-    shrunk = _with_noise_only_stds(problem, settings())
+def test_no_weak_prior_stays_none_and_encoders_without_noise_need_none(problem_of):
+    sensors = {"points": STATED["points"], "joints.effort": SensorOptions(std=0.3)}
+    shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, None, weak_prior_factor=0.0), settings())
     assert shrunk.options.weak_prior_factor == 0.0
-    assert shrunk.residual_rows == problem.residual_rows
+    assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)
 
 
 @pytest.mark.parametrize(
@@ -269,10 +268,3 @@ def test_a_whole_fraction_and_no_weak_prior_stay_as_they_are(problem_of):
 def test_a_fraction_of_what_is_not_stated_is_refused(problem_of, role, group, entry, words):
     with pytest.raises(ConfigError, match=words):
         _with_noise_only_stds(problem_of(role, STATED | {group: entry}), settings())
-
-
-@pytest.mark.parametrize("recorded", [None, 0.0])
-def test_encoders_without_noise_need_none(problem_of, recorded):
-    sensors = {"points": STATED["points"], "joints.effort": SensorOptions(std=0.3)}
-    shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, recorded), settings())
-    assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import OutputSettings, RecordingSettings, RunSettings, VirtualFramesSettings, dump_config
+from yid_ocp.config.settings import OutputSettings, RecordingSettings, RunSettings, dump_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, OutputError, YidError
@@ -248,15 +248,13 @@ def _truth_errors(system: System, found: TrackResult, made: VirtualFrames) -> Ma
 # -- frames -----------------------------------------------------------------------------------------------------------
 
 
-def simulate_recording_and_camera_frames(
-    run: RunSettings, system: System, settings: VirtualFramesSettings
-) -> tuple[Recording, VirtualFrames]:
+def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tuple[Recording, VirtualFrames]:
     """Recording and camera frames of a virtual experiment, with initial parameter values as truth."""
     from yid_ocp.virtual.experiment import VirtualExperiment, record_simulation
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
-    grasps = [grasp.name for grasp in system.grasps]
+    settings, grasps = run.track.virtual_frames, [grasp.name for grasp in system.grasps]
     for name in settings.grasp_start_offsets:
         if name not in grasps:
             where = ("track", "virtual_frames", "grasp_start_offsets", name)
@@ -273,12 +271,8 @@ def simulate_recording_and_camera_frames(
         )
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
         recording = record_simulation(system, None, experiment, truth)
-        timing = FrameTiming(
-            settings.frame_rate,
-            dropped_fraction=settings.dropped_fraction,
-            latency=settings.latency,
-            latency_std=settings.latency_std,
-        )
+        late = (settings.latency, settings.latency_std)
+        timing = FrameTiming(settings.frame_rate, settings.dropped_fraction, *late)
         pose = look_at_pose(settings.camera_position, settings.camera_target)
         depth = DepthCamera(outlier_probability=settings.outlier_fraction)
         camera = VirtualCamera(pose, depth, timing, seed=settings.seed)
@@ -378,7 +372,7 @@ def _frame_tasks(
         frames = Path(said.frames_path)
     else:
         progress.begin_stage("simulating a virtual experiment in MuJoCo")
-        recording, made = simulate_recording_and_camera_frames(run, system, said.virtual_frames)
+        recording, made = simulate_recording_and_camera_frames(run, system)
         progress.begin_stage("filming it")
         work.mkdir(parents=True, exist_ok=True)
         frames, joints = own_files = work / "frames", work / f"{run.name}.h5"
