@@ -410,17 +410,7 @@ class OutputSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class RunSettings:
-    """Resolved settings of one run: all sections of its configuration file.
-
-    Attributes
-    ----------
-    name : str
-        Stem of the configuration file.
-    config_file : str
-        Path of the configuration file, empty for none.
-    key_locations : mapping of key path to text
-        File and line of every key, for error messages.
-    """
+    """Resolved settings of one run: all sections of its configuration file."""
 
     description: Annotated[str, OptionInfo("one sentence for the report")] = ""
     plugins: Annotated[
@@ -444,8 +434,9 @@ class RunSettings:
     track: Annotated[TrackSettings, OptionInfo("how a camera's frames are tracked")] = TrackSettings()
     plan: Annotated[PlanSettings, OptionInfo("which motion is planned")] = PlanSettings()
     output: Annotated[OutputSettings, OptionInfo("where results go")] = OutputSettings()
-    name: str = "run"
-    config_file: str = field(default="", compare=False)
+    name: str = "run"  # stem of the configuration file
+    config_file: str = field(default="", compare=False)  # its path, empty for none
+    # file and line of every key, for error messages
     key_locations: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
     def describe_location(self, *path: str | int) -> str:

@@ -163,14 +163,9 @@ def _shown_frames(system: System) -> list[str]:
 
 
 def make_animation(title: str, told: Sequence[ModelTrajectory], recording: Recording | None = None) -> Animation:
-    """Animation of model trajectories and the recorded motion, with at most `_MAX_FRAMES` frames.
+    """Animation of model trajectories, the first of which fixes clock and joints, and of the recorded motion.
 
-    Parameters
-    ----------
-    told : sequence of ModelTrajectory
-        At least one; the first fixes the clock and the joints.
-    recording : Recording, optional
-        Its points, and its arms where it recorded their angles.
+    Of a recording its points are shown, and its arms where it recorded their angles; at most `_MAX_FRAMES` frames.
     """
     t = _frame_times(told[0].t)
     motions = []

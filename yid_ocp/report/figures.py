@@ -129,9 +129,8 @@ def prediction_and_residual_plots(
     ----------
     t, measured, std : ndarray, shape (M,)
     lines : mapping of name to ndarray, shape (M,)
-        Predictions at the times of the measurements.
     course : (t (K,), value (K,)), optional
-        The first of them at more times, for what is measured seldom.
+        The first of the lines at more times, for what is measured seldom.
     """
     seen = np.isfinite(measured) & np.isfinite(std)
     factor, shown = display_scale_and_unit(unit)

@@ -118,7 +118,7 @@ def build_problem(
     Parameters
     ----------
     step : Step, optional
-        Compiled before; built when absent.
+        Built when absent.
     reference_recordings : sequence of Recording
         That will be predicted only; the options say where markers sit in them.
 
@@ -221,7 +221,7 @@ def _check_recordings(
     """Recordings to estimate on and to hold out, without duplicates and cut at gaps, and all issues found."""
     doubts: list[Issue] = []
     kept: tuple[list[Recording], list[Recording]] = [], []
-    arm = None if cable is not None else _joints_model(system)
+    arm = None if cable is not None else RecordedJointsModel.from_system(system, system.parameters.vector())
     anywhere = run.problem.initial_state != "equilibrium" or not system.unprescribed_coordinate_indices
     clamped = () if cable is None else cable.clamped_vertex_names
     for role, recordings in zip(kept, _once(run, estimate, held_out, doubts), strict=True):
@@ -249,13 +249,10 @@ def single_recording_issues(run: RunSettings, system: System, recording: Recordi
     """All issues of one recording, which is not cut; errors as `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
-    found += _beside_the_model(run, system, _joints_model(system), None, recording)
+    arm = RecordedJointsModel.from_system(system, system.parameters.vector())
+    found += _beside_the_model(run, system, arm, None, recording)
     _raise_for_issues(run, found)
     return found
-
-
-def _joints_model(system: System) -> RecordedJointsModel | None:
-    return RecordedJointsModel.from_system(system, system.parameters.vector())
 
 
 def _choice(run: RunSettings) -> Callable[[str], SensorOptions]:
