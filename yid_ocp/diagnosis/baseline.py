@@ -23,7 +23,7 @@ from yid_ocp.analysis.estimate_history import (
 )
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.hypotheses import neutral_effect_parameter_values
-from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel
+from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel, held_out_channel_errors
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, SolverError, YidError, nearest_name_hint
@@ -31,7 +31,6 @@ from yid_ocp.inference.linearized_residual import linearization_without_weak_pri
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
-from yid_ocp.problem.prediction_errors import rmse_by_channel
 from yid_ocp.progress import Progress
 from yid_ocp.solvers import Status
 
@@ -137,11 +136,9 @@ class BaselineData:
             return None
         plain = _plain_variance(fit)
         weighted = dict(zip(prior.parameter_names, np.diag(prior.covariance), strict=True))
-        names = [name for name in baseline.parameter_names if name in weighted]
-        shifts = []
-        for name, value, std in zip(baseline.parameter_names, baseline.values, baseline.std, strict=True):
-            if name not in names:
-                continue
+        every = zip(baseline.parameter_names, baseline.values, baseline.std, strict=True)
+        known_before, shifts = [entry for entry in every if entry[0] in weighted], []
+        for name, value, std in known_before:
             # in units of noise alone a problem's variances are smaller, all by one factor
             now, c0 = fit.values[name], float(std) ** 2
             c = plain[name] * c0 / float(weighted[name])
@@ -153,7 +150,7 @@ class BaselineData:
                 score = (now - float(value)) / math.sqrt(variance)
                 p = float(2 * scipy.stats.norm.sf(abs(score)))
             known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, fit.std[name])
-            shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(names)))
+            shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
         between = (self.between_runs_chi2, self.between_runs_p_value)
         labels = tuple(baseline.effects)
         return BaselineComparison(self.baseline_runs, baseline.is_fit_adequate, labels, *between, tuple(shifts))
@@ -194,15 +191,12 @@ class BaselineData:
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
     """Variance of every unknown by the stated noise and priors alone."""
-    problem, evaluation = fit.problem, fit.evaluation
-    if evaluation.jacobian is None:
-        evaluation = problem.evaluate(problem.vector(fit.values), equilibrium_guesses=evaluation.equilibrium_guesses)
-    jacobian = linearization_without_weak_priors(problem, evaluation)[1] * problem.unknown_scales
+    problem = fit.problem
+    jacobian = linearization_without_weak_priors(problem, fit.evaluation)[1] * problem.unknown_scales
     variance = np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14, hermitian=True)) * problem.unknown_scales**2
     return dict(zip(problem.unknown_names, map(float, variance), strict=True))
 
 
-_ParameterValues = Mapping[str, float]
 _ChannelErrors = Mapping[str, tuple[float, str]]
 """Root mean square error and its unit by channel."""
 
@@ -260,7 +254,7 @@ class CounterfactualTest:
 
 
 def _predicted(
-    last: RefittedModel, recordings: Sequence[Recording], plain: _ParameterValues, other: _ParameterValues
+    last: RefittedModel, recordings: Sequence[Recording], plain: Mapping[str, float], other: Mapping[str, float]
 ) -> _PredictionErrors:
     """Errors by two models; parameters that neither names are the problem's own, and effects neutral."""
     try:
@@ -283,15 +277,14 @@ def _on(last: RefittedModel, recordings: Sequence[Recording]) -> EstimationProbl
     return EstimationProblem(own.step, recordings, own.shared_parameters, options, values, recordings)
 
 
-def _errors(problem: EstimationProblem, values: _ParameterValues, effects: Sequence[EffectBase]) -> _ChannelErrors:
+def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Sequence[EffectBase]) -> _ChannelErrors:
     if problem.has_process_noise:
         problem = problem_whitened_by_sensor_noise(problem)
     found = problem.predict_held_out(problem.vector({**neutral_effect_parameter_values(effects), **values}))
     failed = [result for _, result in found if isinstance(result, str)]
     if failed:
         raise SolverError(f"a recording cannot be predicted: {failed[0]}")
-    errors = rmse_by_channel([r for _, r in found if not isinstance(r, str)], [episode for episode, _ in found])
-    return {channel: (float(entry["rmse"]), str(entry["unit"])) for channel, entry in errors.items()}
+    return held_out_channel_errors(found)
 
 
 def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared: Sequence[str]) -> dict[str, float]:

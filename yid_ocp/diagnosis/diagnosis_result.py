@@ -227,7 +227,7 @@ def final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     the shared free parameters; those not known at all are left out.
     """
     fit = finding.final_model
-    problem, shared, finish = fit.problem, fit.problem.shared_parameters, fit.evaluation
+    problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.detectability} - {effect.label for effect in fit.effects}
     theta, _ = problem.split(problem.vector(fit.values), 0)
     found = {}
@@ -236,9 +236,7 @@ def final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
             free = entry.name in shared
             std = to_json_types(fit.std[entry.name]) if free else 0.0
             found[entry.name] = {"value": float(value), "std": std, "unit": entry.unit, "free": free}
-    if finish.jacobian is None:
-        finish = problem.evaluate(problem.vector(fit.values), equilibrium_guesses=finish.equilibrium_guesses)
-    matrix, _ = unknowns_covariance_and_reduced_chi2(problem, finish)
+    matrix, _ = unknowns_covariance_and_reduced_chi2(problem, fit.evaluation)
     covariance = covariance_to_dict(shared, matrix[: len(shared), : len(shared)], [fit.std[name] for name in shared])
     return {"parameters": found, "covariance": covariance}
 

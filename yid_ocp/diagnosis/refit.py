@@ -27,7 +27,7 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
 from yid_ocp.problem.prediction_errors import rmse_by_channel
 from yid_ocp.progress import ParallelProgress, Progress
@@ -406,10 +406,15 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
     if problem.has_process_noise:
         # in metres and radians a prediction has its torques as they were recorded, less their offsets
         found = problem_whitened_by_sensor_noise(problem).predict_held_out(x)
+    channels, contradiction = held_out_channel_errors(found), _contradiction(problem, x)
+    return HeldOutLoss(np.concatenate(squares), np.concatenate(counts), channels, contradiction)
+
+
+def held_out_channel_errors(found: Sequence[tuple[Episode, EpisodePrediction | str]]) -> dict[str, tuple[float, str]]:
+    """Root mean square error and its unit by channel, over the held-out recordings that could be predicted."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_by_channel(*map(list, zip(*predicted, strict=True))) if predicted else {}
-    channels = {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
-    return HeldOutLoss(np.concatenate(squares), np.concatenate(counts), channels, _contradiction(problem, x))
+    return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
 
 
 def _contradiction(problem: EstimationProblem, x: Array) -> float:
