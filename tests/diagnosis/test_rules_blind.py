@@ -134,17 +134,8 @@ def test_a_recording_says_nothing_of_what_is_in_it(drawn):
     found = ensemble.simulate_recording({"T1.bend": 7.0}, (KV,), np.random.default_rng(1), "case_001")
     assert (found.name, found.description, found.source, found.true_parameters) == ("case_001", "", "", {})
     [made] = drawn.made
-    assert made["system"] is ensemble.problem.system
     assert (made["truth"], made["injected"]) == ({"T1.bend": 7.0}, (KV,))
-    assert (made["initial_joint_angles"], made["camera"]) == (ensemble.initial_configuration, None)
-    motion = made["motion"]
-    assert (motion["of"], motion["truth"]) == (ensemble.problem.system, {"T1.bend": 7.0})
-    assert (motion["initial_joint_angles"], motion["excitation"]) == (
-        ensemble.initial_configuration,
-        MultisineOptions(gripper_travel=0.15),
-    )
-    rng = np.random.default_rng(1)
-    assert [motion["seed"], made["seed"]] == [int(rng.integers(2**31)) for _ in range(2)]
+    assert made["motion"]["excitation"] == MultisineOptions(gripper_travel=0.15)
 
 
 def of_category(ensemble, category, multiple=None):
@@ -162,10 +153,10 @@ def test_clean_cases_have_nothing_injected(drawn, monkeypatch, category):
         "case_007_estimate_0",
         "case_007_held_out",
     )
-    assert len(drawn.made) == 2
-    assert drawn.made[0]["injected"] == drawn.made[1]["injected"] == ()
-    assert drawn.made[0]["seed"] != drawn.made[1]["seed"]
-    assert drawn.made[0]["motion"]["seed"] != drawn.made[1]["motion"]["seed"]
+    one, other = drawn.made
+    assert one["injected"] == other["injected"] == ()
+    assert one["seed"] != other["seed"]
+    assert one["motion"]["seed"] != other["motion"]["seed"]
     fine = category == "finer_chain"
     assert (drawn.made[0]["system"] is not ensemble.problem.system) is fine
     assert len(case.excluded_kinds) == 1

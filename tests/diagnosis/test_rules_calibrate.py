@@ -111,11 +111,11 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
 
 def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
     clean = [case("null", "no_gap", open=STATISTICS | {"candidate": p}) for p in (0.4, 2.345e-5, 3e-3)]
-    effects = [case("single", "effect", DAMPER, multiple=3.0, statistics={"candidate": p}) for p in (1e-9, 1e-3)]
+    effects = [case("single", "effect", DAMPER, multiple=3.0, statistics={"candidate": p}) for p in (1e-9, 1e-8, 1e-3)]
     labels, marks, answers = zip(*clean, *effects, strict=True)
     found = calibrate_thresholds(labels, marks, answers)
     assert found["rules"]["candidate"]["quantile"] == 2.345e-5
-    assert found["rules"]["candidate"]["effects_beyond"]["3"]["count"] == 1
+    assert found["rules"]["candidate"]["effects_beyond"]["3"]["count"] == 2
     assert found["settings"]["candidate_significance_level"] == 2.3e-5
     few = calibrate_thresholds(labels[:1], marks[:1], answers[:1])
     assert few["settings"]["candidate_significance_level"] == 1e-4, "no less sure than odds that convince"

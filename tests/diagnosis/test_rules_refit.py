@@ -300,7 +300,6 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", "", LIMITS)
     assert by_kind["offset"][2] == {"k": 3.0}
     assert heard.stages == ["refitting with each of 3 effects beside base@x"]
-    assert [part[:2] for part in heard.parts] == [(0, 3), (1, 3), (2, 3), (3, 3)]
     assert sorted(text for done, _, text in heard.parts if done) == [
         "no fit with third@x",
         "refitted with friction@elbow: held-out chi2/n 1.234",

@@ -200,46 +200,27 @@ def test_one_that_is_not_sure_to_be_there_counts_only_where_no_other_comes_near(
 
 
 @pytest.mark.parametrize(
-    ("expected", "value", "odd"),
+    ("expected", "within", "beyond"),
     [
-        ((0.1, 1.0), 0.05, False),
-        ((0.1, 1.0), 0.049, True),
-        ((0.1, 1.0), 2.0, False),
-        ((0.1, 1.0), 2.01, True),
-        ((0.0, 1.0), -1.0, False),
-        ((0.0, 1.0), -1.01, True),
-        ((0.0, 1.0), 2.0, False),
-        ((0.0, 1.0), 2.01, True),
-        ((-3.0, -1.0), 1.0, False),
-        ((-3.0, -1.0), 1.01, True),
-        ((-3.0, -1.0), -5.0, False),
-        ((-3.0, -1.0), -5.01, True),
+        ((0.1, 1.0), (0.05, 2.0), (0.049, 2.01)),
+        ((0.0, 1.0), (-1.0, 2.0), (-1.01, 2.01)),
+        ((-3.0, -1.0), (-5.0, 1.0), (-5.01, 1.01)),
     ],
 )
-def test_a_shape_may_leave_its_range_by_a_factor_or_a_width(expected, value, odd):
+def test_a_shape_may_leave_its_range_by_a_factor_or_a_width(expected, within, beyond):
     of = effect("wide@x", amplitude(), shape("s", expected=expected, lower=-math.inf))
-    assert _is_shape_outside_prior(of, fit([of], values={"wide@x.s": value}, std={"wide@x.s": 0.0}), LIMITS) is odd
+    exact = [fit([of], values={"wide@x.s": value}, std={"wide@x.s": 0.0}) for value in (*within, *beyond)]
+    assert [_is_shape_outside_prior(of, found, LIMITS) for found in exact] == [False, False, True, True]
 
 
 def test_a_shape_that_may_as_well_lie_within_is_not_out_of_it():
-    """By two standard deviations on either side; what they are not known of is taken as it is."""
+    """By two standard deviations; a fit with such a shape counts as one with a shape to be expected."""
     of = effect("wide@x", amplitude(), shape("s", expected=(0.1, 1.0), lower=-math.inf))
-
-    def odd(value, std, **limits):
-        found = fit([of], values={"wide@x.s": value}, std={"wide@x.s": std})
-        return _is_shape_outside_prior(of, found, Thresholds(**limits))
-
-    assert [odd(3.0, std) for std in (0.49, 0.51, math.inf)] == [True, False, False]
-    assert [odd(0.02, std) for std in (0.014, 0.016)] == [True, False]
-    assert odd(3.0, 0.51, min_z=1.0)
-    # a fit with such a shape counts as one with a shape to be expected
-    values, near = (
-        {"wide@x.a": 9.0, "wide@x.s": 3.0},
-        fit([effect("other@x", amplitude())], loss(1.04, 1.04), values={"other@x.a": 1.0}),
-    )
-    sure, unsure = (fit([of], loss(1.0, 1.0), values=values, std={"wide@x.s": std}) for std in (0.1, 2.0))
-    assert _near_best_models([sure, near])[0] is near
-    assert _near_best_models([unsure, near])[0] is unsure
+    near = fit([effect("other@x", amplitude())], loss(1.04, 1.04), values={"other@x.a": 1.0})
+    for std, odd in ((0.1, True), (0.49, True), (0.51, False), (math.inf, False)):
+        found = fit([of], loss(1.0, 1.0), values={"wide@x.a": 9.0, "wide@x.s": 3.0}, std={"wide@x.s": std})
+        assert _is_shape_outside_prior(of, found, LIMITS) is odd
+        assert (_near_best_models([found, near])[0] is near) is odd
 
 
 @pytest.mark.parametrize(
@@ -562,6 +543,13 @@ def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
     assert "left a@x out again: the others do as well" in rounds.heard.stages
 
 
+def test_an_effect_that_is_not_there_any_more_beside_another_is_left_out_again(monkeypatch):
+    rounds = Rounds(monkeypatch, GROWING)
+    gone = {"a@x": 2}
+    monkeypatch.setattr(select, "_is_there", lambda _, full, of, limits: gone.get(of.label) != len(full.effects))
+    assert rounds.compose(max_effects=2)[1] == ["b"]
+
+
 def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "c": (1.3, 1.5)}, p_values=(1e-9, 1e-9, 1e-9))
     rounds.scores = rounds.scores[:2]
@@ -676,21 +664,17 @@ def test_an_effect_that_is_not_there_is_not_added(monkeypatch):
     assert Rounds(monkeypatch, tied, absent=("a",)).compose()[1] == ["b"], "another that does as well may be there"
 
 
+def seen_by_tip(mean, rmse):
+    return loss(mean, mean, channels={"tip": (rmse, "m")})
+
+
 @cases(
     "before, after, counts",
     {
         "all channels": (loss(3.0, 3.0), loss(2.93, 2.93), True),
         "too little": (loss(3.0, 3.0), loss(2.95, 2.95), False),
-        "one channel": (
-            loss(3.0, 3.0, channels={"tip": (0.001, "m")}),
-            loss(2.99, 2.99, channels={"tip": (0.00098, "m")}),
-            True,
-        ),
-        "too little of one": (
-            loss(3.0, 3.0, channels={"tip": (0.001, "m")}),
-            loss(2.99, 2.99, channels={"tip": (0.000995, "m")}),
-            False,
-        ),
+        "one channel": (seen_by_tip(3.0, 0.001), seen_by_tip(2.99, 0.00098), True),
+        "too little of one": (seen_by_tip(3.0, 0.001), seen_by_tip(2.99, 0.000995), False),
         "far likelier": (loss(0.99, 1.04), loss(0.93, 0.98), True),
         "not predicted before": (loss(math.inf, 3.0), loss(2.0, 2.0), True),
     },

@@ -97,6 +97,11 @@ def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, h
     )
 
 
+def test_a_candidate_alone_has_to_be_surer_than_all_residuals():
+    sure = Thresholds(candidate_significance_level=1e-4, significance_level=0.05)
+    assert [has_significant_gap(outcome(), outcome(chi2=1.2), sure, scored(p)) for p in (9e-5, 0.03)] == [True, False]
+
+
 @cases(
     "label, p, stated, gap",
     {

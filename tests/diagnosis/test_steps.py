@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from made_series import series
 
 from yid_ocp.diagnosis import (
     candidate_detectability,
@@ -17,20 +18,10 @@ from yid_ocp.diagnosis import (
 )
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.screening import AllCandidatesLinearization, _EffectSignature
-from yid_ocp.diagnosis.select import (
-    _near_best_models,
-)
+from yid_ocp.diagnosis.select import _near_best_models
 from yid_ocp.effects import make_effect
-from yid_ocp.inference.null_test import (
-    ResidualChannelSamples,
-    residual_channel_samples,
-)
+from yid_ocp.inference.null_test import residual_channel_samples
 from yid_ocp.problem import EstimationProblem
-
-
-def white(rows, colour=None):
-    t = 0.01 * np.arange(len(rows))
-    return ResidualChannelSamples("run", "points.tip", "points", "m", t, rows, np.ones(1) if colour is None else colour)
 
 
 @pytest.fixture(scope="module")
@@ -67,8 +58,7 @@ def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
 
 def test_screening_finds_the_withheld_effect_first(screened):
     _, nominal, point = screened
-    series = residual_channel_samples(nominal.problem)
-    ranked = score_candidates(point, series, candidate_detectability(point))
+    ranked = score_candidates(point, residual_channel_samples(nominal.problem), candidate_detectability(point))
     assert ranked[0].effect.label == "joint_coulomb@elbow"
     assert ranked[0].predicted_values["joint_coulomb@elbow.tau_c"] == pytest.approx(0.1, rel=0.1)
     assert ranked[0].p_value < 1e-6
@@ -77,11 +67,9 @@ def test_screening_finds_the_withheld_effect_first(screened):
 
 def test_the_promised_decrease_is_that_of_a_refit_where_the_model_is_linear(screened):
     composed, nominal, point = screened
-    series = residual_channel_samples(nominal.problem)
-    ranked = {s.effect.label: s for s in score_candidates(point, series, candidate_detectability(point))}
+    scores = score_candidates(point, residual_channel_samples(nominal.problem), candidate_detectability(point))
+    ranked = {s.effect.label: s for s in scores}
     for label in ("joint_coulomb@elbow", "rotor_inertia@elbow", "effort_offset@shoulder"):
-        if label not in ranked:
-            continue
         effect = next(e for e in composed.candidate_effects if e.label == label)
         fit = refit_with_effects(composed, (effect,), nominal.values)
         assert 2 * (nominal.cost - fit.cost) == pytest.approx(ranked[label].predicted_chi2_decrease, rel=1e-3, abs=1e-3)
@@ -127,7 +115,7 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     grid = [{"joint_stribeck@elbow.v_stribeck": value} for value in (0.02, 0.05)]
     signatures = tuple(_EffectSignature(effect, values, x, x.T @ x) for values, x in zip(grid, columns, strict=True))
     point = AllCandidatesLinearization(residual[:, 0], signatures)
-    best = score_candidates(point, [white(np.arange(200))], candidate_detectability(point))[0]
+    best = score_candidates(point, [series(range(200))], candidate_detectability(point))[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
 
 

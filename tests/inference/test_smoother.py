@@ -84,6 +84,12 @@ def problem_of(system: System, recording: Recording, feedback: Literal["none", "
     )
 
 
+def said_of(problem: EstimationProblem):
+    """What the smoother says about the fit of a problem."""
+    solution = solve(problem, GaussNewton())
+    return select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
+
+
 @pytest.mark.parametrize("feedback", ["none", "lqr"])
 def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, feedback):
     """Whatever keeps the arm on its measured motion, whose momentum has the push in it."""
@@ -125,9 +131,7 @@ def test_the_linear_model_predicts_what_a_small_push_does(driven, monkeypatch, f
 
 
 def test_clean_data_have_no_place(driven):
-    problem = problem_of(driven, recorded(driven, {}, 2))
-    solution = solve(problem, GaussNewton())
-    found = select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
+    found = said_of(problem_of(driven, recorded(driven, {}, 2)))
     assert found.log_evidence["both"] == 0
     assert found.gap_origin == "none"
     assert all(place.gap_share == 0 for place in localise_gap(found))
@@ -136,9 +140,7 @@ def test_clean_data_have_no_place(driven):
 
 @pytest.mark.parametrize(("joint", "name", "push"), [(0, "shoulder", 0.3), (1, "elbow", 0.03)])
 def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
-    problem = problem_of(driven, recorded(driven, {joint: (push, 0.8, 1.3)}, 3))
-    solution = solve(problem, GaussNewton())
-    found = select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
+    found = said_of(problem_of(driven, recorded(driven, {joint: (push, 0.8, 1.3)}, 3)))
     places = localise_gap(found)
     assert places[0].location == name
     assert places[0].gap_share > 0.5
@@ -160,18 +162,14 @@ def test_a_sensor_that_reads_wrong_is_told_from_a_push(driven):
     moved = group.position.copy()
     moved[80:130, 1] += [0.0, 0.02, 0.0]
     wrong = replace(recording, points=(replace(group, position=moved),))
-    problem = problem_of(driven, wrong)
-    solution = solve(problem, GaussNewton())
-    found = select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
+    found = said_of(problem_of(driven, wrong))
     assert found.gap_origin == "sensor"
     assert localise_gap(found)[0].location == "points"
 
 
 def test_efforts_of_prescribed_joints_say_which(bench):
     recording = bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, 1, duration=2.0)
-    problem = bench.problem([recording])
-    solution = solve(problem, GaussNewton())
-    found = select_and_smooth_unknowns(problem, np.array(solution.x), solution.evaluation)
+    found = said_of(bench.problem([recording]))
     places = localise_gap(found)
     assert places[0].location == "elbow"
     assert places[0].gap_share > 0.8
