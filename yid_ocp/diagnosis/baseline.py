@@ -74,10 +74,7 @@ class BaselineComparison:
 def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
     """Return the problem with a baseline's estimates as a joint prior and its parameters free.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-        Of the same model, with the effects that the earlier run had.
+    The problem is of the same model, with the effects that the earlier run had.
 
     Raises
     ------

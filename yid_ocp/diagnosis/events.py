@@ -143,15 +143,9 @@ def find_disturbance_events(
 ) -> EventSet:
     """Find events in all recordings of a problem that are more than chance, by the false-discovery rate of all windows.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-        Whitened by the sensors' noise, with all samples.
-    x : ndarray, shape (nx,)
-        Its fit, at which `evaluation` has a Jacobian where there is `smoothed`.
-    smoothed : SmootherResult or None
-        What the smoother found about that fit; forces that move the model are sought where it found some, in the
-        recordings that were estimated on.
+    The problem is whitened by the sensors' noise and has all samples; `x` (nx,) is its fit, at which `evaluation` has a
+    Jacobian where there is `smoothed`, what the smoother found about it. Forces that move the model are sought where it
+    found some, in the recordings that were estimated on.
     """
     runs: list[_RecordingRollout] = []
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):

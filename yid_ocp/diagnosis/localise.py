@@ -97,14 +97,9 @@ def attribute_gap_to_effects(
 ) -> tuple[GapLocation, ...]:
     """Return locations with shares by the closure of the effects there, the rest shared out by the smoother.
 
-    Parameters
-    ----------
-    before, rest : sequence of GapLocation
-        Of the nominal model, and of the model with the effects.
-    closed : mapping of location to float
-        Part of the gap that the effects there close.
-    windows : tuple of (float, float)
-        When the residual was more than noise, for locations that the smoother has no unknown for (`world`, `clock`).
+    `before` and `rest` are the locations of the nominal model and of the model with the effects, `closed` the part of
+    the gap that the effects at each location close, and `windows` when the residual was more than noise, for locations
+    that the smoother has no unknown for (`world`, `clock`).
     """
     known = {place.location: place for place in before}
     left, share = max(1.0 - sum(closed.values()), 0.0), dict(closed)
@@ -126,16 +121,10 @@ def attribute_gap_to_effects(
 def smoothed_unknown_z_scores(
     smoothed: SmootherResult, recording: int = 0, informed_fraction: float = DEFAULT_THRESHOLDS.informed_fraction
 ) -> tuple[Array, tuple[str, ...], Array]:
-    """Return the unknowns of one recording divided by their posterior standard deviation, NaN if not informed.
+    """Return edges (J + 1,) [s], names, and values (J, nd) of a recording's unknowns over their posterior std.
 
-    Informed is a value of which 1 - posterior/prior variance is above `informed_fraction`.
-
-    Returns
-    -------
-    edges : ndarray, shape (J + 1,)
-        [s]
-    names : tuple of str
-    values : ndarray, shape (J, nd)
+    Those that are not informed are NaN: informed is a value of which 1 - posterior/prior variance is above
+    `informed_fraction`.
     """
     trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])

@@ -57,14 +57,7 @@ class InverseDynamicsModel:
         return _function(self._step.system, self._step.time_step)
 
     def inverse_dynamics_term_magnitudes(self, theta: Array, rollout: Rollout, nodes: IntArray) -> _TorqueTermSizes:
-        """Return the term magnitudes along a rollout, accelerations from finite differences.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (ntheta,)
-        nodes : ndarray of int, shape (M,)
-            Increasing.
-        """
+        """Return the term magnitudes at increasing nodes (M,) of a rollout, accelerations from finite differences."""
         system, time_step = self._step.system, self._step.time_step
         n = system.n_coordinates
         q, z = rollout.state[:, :n], rollout.state[:, 2 * n :]

@@ -343,14 +343,8 @@ def refit_with_each_effect(
 ) -> list[RefittedModel]:
     """Refit the model with each of several effects or pairs added to those of `base`; return the refits that succeed.
 
-    Parameters
-    ----------
-    tried : sequence of (sequence of EffectBase, mapping of parameter to float)
-        With the values at which each begins.
-    values : mapping of str to float
-        Where all other unknowns begin.
-    where : str
-        What is said of `values` in the store, if the same effects are refitted from elsewhere too.
+    Each of those `tried` stands beside the parameters at which it begins, `values` is where all other unknowns begin,
+    and `where` says so in the store if the same effects are refitted from elsewhere too.
     """
     if not tried:
         return []

@@ -86,14 +86,8 @@ def linearize_candidates(
 ) -> AllCandidatesLinearization:
     """Return the residual and the signatures of all candidates that are not yet in the model.
 
-    Parameters
-    ----------
-    base : sequence of EffectBase
-        In the model, with all their parameters free.
-    values : mapping of str to float
-        Unknowns of the fit.
-    grid : int
-        Values of every shape parameter.
+    Effects of `base` are in the model with all their parameters free, `values` are the unknowns of its fit, and `grid`
+    is the number of values of every shape parameter.
 
     Raises
     ------

@@ -254,21 +254,10 @@ def select_effects(
 ) -> tuple[tuple[RefittedModel, ...], tuple[SelectedEffect, ...]]:
     """Select effects by forward selection on the held-out gap, then try replacing and removing each.
 
-    Parameters
-    ----------
-    screened : ScreeningResult
-        All candidates at the nominal fit.
-    places : sequence of str
-        Where the smoother says that the gap lies.
-    moved : bool
-        Whether the nominal fit has left what an earlier run found; candidates are then tried from there as well.
-
-    Returns
-    -------
-    fits : tuple of RefittedModel
-        Of single effects in the first round, the chosen one first, then by held-out loss; where one effect alone stays,
-        its last fit first.
-    selected : tuple of SelectedEffect
+    All candidates were screened at the nominal fit; `places` are where the smoother says that the gap lies, and `moved`
+    is whether the nominal fit has left what an earlier run found, so that candidates are tried from there as well.
+    Returned are the fits of single effects in the first round, the chosen one first, then by held-out loss (where one
+    effect alone stays, its last fit first), and what was selected.
     """
     limits, alone, current = search.thresholds, screened, nominal
     first: tuple[RefittedModel, ...] = ()

@@ -54,13 +54,8 @@ def sensor_kinds() -> frozenset[str]:
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
     """Every pair (effect kind, location) possible in a system and visible in its recorded signals, ordered by kind.
 
-    Parameters
-    ----------
-    system : System
-        Without the effects in question.
-    recorded_sensors : collection of str
-        What was recorded, among `sensor_kinds`. What works only on prescribed joints is left out where no effort was
-        recorded, for there nothing would show it.
+    The system is without the effects in question, the signals are among `sensor_kinds`. What works only on prescribed
+    joints is left out where no effort was recorded, for there nothing would show it.
 
     Raises
     ------

@@ -167,12 +167,8 @@ class EffectBase:
     ) -> dict[str, ReportedParameter]:
         """The parameters as reported to users, by reported name; a compliance is reported as stiffness.
 
-        The standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p C) (delta method).
-
-        Parameters
-        ----------
-        values, stds : mapping of parameter name to float, optional
-            Nominal and NaN where absent; entries of other effects are skipped.
+        Values and standard deviations are nominal and NaN where absent; entries of other effects are skipped. The
+        standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p C) (delta method).
         """
         result = {}
         for definition, entry in zip(self.definitions, self.parameters, strict=True):

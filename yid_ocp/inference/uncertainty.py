@@ -148,15 +148,11 @@ def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
 def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluation, covariance: Array) -> Array:
     """Covariance widened for model misfit, at least as large as the block-wise sandwich estimate.
 
-    What a model leaves out repeats itself from sample to sample and shows in all channels at once. The sandwich
-    A^-1 S A^-1 therefore takes S from the scores J' r summed over blocks of time of one recording, all channels
-    together, and where there are enough from those of single channels of whole recordings (a zero that moves, friction
-    that holds) and of whole recordings; the largest variance of each unknown counts.
-
-    References
-    ----------
-    White (1982), Econometrica 50:1, doi:10.2307/1912526; Cameron, Gelbach, Miller (2011), J. Business and Economic
-    Statistics 29:238, doi:10.1198/jbes.2010.07136 (clusters).
+    What a model leaves out repeats itself from sample to sample and shows in all channels at once. The sandwich A^-1 S
+    A^-1 (White 1982, doi:10.2307/1912526) therefore takes S from the scores J' r summed over blocks of time of one
+    recording, all channels together, and where there are enough from those of single channels of whole recordings (a
+    zero that moves, friction that holds) and of whole recordings (clusters: Cameron, Gelbach, Miller 2011,
+    doi:10.1198/jbes.2010.07136); the largest variance of each unknown counts.
     """
     if evaluation.jacobian is None or not len(covariance):
         return covariance

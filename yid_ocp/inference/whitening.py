@@ -103,12 +103,8 @@ class WhiteningFilter:
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Normalized innovations (r, c) of the Kalman filter, and the torque biases from all rows (nu, c) [N m].
 
-        Parameters
-        ----------
-        rows : ndarray, shape (r, c)
-            A residual in units of the sensors' noise, then columns of its derivative.
-        push : ndarray, shape (N, nu, c), or None
-            The tracking filter's correction of the torque, and its derivative [N m].
+        Rows (r, c) are a residual in units of the sensors' noise, then columns of its derivative; `push` (N, nu, c) is
+        the tracking filter's correction of the torque, and its derivative [N m].
         """
         result, mean = np.empty_like(rows), self._expected(rows.shape[1])
         for k, step in enumerate(self.filter_steps):

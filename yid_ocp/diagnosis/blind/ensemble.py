@@ -71,12 +71,8 @@ def plan_blind_cases(
 ) -> list[PlannedBlindCase]:
     """Return the planned cases of an ensemble, in an order given by the seed.
 
-    Parameters
-    ----------
-    weights : mapping of experiment to float
-        How large a part of the cases each gets; fewer than `_MIN_CASES_PER_EXPERIMENT` are none, but for the largest.
-    chains : frozenset of str
-        Experiments whose object can be made of finer links.
+    The weights are how large a part of the cases each experiment gets; fewer than `_MIN_CASES_PER_EXPERIMENT` are none,
+    but for the largest. The objects of `chains` can be made of finer links.
 
     Raises
     ------

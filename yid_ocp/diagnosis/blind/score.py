@@ -365,21 +365,10 @@ def calibrate_thresholds(
     limits: Thresholds = DEFAULT_THRESHOLDS,
     coverage: float = _TARGET_COVERAGE,
 ) -> dict[str, Any]:
-    """Return conformal quantiles for thresholds, and how each would treat the effects of the ensemble.
+    """Return conformal quantiles for thresholds, and what each would do to the ensemble, as `yid-calibration/1`.
 
-    Parameters
-    ----------
-    marks : sequence of BlindCaseScore
-        Of the same cases.
-    answers : sequence of mapping
-        `result` of each, with its `statistics`, and those with open thresholds (`open`) where no gap was seen.
-    limits : Thresholds
-        By which they were given.
-
-    Returns
-    -------
-    dict
-        `yid-calibration/1`.
+    Labels, marks and answers are of the same cases. An answer is a `result` with its `statistics`, and those with open
+    thresholds (`open`) where no gap was seen; `limits` are those by which it was given.
     """
     cases = [
         (label, mark, said, _opened(entry))
