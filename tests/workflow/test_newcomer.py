@@ -48,7 +48,7 @@ def check_truth(result: Mapping[str, Any], truth: Mapping[str, float]) -> None:
 
 
 def test_a_bag_becomes_a_problem_that_is_right_at_the_truth(desk: Path) -> None:
-    recording = UR5.simulate(desk, 3, 1.0, links=8)
+    recording = UR5.simulate(desk, 3, 0.7, links=8)
     bag = write_mcap(recording, desk / "run")
     assert main(["init", "package:ur5", str(bag), *UR5_NUMBERS, "--out", "cable.yaml", "--quiet"]) == 0
     run = load_config("cable.yaml")

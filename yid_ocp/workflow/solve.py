@@ -25,7 +25,6 @@ from yid_ocp.analysis.profile import with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
-from yid_ocp.data.recording import Recording
 from yid_ocp.errors import YidError
 from yid_ocp.inference.uncertainty import covariance_to_dict, estimates_marked_not_trusted, typical_parameter_magnitudes
 from yid_ocp.integrator.step import step_with_time_step
@@ -236,7 +235,7 @@ def measure_discretisation_shifts(
             continue
         progress.begin_stage(f"trying {words}")
         try:
-            refined = _with_twice_the_links(run, problem) if key == "links" else _with_half_the_step(problem)
+            refined = _refined_problem(run, problem, key)
             own = discretisation_estimate_shifts(refined, problem, x, at_x, model_difference_only=models_alone)
         except YidError as error:
             own = error.what
@@ -249,25 +248,21 @@ def measure_discretisation_shifts(
     return {name: DiscretisationEstimateShift(links.get(name), steps.get(name)) for name in names}, notes
 
 
-def _with_twice_the_links(run: RunSettings, problem: EstimationProblem) -> FinerDiscretisationProblem:
-    system, options = build_system(run, link_division=2), problem.options
+def _refined_problem(run: RunSettings, problem: EstimationProblem, what: _Refinement) -> FinerDiscretisationProblem:
+    """The problem with half the time step or with twice the links."""
+    recordings, options = [episode.recording for episode in problem.episodes], problem.options
+    if what == "time_step":
+        step = step_with_time_step(problem.step, problem.step.time_step / 2)
+        return FinerDiscretisationProblem(EstimationProblem(step, recordings, problem.free, options))
+    system = build_system(run, link_division=2)
     steps = sum(episode.grid.steps for episode in problem.episodes)
     compiled = problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE
     step = build_step(replace(run, problem=replace(run.problem, use_compiler=compiled)), system)
     factors = {name: float(divided_link_parameter_scale(run, name, 2)) for name in system.parameters.names}
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     options = replace(options, prior_stds=priors, multivariate_prior=options.multivariate_prior.scaled_by(factors))
-    made = EstimationProblem(step, _recordings(problem), problem.free, options)
+    made = EstimationProblem(step, recordings, problem.free, options)
     return FinerDiscretisationProblem(made, factors, fine_joints_by_coarse_joint(problem.system, system))
-
-
-def _with_half_the_step(problem: EstimationProblem) -> FinerDiscretisationProblem:
-    step = step_with_time_step(problem.step, problem.step.time_step / 2)
-    return FinerDiscretisationProblem(EstimationProblem(step, _recordings(problem), problem.free, problem.options))
-
-
-def _recordings(problem: EstimationProblem) -> list[Recording]:
-    return [episode.recording for episode in problem.episodes]
 
 
 def stability_checked_solution(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
