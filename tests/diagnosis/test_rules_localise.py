@@ -19,6 +19,7 @@ from yid_ocp.diagnosis.localise import (
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 
 TWIST = SmoothedUnknownGroup("T1", "bias")
+NONE = {FORCE: 0.0, OTHER_FORCE: 0.0}
 
 
 def described(places):
@@ -35,16 +36,12 @@ def described(places):
             {},
             [("T1", 0.75, True), ("T2", 0.25, True)],
         ),
-        "none, but one would have shown": (
-            {FORCE: 0.0, OTHER_FORCE: 0.0},
+        "none, one would have shown": (
+            NONE,
             {FORCE: 0.5, OTHER_FORCE: 2.0},
             [("T1", 0.0, True), ("T2", 0.0, False)],
         ),
-        "as large as its reference does not show": (
-            {FORCE: 0.0, OTHER_FORCE: 0.0},
-            {FORCE: 1.0, OTHER_FORCE: 0.9},
-            [("T2", 0.0, True), ("T1", 0.0, False)],
-        ),
+        "reference size does not show": (NONE, {FORCE: 1.0, OTHER_FORCE: 0.9}, [("T2", 0.0, True), ("T1", 0.0, False)]),
         "one of two would have shown": ({FORCE: 0.0, TWIST: 0.0}, {FORCE: 0.5, TWIST: 2.0}, [("T1", 0.0, True)]),
         "the other would have shown": ({FORCE: 0.0, TWIST: 0.0}, {FORCE: 2.0, TWIST: 0.5}, [("T1", 0.0, True)]),
         "what is there shows": ({FORCE: 2.0}, {FORCE: 5.0}, [("T1", 1.0, True)]),
@@ -86,41 +83,34 @@ def test_touching_spans_are_one_stretch(spans, expected):
 # -- what effects close -----------------------------------------------------------------------------------------------
 
 
+T1, T2, T3 = place("T1"), place("T2"), place("T3")
+
+
 @cases(
     "before, closed, rest, expected",
     {
-        "all": ([place("T1")], {"T1": 1.0}, [], [("T1", 1.0, True)]),
-        "what is left goes to its places": (
-            [place("T1")],
-            {"T1": 0.6},
-            [place("T2")],
-            [("T1", 0.6, True), ("T2", 0.4, False)],
-        ),
+        "all": (T1, {"T1": 1.0}, [], [("T1", 1.0, True)]),
+        "what is left goes to its places": (T1, {"T1": 0.6}, [T2], [("T1", 0.6, True), ("T2", 0.4, False)]),
         "what is left of an effect's own place": (
-            [place("T1")],
+            T1,
             {"T1": 0.6},
             [place("T1", 0.5), place("T2", 0.5)],
             [("T1", 0.8, True), ("T2", 0.2, False)],
         ),
         "more than all": (
-            [place("T1")],
+            T1,
             {"T1": 0.9, "T2": 0.3},
-            [place("T3")],
+            [T3],
             [("T1", 0.75, True), ("T2", 0.25, True), ("T3", 0, False)],
         ),
-        "nothing is left to be seen": ([place("T1")], {"T1": 0.5}, [], [("T1", 1.0, True)]),
-        "a place that could not be seen": (
-            [place("T1", observable=False)],
-            {"T2": 0.5},
-            [],
-            [("T2", 1.0, True), ("T1", 0.0, False)],
-        ),
-        "a place without an effect": ([place("T1")], {"T2": 0.5}, [], [("T2", 1.0, True), ("T1", 0.0, True)]),
-        "nothing closed": ([place("T1")], {"world": 0.0}, [], [("T1", 0.0, True), ("world", 0.0, True)]),
+        "nothing is left to be seen": (T1, {"T1": 0.5}, [], [("T1", 1.0, True)]),
+        "an unseen place": (place("T1", observable=False), {"T2": 0.5}, [], [("T2", 1.0, True), ("T1", 0.0, False)]),
+        "a place without an effect": (T1, {"T2": 0.5}, [], [("T2", 1.0, True), ("T1", 0.0, True)]),
+        "nothing closed": (T1, {"world": 0.0}, [], [("T1", 0.0, True), ("world", 0.0, True)]),
     },
 )
 def test_places_of_effects_share_by_what_they_close(before, closed, rest, expected):
-    found = described(attribute_gap_to_effects(before, closed, rest, ()))
+    found = described(attribute_gap_to_effects([before], closed, rest, ()))
     assert sorted(found, key=lambda p: p[0]) == sorted(expected, key=lambda p: p[0])
     shares = [share.expected for _, share, _ in found]
     assert shares == sorted(shares, reverse=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import json
 import math
-from dataclasses import dataclass
 from types import SimpleNamespace
 
 import pytest
@@ -20,6 +19,7 @@ from yid_ocp.diagnosis.blind import (
     score_blind_case,
     seal_labels_with_hash,
 )
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
 
@@ -55,52 +55,46 @@ def said(verdict="effect", effects=(), which=None, where=(), confusable=(), clos
 
 # -- marks ------------------------------------------------------------------------------------------------------------
 
-RIGHT, WRONG = "kelvin_voigt@T1", "density@T2"
+RIGHT, WRONG, RUBS = "kelvin_voigt@T1", "density@T2", "joint_coulomb@elbow"
+NULL, SINGLE, PAIR = label("null"), label("single", KV), label("pair", KV, DRY)
+OUTSIDE, LEFT_OUT = label("outside", GUST), label("left_out", KV)
+
+
+def alike(named, *groups):
+    return said("confusable", named, confusable=groups)
 
 
 @pytest.mark.parametrize(
     ("case", "answer", "right"),
     [
-        (label("null"), said("no_gap"), True),
-        (label("null"), said("insufficient_data"), False),
-        (label("null"), said("unknown"), False),
-        (label("single", KV), said("effect", [RIGHT]), True),
-        (label("single", KV), said("effect", [WRONG]), False),
-        (label("single", KV), said("effect", [WRONG, RIGHT]), False),
-        (label("single", KV), said("effect", [RIGHT, WRONG]), True),
-        (label("single", KV), said("confusable", [WRONG], confusable=[[WRONG, RIGHT]]), True),
-        (label("single", KV), said("confusable", [WRONG], confusable=[[WRONG, "a@b", RIGHT]]), True),
-        (label("single", KV), said("confusable", [WRONG], confusable=[[WRONG, "a@b", "c@d", RIGHT]]), False),
-        (label("single", KV), said("confusable", [WRONG, "a@b"], confusable=[["a@b", RIGHT]]), False),
-        (label("single", KV), said("unknown", where=["T1"]), False),
+        (NULL, said("no_gap"), True),
+        (NULL, said("insufficient_data"), False),
+        (NULL, said("unknown"), False),
+        (SINGLE, said("effect", [RIGHT]), True),
+        (SINGLE, said("effect", [WRONG]), False),
+        (SINGLE, said("effect", [WRONG, RIGHT]), False),
+        (SINGLE, said("effect", [RIGHT, WRONG]), True),
+        (SINGLE, alike([WRONG], [WRONG, RIGHT]), True),
+        (SINGLE, alike([WRONG], [WRONG, "a@b", RIGHT]), True),
+        (SINGLE, alike([WRONG], [WRONG, "a@b", "c@d", RIGHT]), False),
+        (SINGLE, alike([WRONG, "a@b"], ["a@b", RIGHT]), False),
+        (SINGLE, said("unknown", where=["T1"]), False),
         (label("finer_chain"), said("effect", [RIGHT]), False),
-        (label("outside", GUST), said("unknown", where=["T3", "T1"]), True),
-        (label("outside", GUST), said("unknown", where=["T1", "T3"]), False),
-        (label("outside", GUST), said("unknown"), False),
-        (label("outside", GUST), said("effect", [WRONG], where=["T3"]), False),
-        (label("left_out", KV), said("unknown", where=["T1"]), True),
-        (label("left_out", KV), said("effect", [RIGHT], where=["T1"]), False),
-        (label("pair", KV, DRY), said("effect", [RIGHT, "joint_coulomb@elbow"]), True),
-        (label("pair", KV, DRY), said("effect", ["joint_coulomb@elbow", "a@b", RIGHT]), True),
-        (label("pair", KV, DRY), said("effect", [RIGHT]), False),
+        (OUTSIDE, said("unknown", where=["T3", "T1"]), True),
+        (OUTSIDE, said("unknown", where=["T1", "T3"]), False),
+        (OUTSIDE, said("unknown"), False),
+        (OUTSIDE, said("effect", [WRONG], where=["T3"]), False),
+        (LEFT_OUT, said("unknown", where=["T1"]), True),
+        (LEFT_OUT, said("effect", [RIGHT], where=["T1"]), False),
+        (PAIR, said("effect", [RIGHT, RUBS]), True),
+        (PAIR, said("effect", [RUBS, "a@b", RIGHT]), True),
+        (PAIR, said("effect", [RIGHT]), False),
         # one set says one of the two, and two sets of which one has both do not say two
-        (
-            label("pair", KV, DRY),
-            said("confusable", ["joint_coulomb@elbow"], confusable=[["joint_coulomb@elbow", RIGHT]]),
-            False,
-        ),
-        (
-            label("pair", KV, DRY),
-            said("confusable", ["joint_coulomb@elbow", "a@b"], confusable=[["joint_coulomb@elbow", RIGHT]]),
-            False,
-        ),
-        (label("pair", KV, DRY), said("confusable", ["a@b", RIGHT], confusable=[["a@b", "joint_coulomb@elbow"]]), True),
-        (label("pair", KV, DRY), said("confusable", [RIGHT, "a@b"], confusable=[["a@b", "joint_coulomb@elbow"]]), True),
-        (
-            label("pair", KV, DRY),
-            said("confusable", [RIGHT, "a@b"], confusable=[["a@b", "c@d", "e@f", "joint_coulomb@elbow"]]),
-            False,
-        ),
+        (PAIR, alike([RUBS], [RUBS, RIGHT]), False),
+        (PAIR, alike([RUBS, "a@b"], [RUBS, RIGHT]), False),
+        (PAIR, alike(["a@b", RIGHT], ["a@b", RUBS]), True),
+        (PAIR, alike([RIGHT, "a@b"], ["a@b", RUBS]), True),
+        (PAIR, alike([RIGHT, "a@b"], ["a@b", "c@d", "e@f", RUBS]), False),
     ],
 )
 def test_what_is_right_depends_on_the_case(case, answer, right):
@@ -337,23 +331,17 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
     asked = []
     stiff = effect("kelvin_voigt@T1", amplitude("tau", unit="s"), amplitude("other"))
 
-    @dataclass(frozen=True)
-    class Composed:
-        candidate_effects: tuple
-        held: list
-        problem: str
+    def composed_from(problem, effects, held_out):
+        asked.append(held_out)
+        return AllCandidatesProblem("from the start", tuple(effects), False)
 
-    made = SimpleNamespace(
-        from_problem=lambda problem, effects, held_out: Composed(tuple(effects), held_out, "from the start")
-    )
+    nominal = fit(lost=loss(2.0, 2.0), values={"k": 3.0}, problem="settled")
     monkeypatch.setattr(ensemble_module, "make_candidate_effects", lambda *_: [stiff, FRICTION])
-    monkeypatch.setattr(ensemble_module, "AllCandidatesProblem", made)
-    monkeypatch.setattr(
-        ensemble_module, "fit_nominal_model", lambda *_: fit(lost=loss(2.0, 2.0), values={"k": 3.0}, problem="settled")
-    )
+    monkeypatch.setattr(ensemble_module, "AllCandidatesProblem", SimpleNamespace(from_problem=composed_from))
+    monkeypatch.setattr(ensemble_module, "fit_nominal_model", lambda *_: nominal)
 
     def refit(composed, chosen, start):
-        asked.append((composed.held, composed.problem, [e.kind for e in chosen], dict(start)))
+        asked.append((composed.problem, [e.kind for e in chosen], dict(start)))
         return fit(chosen, loss(1.25, 1.25)) if refitted else None
 
     monkeypatch.setattr(ensemble_module, "refit_with_effects", refit)
@@ -363,7 +351,7 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
     )
     assert found == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
-    assert asked == [(["held out"], "settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]
+    assert asked == [["held out"], ("settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]
 
 
 @pytest.mark.slow

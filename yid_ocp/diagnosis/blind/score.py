@@ -371,13 +371,14 @@ def calibrate_thresholds(
     thresholds (`open`) where no gap was seen; `limits` are those by which it was given.
     """
     cases = [
-        (label, mark, said, _opened(entry))
+        (label.category, mark, said, entry.get("open") or {})
         for label, mark, entry in zip(labels, marks, answers, strict=True)
         if (said := entry["result"].get("statistics")) is not None
     ]
-    clean = [wide or said for label, _, said, wide in cases if label.category == "null"]
-    single = [(mark, said) for label, mark, said, _ in cases if label.category == "single"]
-    outside = [said for label, _, said, _ in cases if label.category in _OUT_OF_LIBRARY_CATEGORIES]
+    # where thresholds were opened for a clean recording, but for one that cannot be diagnosed so
+    clean = [wide if "p_value" in wide else said for category, _, said, wide in cases if category == "null"]
+    single = [(mark, said) for category, mark, said, _ in cases if category == "single"]
+    outside = [said for category, _, said, _ in cases if category in _OUT_OF_LIBRARY_CATEGORIES]
     found = {}
     for name, rule in _CALIBRATION_RULES.items():
         known = [(m, rule.statistic(said, limits, m.truth)) for m, said in single if m.right or rule.of != "named"]
@@ -429,9 +430,3 @@ def _rounded(value: float, up: bool) -> float:
     scaled = value * 10.0**digits
     whole = math.ceil(scaled - 1e-9) if up else math.floor(scaled + 1e-9)
     return round(whole / 10.0**digits, max(digits, 0))
-
-
-def _opened(answer: Mapping[str, Any]) -> _Statistics | None:
-    """Statistics with open thresholds, where there are any."""
-    wide = answer.get("open")
-    return wide if wide is not None and "p_value" in wide else None
