@@ -52,6 +52,16 @@ def driven_problem(limited_urdf):
 
 
 @pytest.fixture(scope="module")
+def moved_experiment(moved_problem):
+    return PlannedExperiment.from_options(moved_problem, values_of(moved_problem), OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def driven_experiment(driven_problem):
+    return PlannedExperiment.from_options(driven_problem, values_of(driven_problem), OPTIONS)
+
+
+@pytest.fixture(scope="module")
 def told(moved_problem):
     return plan_informative_motion(moved_problem, OPTIONS)
 
@@ -64,8 +74,8 @@ def some_motion(experiment, seed=0, size=0.1):
     return size * np.random.default_rng(seed).normal(size=experiment.zero_coefficients.shape)
 
 
-def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem):
-    experiment = PlannedExperiment.from_options(driven_problem, values_of(driven_problem), OPTIONS)
+def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem, driven_experiment):
+    experiment = driven_experiment
     w = some_motion(experiment)
     planned, base = experiment.planned_estimation_problem(w), driven_problem
     spent = base.episodes[0].grid.steps * base.step.time_step
@@ -86,35 +96,30 @@ def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem):
     assert max(np.abs(samples.whitened_residual(predicted)).max() for samples, predicted in pairs) < 0.1
 
 
-@pytest.mark.parametrize("kind", ["moved_problem", "driven_problem"])
+@pytest.mark.parametrize("kind", ["moved_experiment", "driven_experiment"])
 def test_slopes_are_derivatives_of_the_sensitivities(kind, request):
-    problem = request.getfixturevalue(kind)
-    experiment = PlannedExperiment.from_options(problem, values_of(problem), OPTIONS)
+    experiment = request.getfixturevalue(kind)
     w, way = some_motion(experiment), some_motion(experiment, 1, 1.0)
     rows, e = experiment.search_problem_sensitivities(w), 1e-4
     slope = np.tensordot(way.ravel(), experiment.sensitivity_derivatives_by_coefficients(w, rows), 1)
-    central = (
-        experiment.search_problem_sensitivities(w + e * way) - experiment.search_problem_sensitivities(w - e * way)
-    ) / (2 * e)
+    after, before = (experiment.search_problem_sensitivities(w + sign * e * way) for sign in (1, -1))
+    central = (after - before) / (2 * e)
     np.testing.assert_allclose(slope, central, atol=2e-3 * np.abs(central).max())
 
 
-def test_prescribed_arms_tell_what_identifiability_says(moved_problem):
-    experiment = PlannedExperiment.from_options(moved_problem, values_of(moved_problem), OPTIONS)
-    w = some_motion(experiment, size=0.3)
-    searched, judged = (
-        experiment.search_problem_sensitivities(w),
-        identifiability(experiment.planned_estimation_problem(w)),
-    )
+def test_prescribed_arms_tell_what_identifiability_says(moved_experiment):
+    w = some_motion(moved_experiment, size=0.3)
+    searched = moved_experiment.search_problem_sensitivities(w)
+    judged = identifiability(moved_experiment.planned_estimation_problem(w))
     # the search sees fewer samples of points, each telling more
     np.testing.assert_allclose(np.diag(searched.T @ searched), np.diag(judged.fisher_information), rtol=0.05)
 
 
-def test_driven_arms_tell_about_what_the_innovations_say(driven_problem):
-    experiment = PlannedExperiment.from_options(driven_problem, values_of(driven_problem), OPTIONS)
-    for seed in range(3):
-        w = some_motion(experiment, seed, 0.3)
-        searched, judged = experiment.search_problem_sensitivities(w), experiment.configured_problem_sensitivities(w)
+def test_driven_arms_tell_about_what_the_innovations_say(driven_experiment):
+    for seed in range(2):
+        w = some_motion(driven_experiment, seed, 0.3)
+        searched = driven_experiment.search_problem_sensitivities(w)
+        judged = driven_experiment.configured_problem_sensitivities(w)
         for criterion in (DOptimalityCriterion((i,), (0, 1)) for i in (0, 1)):  # logarithms of standard deviations
             told, true = (criterion.value_and_gradient_by_sensitivities(rows, False)[0] for rows in (searched, judged))
             assert told == pytest.approx(true, abs=0.5)
@@ -169,7 +174,7 @@ def line(w):
 
 
 def searched(limits, rounds=50):
-    """A search, and what it found, over two places from -1 to 1.5 at which a line is read, within values and bounds."""
+    """What a search found over two places from -1 to 1.5 at which a line is read, within values and bounds."""
 
     def slopes(w, here):
         return np.array([(line(w + 1e-6 * e.reshape(w.shape)) - here) / 1e-6 for e in np.eye(2)])
@@ -185,7 +190,7 @@ def searched(limits, rounds=50):
         limit_rows=bounded, limited_quantity_values=lambda rolled, w: _ValueWithJacobian(*values(w.ravel()))
     )
     search = InformativeMotionSearch(experiment, kept, DOptimalityCriterion((0, 1), (0, 1)))
-    return search, search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
+    return search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
 
 
 def straight(matrix):
@@ -193,7 +198,7 @@ def straight(matrix):
 
 
 def test_a_straight_line_is_read_at_the_ends_of_its_range():
-    _, found = searched((straight([[0.0, 0.0]]), [1.0]))
+    found = searched((straight([[0.0, 0.0]]), [1.0]))
     assert found.is_converged
     np.testing.assert_allclose(np.sort(found.w.ravel()), [-1.0, 1.5], atol=1e-6)
     assert found.final_criterion > found.initial_criterion
@@ -208,8 +213,9 @@ def test_a_straight_line_is_read_at_the_ends_of_its_range():
 )
 def test_a_limit_is_kept_on_the_way_and_used_up_in_the_end(limits, apart):
     for rounds in (1, 2, 50):
-        search, found = searched(limits, rounds)
-        assert search._max_limit_violation(found.w) <= 0.0
+        found = searched(limits, rounds)
+        assert np.all(limits[0](found.w.ravel())[0] <= limits[1])
+        assert -1.0 <= found.w.min() <= found.w.max() <= 1.5
     assert abs(float(np.diff(found.w.ravel())[0])) == pytest.approx(apart, abs=5e-3)
 
 
@@ -246,7 +252,7 @@ def test_one_parameter_is_told_better_where_it_alone_counts(moved_problem, told)
 
 
 def test_the_same_seed_gives_the_same_motion(moved_problem):
-    options = replace(OPTIONS, n_random_starts=1, max_iterations=1)
+    options = replace(OPTIONS, n_random_starts=1, max_iterations=1, n_spline_coefficients=2)
     first, again, other = (
         plan_informative_motion(moved_problem, replace(options, seed=seed)).spline_coefficients for seed in (0, 0, 1)
     )
@@ -255,7 +261,9 @@ def test_the_same_seed_gives_the_same_motion(moved_problem):
 
 
 def test_two_effects_are_moved_apart(driven_problem):
-    found = plan_informative_motion(driven_problem, replace(OPTIONS, discriminate=PAIR, n_random_starts=1))
+    found = plan_informative_motion(
+        driven_problem, replace(OPTIONS, discriminate=PAIR, n_random_starts=1, max_iterations=4)
+    )
     assert set(found.effect_distances) == {PAIR, PAIR[::-1]}
     for before, after in found.effect_distances.values():
         assert after > 1.5 * before

@@ -51,7 +51,7 @@ def test_a_plan_that_ships_arrives_within_its_limits(repository, tmp_path, name)
 
 
 def test_the_middle_of_a_cable_stays_below_a_lid(repository, tmp_path):
-    quick = (*COARSE["plan_cable"], "plan.duration=0.6")
+    quick = (*COARSE["plan_cable"], "plan.duration=0.6", "plan.hold_duration=0.2", "plan.n_spline_coefficients=5")
     _, free = planned(repository, tmp_path / "free", "plan_cable", *quick, "plan.goal=place")
     height = free.output.point_trajectories["cable:50%"][:, 2]
     lid = 0.5 * (height.max() + free.output.target_position[2])
@@ -120,8 +120,14 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
     run = load_config(file)
     if not resolve_recording_path(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
-    way = "plan={point: p6, target_offset: [0.01, 0.01, 0.0], duration: 0.6, n_spline_coefficients: 4}"
-    run, outcome = planned(repository, tmp_path, "deft_bdlo1", way)
+    way = "plan={point: p6, target_offset: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
+    coarse = (
+        "problem.use_compiler=false",
+        "model.object.parent_vertices=[p0, p1, p4, p6, p8, p11, p12]",
+        *("model.object.child_vertices={}", "model.object.branches={}"),
+        "model.object.branches={parent: {separate_twist_damping: true, linear_density: 0.05}}",
+    )
+    run, outcome = planned(repository, tmp_path, "deft_bdlo1", *coarse, way)
     assert outcome.is_successful, outcome.result["message"]
     first = outcome.output.rollout.state[0]
     held = simulate(outcome.output.simulator.step, outcome.output.simulator.theta, first, 20).state[-1]

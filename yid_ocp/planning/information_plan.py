@@ -119,12 +119,12 @@ def plan_informative_motion(
         _smooth(experiment, search.shrink_to_limits(_random(experiment, options.seed + i)))
         for i in range(options.n_random_starts)
     ]
-    if not any(np.any(begin) for begin in begins):
+    if not any(np.any(begin) for begin, _ in begins):
         raise ConfigError("the limits leave no motion", where="plan.limits", hint="widen plan.limits")
-    unseen = _unseen(experiment, begins)
+    unseen = _unseen(experiment, [rows for _, rows in begins])
     _check_seen(chosen, rivals, unseen, experiment)
     found = []
-    for i, begin in enumerate(begins):
+    for i, (begin, _) in enumerate(begins):
         progress.begin_stage(f"improving the motion, start {i + 1} of {len(begins)}")
         found.append(search.improve_motion(begin, options.max_iterations, progress))
     return _plan(experiment, limits, search, criterion, found, rivals, unseen)
@@ -220,28 +220,26 @@ def _random(experiment: PlannedExperiment, seed: int) -> Array:
     return _RANDOM_COEFFICIENT_STD * np.random.default_rng(seed).normal(size=experiment.zero_coefficients.shape)
 
 
-def _smooth(experiment: PlannedExperiment, w: Array) -> Array:
-    """The motion, made smaller until what it tells changes smoothly with it."""
+def _smooth(experiment: PlannedExperiment, w: Array) -> tuple[Array, Array | None]:
+    """The motion, made smaller until what it tells changes smoothly with it, and its sensitivities."""
+    rows = experiment.search_problem_sensitivities(w)
     for _ in range(10):
-        rows, there = (
-            experiment.search_problem_sensitivities(w),
-            experiment.search_problem_sensitivities((1.0 + 1e-4) * w),
-        )
-        if (
-            rows is not None
-            and there is not None
-            and np.linalg.norm(there - rows) <= _MAX_RELATIVE_SENSITIVITY_CHANGE * np.linalg.norm(rows)
-        ):
-            return w
+        there = None if rows is None else experiment.search_problem_sensitivities((1.0 + 1e-4) * w)
+        if rows is not None and there is not None and _is_near(there, rows):
+            break
         w = 0.5 * w
-    return w
-
-
-def _unseen(experiment: PlannedExperiment, motions: Sequence[Array]) -> dict[str, float]:
-    """Parameters of which no reading tells in any of the motions: how far one moves at most [standard deviations]."""
-    largest = np.zeros(len(experiment.column_names))
-    for w in motions:
         rows = experiment.search_problem_sensitivities(w)
+    return w, rows
+
+
+def _is_near(there: Array, rows: Array) -> bool:
+    return bool(np.linalg.norm(there - rows) <= _MAX_RELATIVE_SENSITIVITY_CHANGE * np.linalg.norm(rows))
+
+
+def _unseen(experiment: PlannedExperiment, told: Sequence[Array | None]) -> dict[str, float]:
+    """Parameters of which no reading tells in any motion, by sensitivities: how far one moves at most [stds]."""
+    largest = np.zeros(len(experiment.column_names))
+    for rows in told:
         if rows is not None:
             largest = np.maximum(largest, np.linalg.norm(rows, axis=0))
     named = zip(experiment.column_names, largest, strict=True)
@@ -336,9 +334,8 @@ def _plan(
 
 def _judged(experiment: PlannedExperiment, criterion: OptimalityCriterion, found: MotionSearchResult) -> float:
     try:
-        return criterion.value_and_gradient_by_sensitivities(
-            experiment.configured_problem_sensitivities(found.w), False
-        )[0]
+        rows = experiment.configured_problem_sensitivities(found.w)
+        return criterion.value_and_gradient_by_sensitivities(rows, False)[0]
     except SolverError:
         return -math.inf
 

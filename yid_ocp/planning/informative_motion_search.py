@@ -140,19 +140,17 @@ class InformativeMotionSearch:
         self.lower, self.upper = (bound.ravel() for bound in experiment.simulator.coefficient_bounds())
         self._unit, self._low, self._high = limit_units_and_scaled_bounds(limits.limit_rows)
 
-    def _max_limit_violation(self, w: Array) -> float:
-        """Largest limit violation of a motion, relative to the limits; infinite where it cannot be simulated."""
+    def _limited_values(self, w: Array) -> tuple[Array, bool]:
+        """Limited quantities of a motion in parts of their limits, and whether it can be simulated and keeps these."""
         value = self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(w), w).value / self._unit
-        if not np.all(np.isfinite(value)):
-            return np.inf
         flat = w.ravel()
-        joints = max(float(np.max(flat - self.upper)), float(np.max(self.lower - flat)))
-        return max(float(np.max(value - self._high)), float(np.max(self._low - value)), joints)
+        within = np.all((value <= self._high) & (value >= self._low))  # not where a value is not finite
+        return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
 
     def shrink_to_limits(self, w: Array) -> Array:
         """Spline coefficients (K, nc) of the motion, scaled down until it keeps the limits."""
         for _ in range(60):
-            if self._max_limit_violation(w) <= 0.0:
+            if self._limited_values(w)[1]:
                 return w
             w = 0.8 * w
         return np.zeros_like(w)
@@ -160,11 +158,7 @@ class InformativeMotionSearch:
     def _value_and_rows(self, w: Array) -> tuple[float, Array | None]:
         """Criterion and sensitivities of a motion; minus infinity where it cannot be simulated."""
         rows = self.experiment.search_problem_sensitivities(w)
-        return (
-            (-np.inf, None)
-            if rows is None
-            else (self.criterion.value_and_gradient_by_sensitivities(rows, False)[0], rows)
-        )
+        return -np.inf if rows is None else self.criterion.value_and_gradient_by_sensitivities(rows, False)[0], rows
 
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
         """Maximise the criterion from spline coefficients (K, nc) that keep the limits, until convergence."""
@@ -211,18 +205,15 @@ class InformativeMotionSearch:
             room = np.maximum(np.concatenate([high[near_high], low[near_low]]), 0.0)
             step = self._inner(rows, slopes, w, normal, room, radius)
             there = w + step.reshape(w.shape)
-            if self._max_limit_violation(there) <= 0.0:
+            true, is_within = self._limited_values(there)
+            if is_within:
                 return there - w
-            true = (
-                self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(there), there).value
-                / self._unit
-            )
             if not np.all(np.isfinite(true)):
                 break
             shift = true - value - slope @ step
         for share in (0.9, 0.7, 0.4, 0.2, 0.1):
             part = share * step.reshape(w.shape)
-            if self._max_limit_violation(w + part) <= 0.0:
+            if self._limited_values(w + part)[1]:
                 return part
         return np.zeros_like(w)
 

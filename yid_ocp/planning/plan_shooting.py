@@ -198,7 +198,6 @@ class PlanShootingResult:
     """Result of a search for a planned motion: coefficients w (K, nc), converged only if within the limits."""
 
     w: Array
-    cost: float
     is_converged: bool
     message: str
     n_evaluations: int
@@ -255,13 +254,11 @@ class PlanShootingProblem:
             if passed > 0.25 * before:
                 penalty = min(_PENALTY_GROWTH * penalty, _MAX_PENALTY)
             before = passed
-        residual = self._residual_and_limit_values(x)[0].value
         finished = bool(ended and passed <= _LIMIT_TOLERANCE)
         message = "the motion was found" if finished else "no motion within the limits was found"
         if not ended and not passed > _LIMIT_TOLERANCE:
             message = f"the search was stopped after {iterations} evaluations; raise plan.max_iterations"
-        cost = 0.5 * float(residual @ residual)
-        return PlanShootingResult(x.reshape(self._shape), cost, finished, message, self.evaluations)
+        return PlanShootingResult(x.reshape(self._shape), finished, message, self.evaluations)
 
     def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
         """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
