@@ -103,21 +103,17 @@ def _heat_figure(
     return figure
 
 
-def confusion_matrix_figure(
-    rows: Sequence[str], columns: Sequence[str], counts: Array, row: str, column: str
-) -> plotly.graph_objects.Figure:
-    """Confusion-matrix figure of counts, colored by the fraction of their row."""
+def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts: Array) -> plotly.graph_objects.Figure:
+    """Confusion-matrix figure of counts of what was said of what is true, colored by the fraction of their row."""
     parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
-    figure = _heat_figure(200 + 24 * len(rows), (rows, columns), parts, (row, column), -50)
+    figure = _heat_figure(200 + 24 * len(rows), (rows, columns), parts, ("true", "said first"), -50)
     text = [[f"{n:.0f}" if n else "" for n in line] for line in counts]
     return figure.update_traces(text=text, hovertemplate="%{y}: said %{x}<extra></extra>")
 
 
-def explained_fraction_matrix_figure(
-    names: Sequence[str], values: Array, row: str, column: str
-) -> plotly.graph_objects.Figure:
+def explained_fraction_matrix_figure(names: Sequence[str], values: Array) -> plotly.graph_objects.Figure:
     """Heat-map figure of explained fractions `values` (n, n), row explained by column, shown in per cent."""
-    figure = _heat_figure(190 + 27 * len(names), (names, names), values, (row, column), -40)
+    figure = _heat_figure(190 + 27 * len(names), (names, names), values, ("trace of", "explained by [%]"), -40)
     text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]
     return figure.update_traces(text=text, hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>")
 

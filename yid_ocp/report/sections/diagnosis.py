@@ -301,7 +301,7 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         "can; 100 % cannot be told apart by these motions and sensors, whatever the residual is.",
         f"Alike: {listed}." if close else f"No two of them are alike; the closest are {said[0][1]}.",
     ]
-    figure = categorical_charts.explained_fraction_matrix_figure(names, values, "trace of", "explained by [%]")
+    figure = categorical_charts.explained_fraction_matrix_figure(names, values)
     return _Chapter("What could be mistaken for what", sentences, [("", figure)])
 
 

@@ -136,7 +136,7 @@ def _blind_validation(findings: ReportData) -> Mapping[str, Any] | None:
     said = result["confusion"]
     counts = np.array(said["counts"], float).reshape(len(said["true"]), len(said["said"]))
     if counts.size:
-        figure = categorical_charts.confusion_matrix_figure(said["true"], said["said"], counts, "true", "said first")
+        figure = categorical_charts.confusion_matrix_figure(said["true"], said["said"], counts)
         shown.append(("What was said of what", figure))
     kept = {
         label: {entry["level"]: entry for entry in result["calibration"][key] if entry["of"]}
