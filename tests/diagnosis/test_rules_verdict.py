@@ -246,31 +246,23 @@ def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, par
 
 
 @cases(
-    "weight, evidence, side",
+    "weight, plant, sensor, both, side",
     {
-        "nothing": ({FORCE: 0.0}, {}, "none"),
-        "worse than nothing": ({FORCE: 9.0}, {"plant": -1.0, "sensor": -2.0, "both": -1.0}, "none"),
-        "plant": ({FORCE: 9.0, BIAS: 0.0}, {"plant": 9.0, "sensor": 3.0, "both": 9.0}, "plant"),
-        "sensor": ({FORCE: 0.0, BIAS: 9.0}, {"plant": 3.0, "sensor": 9.0, "both": 9.0}, "sensor"),
-        "both by chance": ({FORCE: 9.0, BIAS: 3.0}, {"plant": 9.0, "sensor": 3.0, "both": 14.0}, "plant"),
-        "both": ({FORCE: 9.0, BIAS: 3.0}, {"plant": 9.0, "sensor": 3.0, "both": 14.1}, "both"),
-        "both, mostly the sensor": ({FORCE: 3.0, BIAS: 9.0}, {"plant": 3.0, "sensor": 9.0, "both": 14.1}, "both"),
-        "mostly the sensor": ({FORCE: 3.0, BIAS: 9.0}, {"plant": 3.0, "sensor": 9.0, "both": 13.9}, "sensor"),
-        "an effort's bias would do the same": (
-            {READ_FORCE: 9.0, BIAS: 3.0},
-            {"plant": 9.0, "sensor": 3.0, "both": 20.0},
-            "either",
-        ),
-        "another force weighs more": (
-            {READ_FORCE: 3.0, FORCE: 9.0},
-            {"plant": 9.0, "sensor": 0.0, "both": 9.0},
-            "plant",
-        ),
-        "little": ({FORCE: 0.1}, {"plant": 0.1, "both": 0.1}, "plant"),
+        "nothing": ({FORCE: 0.0}, 0.0, 0.0, 0.0, "none"),
+        "worse than nothing": ({FORCE: 9.0}, -1.0, -2.0, -1.0, "none"),
+        "plant": ({FORCE: 9.0, BIAS: 0.0}, 9.0, 3.0, 9.0, "plant"),
+        "sensor": ({FORCE: 0.0, BIAS: 9.0}, 3.0, 9.0, 9.0, "sensor"),
+        "both by chance": ({FORCE: 9.0, BIAS: 3.0}, 9.0, 3.0, 14.0, "plant"),
+        "both": ({FORCE: 9.0, BIAS: 3.0}, 9.0, 3.0, 14.1, "both"),
+        "both, mostly the sensor": ({FORCE: 3.0, BIAS: 9.0}, 3.0, 9.0, 14.1, "both"),
+        "mostly the sensor": ({FORCE: 3.0, BIAS: 9.0}, 3.0, 9.0, 13.9, "sensor"),
+        "an effort's bias would do the same": ({READ_FORCE: 9.0, BIAS: 3.0}, 9.0, 3.0, 20.0, "either"),
+        "another force weighs more": ({READ_FORCE: 3.0, FORCE: 9.0}, 9.0, 0.0, 9.0, "plant"),
+        "little": ({FORCE: 0.1}, 0.1, 0.0, 0.1, "plant"),
     },
 )
-def test_the_side_of_a_gap_by_evidence(weight, evidence, side):
-    assert smoothed(weight, evidence=evidence).gap_origin == side
+def test_the_side_of_a_gap_by_evidence(weight, plant, sensor, both, side):
+    assert smoothed(weight, evidence={"plant": plant, "sensor": sensor, "both": both}).gap_origin == side
 
 
 @cases(

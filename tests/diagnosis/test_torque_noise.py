@@ -83,9 +83,8 @@ def problem_of(step: Step, recordings: list[Recording], held_out: list[Recording
 
 def composed(step: Step, held_out: bool, *candidates: str) -> AllCandidatesProblem:
     problem = problem_of(step, [recorded(step, 1)])
-    effects = make_candidate_effects(
-        step.system, [problem.episodes[0].recording], list(candidates) or ["joint_viscous"]
-    )
+    recordings = [problem.episodes[0].recording]
+    effects = make_candidate_effects(step.system, recordings, list(candidates) or ["joint_viscous"])
     return AllCandidatesProblem.from_problem(problem, effects, [recorded(step, 2)] if held_out else [])
 
 
@@ -93,21 +92,16 @@ def composed(step: Step, held_out: bool, *candidates: str) -> AllCandidatesProbl
 def test_all_hypotheses_share_weights_frozen_at_one_point(step, held_out):
     made = composed(step, held_out)
     weighted = made.whitened_at({"elbow.stiffness": 2.5})
-    assert (weighted.candidate_effects, weighted.is_split_in_blocks) == (
-        made.candidate_effects,
-        made.is_split_in_blocks,
-    )
+    assert weighted.candidate_effects == made.candidate_effects
+    assert weighted.is_split_in_blocks == made.is_split_in_blocks
     own = weighted.problem
     extended = weighted.with_free_effects(weighted.candidate_effects)
     assert all(x is y is not None for x, y in zip(own.whitening_filters, extended.whitening_filters, strict=True))
     held = zip(own.held_out_whitening_filters, extended.held_out_whitening_filters, strict=True)
     assert all(x is y is not None for x, y in held)
     assert made.problem.whitening_filters == made.problem.held_out_whitening_filters == (None,)
-    there = own.evaluate(own.vector({"elbow.stiffness": 2.5}), False)
-    again = problem_whitened_at(own, own.vector({"elbow.stiffness": 2.5})).evaluate(
-        own.vector({"elbow.stiffness": 2.5}), False
-    )
-    assert there.cost == pytest.approx(again.cost, rel=0.02)
+    x = own.vector({"elbow.stiffness": 2.5})
+    assert own.evaluate(x, False).cost == pytest.approx(problem_whitened_at(own, x).evaluate(x, False).cost, rel=0.02)
 
 
 @cases("held_out", {"held_out": True, "in_blocks": False})
@@ -118,18 +112,12 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
     at = {"elbow.stiffness": 2.5}
     x, frozen = (wide.vector({**at, "effort_offset@shoulder.offset": value}) for value in (0.3, 0.0))
     moved = problem_with_relinearized_held_out(problem_relinearized_at_torque_bias(wide, x, frozen), x, frozen)
-    for before, after in (
-        (wide.whitening_filters, moved.whitening_filters),
-        (wide.held_out_whitening_filters, moved.held_out_whitening_filters),
-    ):
-        assert after[0].filter_steps is before[0].filter_steps
-        np.testing.assert_allclose(
-            after[0].input_errors.torque_bias, before[0].input_errors.torque_bias - 0.3, atol=1e-12
-        )
-    there, then = (
-        problem_whitened_by_sensor_noise(moved).evaluate(x),
-        problem_whitened_by_sensor_noise(wide).evaluate(frozen),
-    )
+    for group in ("whitening_filters", "held_out_whitening_filters"):
+        [before], [after] = getattr(wide, group), getattr(moved, group)
+        assert after.filter_steps is before.filter_steps
+        biases = before.input_errors.torque_bias - 0.3, after.input_errors.torque_bias
+        np.testing.assert_allclose(*biases, atol=1e-12)
+    there, then = (problem_whitened_by_sensor_noise(own).evaluate(at) for own, at in ((moved, x), (wide, frozen)))
     np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
     own, nominal = (
         problem.whitened_held_out_residual(0, *problem.predict_held_out(point)[0]).residual
