@@ -43,9 +43,9 @@ def places(system, frames, q):
     return np.array(function(q, system.parameters.vector())).T
 
 
-def holding_pendulum(folder):
+def holding_pendulum(folder, links=3):
     """A pendulum of two motors that takes the end of a rod on the ground."""
     robot = read_urdf(folder / "double_pendulum.urdf")
-    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
+    rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
     grasps = [Grasp("hand", "tip", "w_T1")]
     return System.build(robot, objects=[(rod, None, None)], grasps=grasps, driven=["shoulder", "elbow"])

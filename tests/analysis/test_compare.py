@@ -67,7 +67,9 @@ def test_nothing_to_agree_on(repository, tmp_path, capsys):
 def test_command(repository, clean, tmp_path, capsys):
     config = repository / "configs" / "single_arm_no_vision.yaml"
     settings = [
-        "problem.duration=0.5",
+        "problem.duration=0.3",
+        "problem.use_compiler=false",
+        "model.object.links=1",
         "compare.methods={gauss_newton: {}, single_shooting: {}}",
         "parameters={}",
         "parameters={T1.bend: {free: true, initial: 15}, T1.twist: {initial: 13.6}, T2.bend: {initial: 10.7}, "

@@ -106,7 +106,7 @@ def test_a_stiffness_enters_the_rows_of_its_joints_alone(step):
 
 def made_problem(urdf_folder, feedback, start):
     """Four steps of the motors' small motion, a point between two nodes seen, parameters with a prior."""
-    system = holding_pendulum(urdf_folder)
+    system = holding_pendulum(urdf_folder, links=2)
     t = 0.01 * np.arange(5)
     path = np.stack([0.02 * t, 0.03 * t], axis=1)
     joints = JointGroup(

@@ -202,36 +202,6 @@ def steps(problem, std, unit):
     return [-d for d in moved if d < 0], [d for d in moved if d > 0]
 
 
-@pytest.mark.parametrize(
-    ("guess", "asked"),
-    [
-        (1.0, [1.0]),
-        (0.995, [0.995]),
-        (0.1, [0.1, 0.4, 1.18, 1.0]),
-        (0.04, [0.04, 0.16, 0.64, 1.108, 1.0]),
-        (0.9, [0.9, 1.08, 1.0]),
-        (5.0, [5.0, 1.0]),
-        (15.0, [15.0, 7.5, 7.5 - 6.5 * 7.5 / 7.0, 1.0]),
-    ],
-)
-def test_a_line_is_followed_no_faster_than_it_is_known(guess, asked):
-    """A parabola's root is a line: the next point is a third beyond its end, no more than three times what is gone.
-
-    Of two sides, one that is kept counts half; heights of more than ten times the end's are halved.
-    """
-    problem = Formula(lambda x: [2 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, scales={"a": 100.0})
-    for side in steps(problem, 0.5 * guess, 0.5 * HALF):
-        assert side == pytest.approx(asked, rel=1e-6)
-
-
-def test_the_first_step_is_no_larger_than_the_unknown_itself():
-    either = Formula(lambda x: [0 * x["a"] + 1.0], {"a": 3.0}, bounds=OPEN, scales={"a": 2.0})
-    below, above = steps(either, math.inf, HALF)
-    assert below[0] == above[0] == pytest.approx(20.0)
-    below, above = steps(Formula(lambda x: [0 * x["a"] + 1.0], {"a": 3.0}), math.inf, 3.0)
-    assert [1 - below[0], 1 + above[0]] == pytest.approx([math.exp(-0.5 * HALF), math.exp(0.5 * HALF)])
-
-
 def test_refits_leave_little_on_the_table():
     """The other unknown follows the first on a curve, so that its tangent alone is not enough."""
 
@@ -258,23 +228,6 @@ def test_edges_take_few_refits():
     assert below == pytest.approx([1.0])
     # half the way to where it failed, time and again
     assert above[:3] == pytest.approx([1.0, 1.0, 0.5], rel=1e-6)
-
-
-def test_a_refit_that_fails_takes_ever_shorter_steps_and_gives_up_after_nine():
-    """The other unknown would follow on a parabola; where it moves at all the model cannot be rolled out."""
-    problem = Formula(
-        lambda x: [0.01 * (x["a"] - 3.0), x["b"] - 0.3 * (x["a"] - 3.0) ** 2],
-        {"a": 3.0, "b": 0.0},
-        bounds=OPEN,
-        scales={"a": 100.0, "b": 1.0},
-        fails=lambda v: v["b"] > 1e-9,
-    )
-    profiled(problem, std=100.0)
-    first = next(x[0] for x in problem.asked if x[0] > 3.0)
-    assert first == pytest.approx(3.0 + 100 * HALF)
-    whole, tried = 0.3 * (first - 3.0) ** 2, [b for a, b in problem.asked if a == first]
-    expected = [0.0, *(1 / (1 + damping) for damping in (1e-8, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0))]
-    np.testing.assert_allclose(np.array(tried) / whole, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("left", "refitted"), [(0.7e-3, False), (1.5e-3, True)])

@@ -16,7 +16,7 @@ from yid_ocp.analysis.what_if import what_if
 from yid_ocp.data.recording import PointGroup
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.inference.whitening import problem_whitened_at, problem_without_input_errors
-from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.workflow.build_problem import load_problem
 
 STEPS, NX, NU, READINGS = 30, 4, 2, 3
@@ -91,7 +91,8 @@ def test_few_unknowns_have_the_covariance_of_all(made, size):
 # -- experiments ------------------------------------------------------------------------------------------------------
 
 
-def short(repository, *settings):
+@pytest.fixture(scope="module")
+def noisy(repository):
     """One arm on a coarse Y, for a second; its torques have white noise and offsets."""
     coarse = (
         "model.object.links=1",
@@ -101,12 +102,13 @@ def short(repository, *settings):
         "parameters={}",
         "parameters={T1.bend: {free: true, initial: 20}, T2.bend: {free: true, initial: 10}, T2.twist: {initial: 10}}",
     )
-    return load_problem(repository / "configs" / "single_arm_vision.yaml", (*coarse, *settings))
+    return load_problem(repository / "configs" / "single_arm_vision.yaml", coarse)
 
 
-@pytest.fixture(scope="module")
-def noisy(repository):
-    return short(repository)
+def half_without(problem, *groups):
+    """Half a second of a problem without some sensors."""
+    sensors = {**problem.options.sensors, **{name: SensorOptions(use=False) for name in groups}}
+    return problem.with_options(replace(problem.options, sensors=sensors, duration=0.5))
 
 
 def relative(problem):
@@ -125,13 +127,9 @@ def test_the_experiment_as_it_is_knows_the_noise_of_its_torques(noisy, ranking):
         assert std > 1.2 * exact[name]
 
 
-def test_encoders_that_are_measurements_stay_so(repository):
-    problem = short(repository, "problem.duration=0.5", "sensors.points_arm.use=false")
-    found = what_if(problem, considered_changes=("rate:30",)).unchanged_experiment.std_relative
-    without = short(
-        repository, "problem.duration=0.5", "sensors.points_arm.use=false", "sensors.joints.position.use=false"
-    )
-    blind = what_if(without, considered_changes=("rate:30",)).unchanged_experiment.std_relative
+def test_encoders_that_are_measurements_stay_so(noisy):
+    problem, without = (half_without(noisy, "points_arm", *more) for more in ((), ("joints.position",)))
+    found, blind = (what_if(one, considered_changes=()).unchanged_experiment.std_relative for one in (problem, without))
     for name, std in relative(problem).items():
         assert found[name] == pytest.approx(std, rel=0.3)
         assert found[name] < 0.5 * blind[name]
