@@ -287,10 +287,8 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         seen = math.sqrt(max(squares) / free)
         if not seen < 1 / QUALITY_LIMITS.max_overstatement_ratio:
             continue
-        stated = [
-            s.std[s.used_output_mask] for e in problem.episodes for s in e.measurements if s.sensor.group_name == group
-        ]
-        usual = float(np.median(np.concatenate(stated)))
+        own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
+        usual = float(np.median(np.concatenate([s.std[s.used_output_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
         words = (
             f"the fit leaves {seen * usual:.2g} {unit} of {group}, all slow errors counted; "

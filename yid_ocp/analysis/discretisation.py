@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 import scipy.optimize
 
+from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.arrays import Array
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
@@ -231,12 +232,9 @@ def min_grasp_closure_errors(system: System, posture: Mapping[str, float], theta
     """
     if not system.grasps:
         return {}
-    q = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, q)
-    symbols = ca.vertcat(system.parameters.symbols, *system.internal_coordinates.values())
-    numbers = np.concatenate([theta, np.zeros(len(system.internal_coordinates))])
-    ends = [grasp.constraint_residual(kinematics)[:3] for grasp in system.grasps]
-    phi = ca.substitute(ca.vertcat(*ends), symbols, ca.SX(ca.DM(numbers)))
+    q, numeric = ca.SX.sym("q", system.n_coordinates), system_with_numeric_parameters(system, theta)
+    kinematics = forward_kinematics(numeric.mechanism, q)
+    phi = ca.vertcat(*(grasp.constraint_residual(kinematics)[:3] for grasp in numeric.grasps))
     known = [system.mechanism.joint_index(name) for name in posture]
     free = [i for i in range(system.n_coordinates) if i not in known]
     full = np.zeros(system.n_coordinates)

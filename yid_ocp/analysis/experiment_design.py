@@ -291,14 +291,8 @@ class CandidateExperimentBuilder:
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
         step, seen = add_observable_frames_to_step(step)
         wide = with_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
-        options = replace(
-            wide.options,
-            sensors=self._joint_sensors(mechanics),
-            huber_threshold=math.inf,
-            weak_prior_factor=0.0,
-            weighting="whitened",
-            duration=None,
-        )
+        plain = replace(wide.options, huber_threshold=math.inf, weak_prior_factor=0.0, weighting="whitened")
+        options = replace(plain, sensors=self._joint_sensors(mechanics), duration=None)
         dense = [self._dense(entry, i, seen, "torque" in mechanics) for i, entry in enumerate(recordings)]
         values = {name: v for name, v in setting.parameter_values.items() if name in step.system.parameters}
         nuisances = [name for name in wide.free if name not in base.free]
@@ -336,11 +330,8 @@ class CandidateExperimentBuilder:
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Least standard deviation that each group's points can have in a recording [m]."""
         finest = {}
-        samplings = (
-            (CAMERA_GROUP, self.setting.camera_sample_times_and_std),
-            (ARM_GROUP, self.setting.arm_sample_times_and_std),
-        )
-        for default, sampling in samplings:
+        samplings = self.setting.camera_sample_times_and_std, self.setting.arm_sample_times_and_std
+        for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
         for view in self.setting.existing_sensor_observations(episode):
@@ -447,11 +438,8 @@ class CandidateExperimentBuilder:
             np.array([getattr(joint, f"{name}_limit") for joint in limits]) for name in ("lower", "upper", "effort")
         )
         beyond = {"range": (q.min(0) < low) | (q.max(0) > high), "torque": np.abs(run.effort).max(0) > most}
-        notes = [
-            f"beyond the {what} of {', '.join(np.array(system.driven)[over])}"
-            for what, over in beyond.items()
-            if over.any()
-        ]
+        names = {what: ", ".join(np.array(system.driven)[over]) for what, over in beyond.items() if over.any()}
+        notes = [f"beyond the {what} of {joints_beyond}" for what, joints_beyond in names.items()]
         return Recording(joints, source="what if", name=episode.name), notes
 
     def _dense(self, recording: Recording, index: int, seen: Sequence[_ObservableFrame], torque: bool) -> Recording:
@@ -514,12 +502,14 @@ def _frame_positions(system: System, values: Mapping[str, float], frames: Sequen
 
 
 def _pushed_together(system: System, values: Mapping[str, float]) -> dict[str, Array]:
-    """Offsets of grippers that take an object held by several out of its full stretch."""
+    """Offsets of grippers that take an object held by several out of its full stretch [m]."""
+
+    def direction(x: Array) -> Array:
+        return np.asarray(x / max(float(np.linalg.norm(x)), 1e-9))
+
     points = _frame_positions(system, values, system.point_frames, np.zeros((1, system.n_coordinates)))[0]
     middle, held = points.mean(0), dict(zip(system.point_frames, points, strict=True))
     away = np.array([middle[0], middle[1], 0.0])
-    forward = _FORWARD_GRIPPER_OFFSET * away / max(float(np.linalg.norm(away)), 1e-9)
+    forward = _FORWARD_GRIPPER_OFFSET * direction(away)
     inward = {grasp.name: middle - held[grasp.held_frame] for grasp in system.grasps if grasp.held_frame in held}
-    return {
-        name: _INWARD_GRIPPER_OFFSET * x / max(float(np.linalg.norm(x)), 1e-9) + forward for name, x in inward.items()
-    }
+    return {name: _INWARD_GRIPPER_OFFSET * direction(x) + forward for name, x in inward.items()}

@@ -451,9 +451,6 @@ class _Component:
     unit: str
 
 
-_DataChange = Callable[[Mapping[str, float]], float]
-"""How far the data move where parameters take new values [standard deviations]."""
-
 # what may be seen of a and b: words, slope of a relative change that leaves it, b that does with a new a, like units
 _Combination = tuple[str, Callable[[float, float], tuple[float, float]], Callable[[float, float, float], float], bool]
 _COMBINATIONS: tuple[_Combination, ...] = (
@@ -484,7 +481,7 @@ def _unseen_words(view: _Sensitivities, vector: Array) -> str:
     if float(np.linalg.norm(view.by_alone @ vector)) * MAX_WEAK_RELATIVE_STD >= 1.0:
         what = parts[0].name if len(parts) == 1 else "this: " + _combination_words(parts)
         return f"{what} cannot be told apart from {_hiding_nuisances(view, vector)}"
-    form = _combination(parts[0], parts[1], lambda changes: _moved(view, changes)) if len(parts) == 2 else None
+    form = _combination(view, *parts) if len(parts) == 2 else None
     if form is None:
         return _combination_words(parts)
     names = [part.name for part in parts]
@@ -547,7 +544,7 @@ def _joined(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _combination(first: _Component, second: _Component, moved: _DataChange) -> str | None:
+def _combination(view: _Sensitivities, first: _Component, second: _Component) -> str | None:
     """Words on the plain combination of two parameters that the data determine, also at a finite change, if any."""
     direction = np.array([first.coefficient, second.coefficient])
     direction /= np.linalg.norm(direction)
@@ -561,9 +558,9 @@ def _combination(first: _Component, second: _Component, moved: _DataChange) -> s
             continue
         new_b = partner(a, b, new_a)
         if new_b > 0:
-            tried.append((moved({first.name: new_a, second.name: new_b}), words))
+            tried.append((_moved(view, {first.name: new_a, second.name: new_b}), words))
     if not tried:
         return None
     least, best = min(tried, key=lambda entry: entry[0])
-    allowed = max(_MAX_RELATIVE_DATA_CHANGE * moved({first.name: new_a}), 1.0)
+    allowed = max(_MAX_RELATIVE_DATA_CHANGE * _moved(view, {first.name: new_a}), 1.0)
     return best if math.isfinite(least) and least <= allowed else None

@@ -185,11 +185,9 @@ def _angle_issues(arm: RecordedJointsModel, position: Array) -> Iterator[Issue]:
     for j in np.flatnonzero(beyond > margin):
         name, unit = arm.joint_names[j], arm.joints[j].coordinate_unit
         words = f"{name} goes {beyond[j]:.3g} {unit} beyond its limits of {low[j]:.3g} to {high[j]:.3g}"
-        advice, depth = (
-            "check the joint's zero, unit and column, and that the recording is this robot's",
-            beyond[j] / margin,
-        )
-        yield Issue("angle_limits", words, "not_trusted", float(depth), advice, "", channel=f"position.{name}")
+        advice = "check the joint's zero, unit and column, and that the recording is this robot's"
+        depth = float(beyond[j] / margin)
+        yield Issue("angle_limits", words, "not_trusted", depth, advice, "", channel=f"position.{name}")
 
 
 def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterator[Issue]:
@@ -273,10 +271,8 @@ def check_joint_excitation(
             if joints is None or joint not in joints.names:
                 continue
             angle = joints.position[:, joints.names.index(joint)]
-            noise, given = (
-                white_noise_std(joints.t, angle),
-                joints.position_std if position.std is None else position.std,
-            )
+            noise = white_noise_std(joints.t, angle)
+            given = joints.position_std if position.std is None else position.std
             if given is not None:
                 std = expand_to_joint_values(given, joints.names, (joint,), f"sensors.{JOINT_POSITION_GROUP_NAME}.std")
                 noise = max(noise, float(std[0]))
@@ -450,9 +446,8 @@ def _by_joint(data: _Data) -> Iterator[Issue]:
 
 def _signs(arm: RecordedJointsModel, fit: _Fit, turned: BoolArray, upright: BoolArray) -> Iterator[Issue]:
     depth = -fit.inverse / fit.std / (_MIN_Z / 2)
-    cases = [
-        (f"the effort of {arm.joint_names[j]} has", float(depth[j]), arm.joint_names[j]) for j in np.flatnonzero(turned)
-    ]
+    wrong = ((arm.joint_names[j], float(depth[j])) for j in np.flatnonzero(turned))
+    cases = [(f"the effort of {name} has", by, name) for name, by in wrong]
     if turned.sum() >= 2 and not upright.any():
         cases = [("all efforts have", float(np.max(depth[turned])), "")]
     for who, by, joint in cases:

@@ -117,10 +117,9 @@ def _explained(changes: Sequence[_Change], error: float, allowed: float, recordi
         words, where = f"{words}; {chosen.words} it is {chosen.error:.2g} m", "joints" if chosen.channel else group
         place = recording, where, chosen.channel
         return Issue(chosen.cause, words, "not_trusted", depth, chosen.advice, *place, setting=chosen.setting)
+    words = f"{words}, and no simple change explains it"
     advice = "check the frame of the points, their names and the robot's description"
-    return Issue(
-        "point_unlike", f"{words}, and no simple change explains it", "not_trusted", depth, advice, recording, group
-    )
+    return Issue("point_unlike", words, "not_trusted", depth, advice, recording, group)
 
 
 def _noise(group: PointGroup) -> float:
@@ -286,9 +285,8 @@ def check_point_distances(
                 worst, ratio = far / allowed, far / bound if bound > 0 else 1.0
                 words = f"{said_as} is {far:.3g} m, {bound:.3g} m along the object"
         if worst > 1:
-            unit = ratio > 5
             cause, advice = "point_reach", "check the frame of the points, the camera's pose and their names"
-            if unit:
+            if ratio > 5:
                 cause, advice = "point_scale", f"check the unit of positions (they are {ratio:.2g} times too far)"
             yield Issue(cause, words, "not_trusted", worst, advice, recording.name, group.name)
 

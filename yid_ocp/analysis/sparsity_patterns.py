@@ -70,10 +70,9 @@ def _pattern(
     name: str, title: str, mask: BoolArray, rows: Sequence[_Block], columns: Sequence[_Block]
 ) -> SparsityPattern:
     def named(blocks: Sequence[_Block]) -> tuple[tuple[NamedIndexRange, ...], tuple[str, ...]]:
-        ends = np.cumsum([0, *(len(own) for _, own in blocks)]).tolist()
-        spans = (
-            NamedIndexRange(*entry) for entry in zip((name for name, _ in blocks), ends[:-1], ends[1:], strict=True)
-        )
+        spans, at = [], 0
+        for block, own in blocks:
+            spans.append(NamedIndexRange(block, at, at := at + len(own)))
         return tuple(spans), tuple(label for _, own in blocks for label in own)
 
     (row_spans, row_labels), (column_spans, column_labels) = named(rows), named(columns)
@@ -130,10 +129,8 @@ def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
     unknowns = _blocks(symbols, "q1", "z1", "lam", kept=free)
     residual = _blocks(symbols, "del", "internal", "constraint", kept=free)
     before, after = _blocks(symbols, "q0", "p0", "z0"), _blocks(symbols, "q1", "p1", "z1")
-    every, torque, theta = (
-        [(b.name, b.labels) for b in symbols.row_blocks],
-        *(_blocks(symbols, b) for b in ("u", "theta")),
-    )
+    every = [(block.name, block.labels) for block in symbols.row_blocks]
+    torque, theta = _blocks(symbols, "u"), _blocks(symbols, "theta")
     by_theta = whole[:, symbols.block_slice("theta")]
     found = (
         _pattern("dR_dy", "residual of a step by its unknowns", by_unknown, residual, unknowns),

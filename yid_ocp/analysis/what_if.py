@@ -329,11 +329,8 @@ class _Outcomes:
         ]
         views += [look(change.camera_frame) for change in changes if change.camera_frame]
         feels = [*sorted(held - before), *(change.arm_frame for change in changes if change.arm_frame)]
-        views += [
-            FrameObservationSchedule(feeling, frame, arm_times, np.full((len(arm_times), 3), arm_std))
-            for frame in feels
-        ]
-        return views
+        felt = np.full((len(arm_times), 3), arm_std)
+        return views + [FrameObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
 
 
 def _relative_stds_and_gain(layout: CandidateExperiment, information: Array) -> tuple[dict[str, float], float]:

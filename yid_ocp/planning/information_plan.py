@@ -243,11 +243,8 @@ def _unseen(experiment: PlannedExperiment, told: Sequence[Array | None]) -> dict
         if rows is not None:
             largest = np.maximum(largest, np.linalg.norm(rows, axis=0))
     named = zip(experiment.column_names, largest, strict=True)
-    return {
-        name: float(size)
-        for name, size in named
-        if name.split("[")[0] in experiment.free_parameters and size < _UNOBSERVABLE_STDS
-    }
+    hidden = {name: float(size) for name, size in named if size < _UNOBSERVABLE_STDS}
+    return {name: size for name, size in hidden.items() if name.split("[")[0] in experiment.free_parameters}
 
 
 def _check_seen(
@@ -377,9 +374,8 @@ def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: 
     def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
 
-    for rows, own in limits.limits_with_quantity_values(
-        limits.limited_quantity_values(mover.simulate_path(w), w).value
-    ):
+    values = limits.limited_quantity_values(mover.simulate_path(w), w).value
+    for rows, own in limits.limits_with_quantity_values(values):
         near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
         found[rows.description] = reached(rows.row_names, near)
     flat = w.ravel()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -23,6 +23,7 @@ from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo
 from yid_ocp.parallel import CASADI_LOCK
 
+_Value = TypeVar("_Value")
 _Vector3 = tuple[float, float, float]
 _PlanGoal = Literal["place", "path", "box", "information"]
 
@@ -426,7 +427,7 @@ def solve_end_equilibrium(
         raise ConfigError(what, where="plan.point", allowed=allowed, hint="set model.grasp, or name another point")
     guess = [start.state[:n]]
 
-    @_last_kept
+    @last_value_kept
     def rows(x: Array) -> tuple[Array, Array]:
         rest = statics.solve(x, theta, guess=guess[0])
         if not rest.is_converged:
@@ -448,11 +449,11 @@ def solve_end_equilibrium(
     return _EndEquilibrium(found.x, rest, distance, limits)
 
 
-def _last_kept(function: Callable[[Array], tuple[Array, Array]]) -> Callable[[Array], tuple[Array, Array]]:
+def last_value_kept(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
     """The function with its last value kept: searches ask for residual and slope of a point one after the other."""
-    last: list[tuple[Array, tuple[Array, Array]]] = []
+    last: list[tuple[Array, _Value]] = []
 
-    def at(x: Array) -> tuple[Array, Array]:
+    def at(x: Array) -> _Value:
         if not last or not np.array_equal(last[-1][0], x):
             last[:] = [(np.array(x), function(x))]
         return last[-1][1]

@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 
 from yid_ocp.arrays import Array
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanOptions
+from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanOptions, last_value_kept
 
 _LIMIT_NODE_STRIDE = 2  # nodes between those at which limits on what moves freely are asked for
 _QUASI_STATIC_DISTANCE = 1.0  # RMS distance of the joints from the quasi-static motion that counts as one [rad or m]
@@ -208,25 +208,22 @@ class PlanShootingProblem:
 
     def __init__(self, cases: Sequence[PlanResidualsAndLimits], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
-        self._last: tuple[Array, tuple[_ValueWithJacobian, _ValueWithJacobian]] | None = None
+        self._residual_and_limit_values = last_value_kept(self._evaluated)
         self._unit, self._lower, self._upper = limit_units_and_scaled_bounds(self._cases[0].limit_rows)
         self.evaluations = 0
 
-    def _residual_and_limit_values(self, x: Array) -> tuple[_ValueWithJacobian, _ValueWithJacobian]:
+    def _evaluated(self, x: Array) -> tuple[_ValueWithJacobian, _ValueWithJacobian]:
         """Residual and scaled limit values with their Jacobians; not finite where a rollout fails."""
-        if self._last is None or not np.array_equal(self._last[0], x):
-            self.evaluations += 1
-            w = x.reshape(self._shape)
-            rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
-            parts = [case._goal_residual(rollout, w) for case, rollout in zip(self._cases, rollouts, strict=True)]
-            whole, scale = _stacked(parts), 1.0 / np.sqrt(len(self._cases))
-            limits = self._cases[0].limited_quantity_values(rollouts[0], w)
-            assert whole.jacobian is not None
-            assert limits.jacobian is not None
-            residual = _ValueWithJacobian(scale * whole.value, scale * whole.jacobian)
-            scaled = _ValueWithJacobian(limits.value / self._unit, limits.jacobian / self._unit[:, None])
-            self._last = np.array(x), (residual, scaled)
-        return self._last[1]
+        self.evaluations += 1
+        w = x.reshape(self._shape)
+        rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
+        parts = [case._goal_residual(rollout, w) for case, rollout in zip(self._cases, rollouts, strict=True)]
+        whole, scale = _stacked(parts), 1.0 / np.sqrt(len(self._cases))
+        limits = self._cases[0].limited_quantity_values(rollouts[0], w)
+        assert whole.jacobian is not None
+        assert limits.jacobian is not None
+        residual = _ValueWithJacobian(scale * whole.value, scale * whole.jacobian)
+        return residual, _ValueWithJacobian(limits.value / self._unit, limits.jacobian / self._unit[:, None])
 
     def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> PlanShootingResult:
         """Optimise a motion from initial coefficients within bounds, all of shape (K, nc).
