@@ -43,7 +43,7 @@ PROOF = "blind"
 """The command that goes on in the folder it finds, instead of taking a hidden one."""
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 FULL = (50_000.0, 3_000.0)  # geometric mean and least of the sizes of a file on a full disk [bytes]
-ENDING = 0.5  # [s] time within which a process that has done its work may be past listening to a signal
+LATE = 0.1  # [s] by which a result may still get its name after a signal
 LINGER = 20.0
 """How long what a run started may go on when it has ended [s]."""
 TRACK = """\
@@ -136,6 +136,11 @@ class Room:
     def said(self) -> str:
         return (self.folder / "said.txt").read_text(errors="replace")[-600:]
 
+    def newest_result(self) -> float:
+        """When the newest result got its name [s since the epoch]; a named folder's status changes with its name."""
+        named = [*self.folder.glob("runs/[!.]*"), *self.folder.glob("driven-blind-*/result.json")]
+        return max((path.stat().st_ctime for path in named if not path.name.endswith(".partial")), default=0.0)
+
     def look(self, after: str, hidden: bool) -> None:
         """Whether what stands in the room is whole; `hidden`: whether a killed run may have left its hidden folder."""
         for path in self.folder.iterdir():
@@ -204,7 +209,7 @@ def killed(room: Room, rng: Random, command: str) -> str:
     delay = float(rng.uniform(0.0, 1.1 * room.usual[command][1]))
     process = room.start(command)
     time.sleep(delay)
-    asked = time.monotonic() if process.poll() is None else None
+    asked = time.time() if process.poll() is None else None
     process.send_signal(number)
     what = f"{command} and {number.name} after {delay:.2f} s"
     try:
@@ -214,8 +219,8 @@ def killed(room: Room, rng: Random, command: str) -> str:
         process.wait()
         room.wrong.append(f"{what}: no end within 30 s")
         return what
-    if asked is not None and code in (0, 1) and time.monotonic() - asked > ENDING:
-        room.wrong.append(f"{what}: went on to its end with {code}")
+    if asked is not None and code in (0, 1) and (later := room.newest_result() - asked) > LATE:
+        room.wrong.append(f"{what}: went on for {later:.2f} s, to its end with {code}")
     if code not in (0, 1, -number, 128 + number):
         room.wrong.append(f"{what}: ended with {code}: {room.said()}")
     room.alone(process, what)

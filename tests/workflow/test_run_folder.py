@@ -10,8 +10,8 @@ import math
 import pytest
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.errors import OutputError
-from yid_ocp.files import file_sha256
+from yid_ocp.errors import OutputError, WorkerError
+from yid_ocp.files import file_sha256, write_text
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
@@ -168,6 +168,11 @@ def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, mon
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
+    def fail_in_task(file):
+        with pytest.raises(OutputError) as failed:
+            write_text(file, "a")
+        raise WorkerError(f"3 tasks failed: {failed.value}", hint="mend it")
+
     monkeypatch.setattr("yid_ocp.files.os.replace", full)
     with (
         pytest.raises(OutputError, match="No space left") as caught,
@@ -176,3 +181,8 @@ def test_a_full_disk_names_the_folder_that_was_asked_for(settings, tmp_path, mon
         folder.write_text_file("a.txt", "a")
     assert caught.value.where == str(tmp_path / "runs" / "run" / "a.txt")
     assert not (tmp_path / "runs").exists()
+    with pytest.raises(WorkerError) as caught, atomic_run_folder(settings, tmp_path / "run") as folder:
+        fail_in_task(folder.resume_folder / "done.json")
+    assert f"where: {tmp_path / 'run' / 'done.json'}" in caught.value.what
+    assert ".partial" not in str(caught.value)
+    assert caught.value.hint == "mend it"

@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 
 from yid_ocp import interruption
 from yid_ocp.config.settings import RunSettings, dump_config
-from yid_ocp.errors import OutputError
+from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_text
 from yid_ocp.progress import Progress
 from yid_ocp.report.html import write_report
@@ -167,10 +167,17 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
             with interruption.defer_interruption(), contextlib.suppress(OSError):
                 lines.close()
             _clear(temporary, made)
-            if isinstance(error, OutputError) and str(temporary) in error.where:  # its reader knows another name
-                where = error.where.replace(str(temporary), str(target))
-                raise OutputError(error.what, where=where, allowed=error.allowed, hint=_FULL_HINT) from error
+            if isinstance(error, YidError):
+                _name_requested_folder(error, target, temporary, partial)
             raise
+
+
+def _name_requested_folder(error: YidError, target: Path, *hidden: Path) -> None:
+    """Let an error name the folder that was asked for, where it names a hidden one, which its reader does not know."""
+    for path in map(str, hidden):
+        if path in error.what + error.where:
+            error.what, error.where = (text.replace(path, str(target)) for text in (error.what, error.where))
+            error.hint = _FULL_HINT if isinstance(error, OutputError) else error.hint
 
 
 def _publish(folder: RunFolder, lock: FileLock) -> None:
