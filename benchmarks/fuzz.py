@@ -21,7 +21,6 @@ import math
 import multiprocessing
 import os
 import re
-import resource
 import shutil
 import signal
 import subprocess
@@ -520,8 +519,14 @@ def tried(case: Case, originals_folder: Path, work: Path) -> str:
         return f"{LATE} {time.monotonic() - begun:.1f} s"
     if left := [path.name for path in stand.iterdir()]:
         return f"left where the process stands: {left}"
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    peak = peak_memory()
     return f"{peak / 2**30:.1f} GiB" if peak > MEMORY else ""
+
+
+def peak_memory() -> int:
+    """Largest memory of this process so far [bytes]; `ru_maxrss` begins with what the process that started it had."""
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    return 1024 * next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM:"))
 
 
 def serve(there: Connection, originals_folder: str, work: str) -> None:

@@ -71,6 +71,13 @@ def test_what_is_wrong_is_found(fuzz, tmp_path, monkeypatch):
     assert said(fuzz.probe_csv) == ""
 
 
+def test_memory_of_the_process_that_starts_an_input_does_not_count(fuzz):
+    large = np.ones(fuzz.MEMORY // 8 + 2**24)
+    assert fuzz.peak_memory() > fuzz.MEMORY
+    del large
+    assert fuzz.hunt(iter([fuzz.Case("csv", 0)]), 60.0, 1) == (1, [])
+
+
 def test_what_is_damaged_is_sound_before(fuzz, tmp_path, capsys):
     fuzz.originals(tmp_path)
     fuzz.checked(tmp_path)
