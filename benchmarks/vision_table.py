@@ -55,7 +55,7 @@ from yid_ocp.vision import (
     track_object,
 )
 from yid_ocp.vision.frames import import_open3d
-from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes, numeric_mechanism
+from yid_ocp.vision.surface_meshes import TriangleMesh, load_robot_meshes
 
 Array = NDArray[np.float64]
 
@@ -217,7 +217,7 @@ class Stage:
         self.data = mujoco.MjData(self.model)
         names = system.mechanism.joint_names
         self.order = [self.model.joint(name).id for name in names]
-        tree = numeric_mechanism(system, play.values)
+        tree = system.numeric_mechanism(play.values)
         self.robot = load_robot_meshes("package:baxter", tree)
         theta = dict(zip(system.parameters.names, system.parameters.vector(play.values), strict=True))
         self.rods = []

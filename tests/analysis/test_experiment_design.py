@@ -340,7 +340,7 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
     assert grasp.kind == "weld"
     start = free.problem.initial_state(free.problem.episodes[0], *free.problem.split(free.x, 0))
     system, symbol = free.problem.system, ca.SX.sym("q", made.problem.system.n_coordinates)
-    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(None)
+    tree = system.numeric_mechanism()
     kinematics = forward_kinematics(tree, symbol)
     turn = kinematics.frame_pose(grasp.holder_frame).rotation.T @ kinematics.frame_pose(grasp.held_frame).rotation
     wanted = np.array(ca.Function("turn", [symbol], [turn])(start.state[: system.n_coordinates]))

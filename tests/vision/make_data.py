@@ -27,7 +27,7 @@ from yid_ocp.vision import (
 )
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.point_cloud import ReachableObjectRegion, is_statistical_inlier, voxel_averages
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes, numeric_mechanism
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
 
 FOLDER = Path(__file__).parent / "data"
 VOXEL = 0.011
@@ -44,7 +44,7 @@ def main() -> None:
     )
     camera = VirtualCamera(look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=FrameTiming(mean_rate=2.7), seed=5)
     made = render_virtual_frames(CameraScene(system, "package:baxter"), run.t, run.q, camera)
-    tree = numeric_mechanism(system)
+    tree = system.numeric_mechanism()
     robot = ArticulatedSurfaces(tree, load_robot_meshes("package:baxter", tree))
     region = ReachableObjectRegion(system, CloudFilterOptions())
     pose, clouds = made.sequence.camera_pose, []

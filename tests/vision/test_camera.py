@@ -14,7 +14,7 @@ from yid_ocp.vision import (
     look_at_pose,
     render_virtual_frames,
 )
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, numeric_mechanism, tube_meshes_by_joint
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, tube_meshes_by_joint
 
 SHAPE = (480, 640)
 
@@ -94,7 +94,7 @@ def test_virtual_frames_are_the_same_every_time(system, run):
     assert np.array_equal(first, one.sequence.load_cloud(1))
     assert not np.array_equal(one.capture_times[:3], two.capture_times[:3])
     # the object's surface is where the points are
-    tubes = ArticulatedSurfaces(numeric_mechanism(system), tube_meshes_by_joint(system))
+    tubes = ArticulatedSurfaces(system.numeric_mechanism(), tube_meshes_by_joint(system))
     away, _, _ = tubes.nearest_moving_surface(
         one.sequence.load_world_cloud(1), one.true_configuration_at(one.capture_times[1]), 0.2
     )

@@ -11,7 +11,7 @@ from yid_ocp.vision import CloudFilterOptions, ExtraMesh, FrameSequence, look_at
 from yid_ocp.vision.point_cloud import has_wanted_colour
 from yid_ocp.vision.sequence_calibration import BackgroundPoints, group_foreign_clusters
 from yid_ocp.vision.shape_evidence import ForeignCluster, TubeLinks
-from yid_ocp.vision.surface_meshes import extra_meshes_by_joint, numeric_mechanism
+from yid_ocp.vision.surface_meshes import extra_meshes_by_joint
 
 FRAMES = 2
 TABLE = [0.6, 0.5, -0.2], [0.6, 0.8, 0.04]
@@ -112,7 +112,7 @@ def test_what_moves_with_a_link_is_told_from_what_moves_by_itself():
 
 
 def test_extra_meshes_hang_on_links(system):
-    tree = numeric_mechanism(system)
+    tree = system.numeric_mechanism()
     extra = [ExtraMesh(parent_frame="left_gripper", box=(0.1, 0.1, 0.1)), ExtraMesh(sphere=0.2, xyz=(1, 2, 3))]
     made = extra_meshes_by_joint(extra, tree)
     assert set(made) == {-1, tree.frames["left_gripper"].joint_index}

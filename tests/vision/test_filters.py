@@ -11,7 +11,7 @@ from yid_ocp.vision.point_cloud import (
     voxel_averages,
     weighted_median,
 )
-from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes, numeric_mechanism
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
 
 CAMERA = np.array([2.6, 0.0, 0.45])
 
@@ -47,7 +47,7 @@ def test_outliers_go_and_the_surface_stays(share):
 
 
 def test_the_robot_goes_with_its_padding(system, run):
-    tree = numeric_mechanism(system)
+    tree = system.numeric_mechanism()
     meshes = load_robot_meshes("package:baxter", tree)
     robot = ArticulatedSurfaces(tree, meshes)
     wrist = system.mechanism.joint_index("left_w1")

@@ -12,7 +12,6 @@ from yid_ocp.vision.surface_meshes import (
     TriangleMesh,
     _resolve_mesh_path,
     load_robot_meshes,
-    numeric_mechanism,
     tube_meshes_by_joint,
 )
 
@@ -80,7 +79,7 @@ def test_rays_meet_a_ball_where_it_is(ball):
 
 
 def test_baxters_meshes_are_found_and_move(system):
-    tree = numeric_mechanism(system)
+    tree = system.numeric_mechanism()
     meshes = load_robot_meshes("package:baxter", tree)
     assert set(meshes) == {-1, *system.driven_coordinate_indices}
     finger = meshes[system.mechanism.joint_index("left_w2")].vertices

@@ -80,7 +80,7 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
 
 def _tree(system: System, values: Mapping[str, float]) -> tuple[Mechanism, dict[str, JointDynamicsTerms]]:
     """The tree in numbers, its bodies without weights of their own, and what its joints have."""
-    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
+    tree = system.numeric_mechanism(values)
     joints = tuple(replace(j, bodies=tuple(replace(b, gravity_fraction=None) for b in j.bodies)) for j in tree.joints)
     return replace(tree, joints=joints), joint_dynamics_terms(system, ParameterEvaluator(system, values))
 

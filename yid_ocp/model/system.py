@@ -447,6 +447,10 @@ class System(ReprMixin):
         mapped: System = map_expressions(replace(self, effects=()), change)
         return replace(mapped, effects=self.effects)
 
+    def numeric_mechanism(self, values: Mapping[str, float] | None = None) -> Mechanism:
+        """The mechanism with numbers in place of all of the system's parameters, nominal where absent."""
+        return replace(self.mechanism, parameters=self.parameters).with_numeric_values(values)
+
     def elastic_energy(self, q: ca.SX) -> ca.SX:
         """Elastic energy, the sum of 1/2 stiffness (q - rest)^2 over the elastic joints [J]."""
         index = self.mechanism.joint_index

@@ -126,7 +126,7 @@ def random_multisine_motion(
     motion = MultisineMotion(system.driven, amplitude, frequency, phase, chosen.ramp_time)
     times = np.linspace(0.0, chosen.duration, 251)
     start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
-    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
+    tree = system.numeric_mechanism(values)
     q0 = np.zeros(system.n_coordinates)
     q0[[tree.joint_index(name) for name in start]] = list(start.values())
     holders = [tree.frame(grasp.holder_frame) for grasp in system.grasps]
@@ -231,7 +231,7 @@ def grasping_joint_angles(
     ModelError
         The grasped points cannot be reached within the joint limits.
     """
-    tree = replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)
+    tree = system.numeric_mechanism(values)
     value = ParameterEvaluator(system, values)
     posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})
     elastic = {spring.joint_name for spring in system.elastic_joints}

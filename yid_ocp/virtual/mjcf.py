@@ -294,7 +294,7 @@ def mujoco_xml(
     """
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml", allowed="a positive number of seconds")
-    tree, weights = _weighed(replace(system.mechanism, parameters=system.parameters).with_numeric_values(values))
+    tree, weights = _weighed(system.numeric_mechanism(values))
     value = ParameterEvaluator(system, values)
     _refuse_inexpressible(system, value, emulate)
 

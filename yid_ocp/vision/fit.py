@@ -41,7 +41,7 @@ from yid_ocp.vision.shape_evidence import (
     tube_like_node_point_masks,
     tube_link_projections,
 )
-from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_link_lengths_and_radii
+from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 _Left = tuple[BoolArray, BoolArray]
 """Which of a frame's nodes and points count."""
@@ -125,7 +125,7 @@ class ShapeFitter:
         self.options = options or ShapeFitOptions()
         if not system.segment_layouts:
             raise DataError("the model has no object whose shape could be fitted", hint="give it segments")
-        tree = self._tree = numeric_mechanism(system, values)
+        tree = self._tree = system.numeric_mechanism(values)
         symbols, theta = system.parameters.symbols, system.parameters.vector(values)
 
         def number(expression: ca.SX) -> float:

@@ -28,7 +28,6 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System, floating_clamp
 from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud
-from yid_ocp.vision.surface_meshes import numeric_mechanism
 
 _NEIGHBOURS = 10
 _SPACINGS = 3.0  # points further apart than so many of their usual distance do not hang together
@@ -223,7 +222,7 @@ def system_with_free_root(system: System, values: Mapping[str, float] | None = N
 
     They are the root's place [m], then its turns about x, y and z [rad].
     """
-    tree = numeric_mechanism(system, values)
+    tree = system.numeric_mechanism(values)
     q = ca.SX.sym("q", system.n_coordinates)
     base = tree.joint_index(next(s for s in system.segment_layouts if s.parent_segment is None).link_joints[0][0])
     place = ca.Function("root", [q], [forward_kinematics(tree, q).joint_origins[base]])(np.zeros(system.n_coordinates))

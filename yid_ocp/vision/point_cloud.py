@@ -19,7 +19,7 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
-from yid_ocp.vision.surface_meshes import numeric_mechanism, tube_link_lengths_and_radii
+from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 XyzCoordinates = tuple[float, float, float]
 _ColourComponent = Annotated[float, Ge(0), Le(255)]
@@ -129,7 +129,7 @@ class ReachableObjectRegion:
         *,
         anywhere: bool = False,
     ) -> None:
-        tree, sizes = numeric_mechanism(system, values), tube_link_lengths_and_radii(system, values)
+        tree, sizes = system.numeric_mechanism(values), tube_link_lengths_and_radii(system, values)
         reach: dict[str, float] = {}
         for segment in system.segment_layouts:
             before = reach[segment.parent_segment] if segment.parent_segment else 0.0

@@ -412,8 +412,3 @@ def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = No
                 parts.append(TriangleMesh.sphere(radius))
             meshes[system.mechanism.joint_index(names[-1])] = TriangleMesh.concatenate(parts)
     return meshes
-
-
-def numeric_mechanism(system: System, values: Mapping[str, float] | None = None) -> Mechanism:
-    """A system's mechanism with numbers in place of all of the system's parameters."""
-    return replace(system.mechanism, parameters=system.parameters).with_numeric_values(values)

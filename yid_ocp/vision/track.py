@@ -62,7 +62,6 @@ from yid_ocp.vision.surface_meshes import (
     TriangleMesh,
     extra_meshes_by_joint,
     load_robot_meshes,
-    numeric_mechanism,
 )
 from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, TrackResult
 
@@ -163,7 +162,7 @@ class FrameTracker:
         # of a root that is sought nothing that was recorded is needed
         known = () if anywhere else self.shape_fitter.recorded_joint_names
         self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
-        tree = numeric_mechanism(system, values)
+        tree = system.numeric_mechanism(values)
         meshes: dict[int, TriangleMesh] = {}
         if scene.robot_urdf is not None:
             meshes = load_robot_meshes(scene.robot_urdf, tree, options.robot_mesh_kind)

@@ -27,7 +27,6 @@ from yid_ocp.vision.surface_meshes import (
     CameraScene,
     TriangleMesh,
     load_robot_meshes,
-    numeric_mechanism,
     tube_meshes_by_joint,
 )
 
@@ -164,7 +163,7 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     course = CubicSpline(times, path, axis=0)
     configuration = np.asarray(course(taken))
     of = scene.system, scene.parameter_values
-    tree, meshes = numeric_mechanism(*of), tube_meshes_by_joint(*of)
+    tree, meshes = scene.system.numeric_mechanism(scene.parameter_values), tube_meshes_by_joint(*of)
     robot = load_robot_meshes(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}
     around = [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in _FLOOR_AND_WALL]
     still = [*(around if robot else []), *([robot.pop(-1)] if -1 in robot else [])]
