@@ -23,13 +23,11 @@ from pendulum_run import solved_pendulum as solved_pendulum
 
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.integrator.step_model import RolloutInputs
-from yid_ocp.model import Grasp, System
-from yid_ocp.model.objects.foam_y import foam_y_object
-from yid_ocp.model.urdf import read_urdf
+from yid_ocp.model.system import System
+from yid_ocp.virtual.experiment import baxter_foam_y_system
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-SIDES = {"single": ("left",), "dual": ("left", "right")}
-BAXTER_JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
+ARMS = {"single": 1, "dual": 2}
 STIFFNESSES = ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
 
 hypothesis.settings.register_profile("tests", deadline=None, max_examples=20, derandomize=True)
@@ -97,23 +95,14 @@ def golden(shared):
         text = (shared / "golden" / f"trep_{name}_arm.model.json").read_text(encoding="utf-8")
         return SimpleNamespace(**entries, model=json.loads(text))
 
-    loaded = {name: load(name) for name in SIDES}
+    loaded = {name: load(name) for name in ARMS}
     return loaded.__getitem__
 
 
 @pytest.fixture(scope="session")
 def paper_systems():
     """Baxter with one (`single`) or two (`dual`) arms on the foam Y."""
-
-    def build(sides: tuple[str, ...]) -> System:
-        names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINTS]
-        robot = read_urdf("package:baxter", joints=names)
-        held = dict(zip(("left", "right"), ("w_T2", "w_T3"), strict=True))
-        grasps = [Grasp(side, f"{side}_gripper", held[side]) for side in sides]
-        objects = [(foam_y_object(), None, None)]
-        return System.build(robot, objects=objects, grasps=grasps, driven=names, damping=0.05)
-
-    return {name: build(sides) for name, sides in SIDES.items()}
+    return {name: baxter_foam_y_system(arms) for name, arms in ARMS.items()}
 
 
 @pytest.fixture(scope="session")

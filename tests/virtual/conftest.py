@@ -11,10 +11,10 @@ from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResul
 
 @pytest.fixture(scope="session")
 def runs() -> Runs:
-    """runs(arms, time step [s], duration [s]): the paper's system, two seconds where nothing else is said."""
+    """runs(arms, time step [s], duration [s]): the paper's system, one second where nothing else is said."""
 
     @cache
-    def run(arms: int, step: float, duration: float = 2.0) -> SimulationResult:
+    def run(arms: int, step: float, duration: float = 1.0) -> SimulationResult:
         motion = random_multisine_motion(SYSTEMS[arms], TRUTH, seed=SEEDS[arms])
         return simulate_in_mujoco(SYSTEMS[arms], TRUTH, motion, SimulationOptions(duration, time_step=step))
 

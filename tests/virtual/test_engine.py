@@ -27,7 +27,7 @@ from yid_ocp.virtual.mujoco_simulation import (
 
 @pytest.mark.parametrize("arms", [1, 2])
 def test_grasps_hold(runs: Runs, arms: int) -> None:
-    run, system = runs(arms, 1e-4), SYSTEMS[arms]
+    run, system = runs(arms, 2e-4), SYSTEMS[arms]
     q = ca.SX.sym("q", system.n_coordinates)
     phi = ca.Function(
         "phi", [q], [system.constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))]
@@ -37,14 +37,14 @@ def test_grasps_hold(runs: Runs, arms: int) -> None:
 
 
 def test_halving_the_inner_step_changes_little(runs: Runs) -> None:
-    coarse, fine = runs(2, 1e-4), runs(2, 5e-5, 1.0)
-    np.testing.assert_array_equal(coarse.t[:101], fine.t)
-    assert np.linalg.norm(coarse.point_positions[:101] - fine.point_positions, axis=-1).max() < 5e-5
+    coarse, fine = runs(2, 2e-4), runs(2, 1e-4, 0.5)
+    np.testing.assert_array_equal(coarse.t[:51], fine.t)
+    assert np.linalg.norm(coarse.point_positions[:51] - fine.point_positions, axis=-1).max() < 5e-5
 
 
 @pytest.mark.parametrize("arms", [1, 2])
 def test_starts_in_static_equilibrium_of_the_symbolic_equations(runs: Runs, arms: int) -> None:
-    run, system = runs(arms, 1e-4), SYSTEMS[arms]
+    run, system = runs(arms, 2e-4), SYSTEMS[arms]
     q, u = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("u", len(system.driven))
     kinematics = forward_kinematics(system.mechanism, q)
     rigid = rigid_body_lagrangian_derivatives(kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), system.gravity)
@@ -75,7 +75,7 @@ def test_other_grasps_hold(kind: str) -> None:
     system = replace(system, grasps=(grasp,))
     motion = random_multisine_motion(system, TRUTH, seed=1, initial_joint_angles=posture)
     run = simulate_in_mujoco(
-        system, TRUTH, motion, SimulationOptions(0.8, time_step=2e-4), initial_joint_angles=posture
+        system, TRUTH, motion, SimulationOptions(0.5, time_step=5e-4), initial_joint_angles=posture
     )
     phi = ca.Function(
         "phi", [q], [system.constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))]
@@ -90,17 +90,17 @@ def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
     motion = random_multisine_motion(SYSTEMS[1], TRUTH, seed=1)
 
     def run(**choices: Any) -> SimulationResult:
-        return simulate_in_mujoco(SYSTEMS[1], TRUTH, motion, SimulationOptions(0.4, time_step=2.5e-4, **choices))
+        return simulate_in_mujoco(SYSTEMS[1], TRUTH, motion, SimulationOptions(0.2, time_step=1e-3, **choices))
 
     finely = run(sample_rate=1000.0)
     sample = run(sample_rate=100.0, controller_rate=1000.0, effort_kind="sample")
     mean = run(sample_rate=100.0, controller_rate=1000.0, effort_kind="mean")
     for coarse in (sample, mean):
-        assert len(coarse.t) == 41
+        assert len(coarse.t) == 21
         np.testing.assert_array_equal(coarse.q, finely.q[::10])
         np.testing.assert_array_equal(coarse.point_positions, finely.point_positions[::10])
     np.testing.assert_array_equal(sample.effort, finely.effort[::10])
-    np.testing.assert_allclose(mean.effort[:-1], finely.effort[:-1].reshape(40, 10, -1).mean(1), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mean.effort[:-1], finely.effort[:-1].reshape(20, 10, -1).mean(1), rtol=0, atol=1e-12)
     np.testing.assert_array_equal(mean.effort[-1], finely.effort[-1])
     assert np.abs(mean.effort - sample.effort)[:-1].max() > 1e-3
 
@@ -189,4 +189,4 @@ def test_a_state_that_is_lost_is_told(later: bool, said: str, tmp_path: Path, mo
     system = SYSTEMS[1]
     motion = random_multisine_motion(system, TRUTH, seed=1)
     with pytest.raises(ModelError, match=said):
-        simulate_in_mujoco(system, TRUTH, motion, SimulationOptions(0.1), injected=Thrown())
+        simulate_in_mujoco(system, TRUTH, motion, SimulationOptions(0.1, time_step=1e-3), injected=Thrown())

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,18 +17,19 @@ from yid_ocp.virtual.experiment import (
     PointCamera,
     VirtualExperiment,
     baxter_foam_y_system,
+    record_simulation,
     run_virtual_experiment,
 )
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
-from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions, SimulationResult, simulate_in_mujoco
 
 DEFAULTS = Path(yid_ocp.__file__).parent / "data" / "defaults"
 
 
 def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
-    system, run = SYSTEMS[1], runs(1, 2e-4, 3.0)
+    system, run = SYSTEMS[1], runs(1, 1e-3, 3.0)
     motion = random_multisine_motion(system, TRUTH, seed=SEEDS[1])
-    simulation = SimulationOptions(3.0, time_step=2e-4)
+    simulation = SimulationOptions(3.0, time_step=1e-3)
     recording = run_virtual_experiment(system, TRUTH, VirtualExperiment(motion=motion, simulation=simulation, seed=5))
     joints = recording.joints
     assert joints is not None
@@ -53,18 +55,19 @@ def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
     assert "MuJoCo" in recording.description
 
 
-def test_sensors_have_their_own_noise() -> None:
-    system = SYSTEMS[1]
-    motion = random_multisine_motion(system, TRUTH, seed=1)
+def recorded(run: SimulationResult, seed: int, noise: ArmSensorNoise, camera: PointCamera | None = None) -> Recording:
+    """What sensors with some noise make of a simulation of one arm."""
+    simulation = SimulationOptions(time_step=1e-3, effort_kind="sample")
+    experiment = VirtualExperiment(None, None, simulation, noise, camera, seed=seed)
+    return record_simulation(SYSTEMS[1], TRUTH, experiment, run)
 
-    often_hidden = PointCamera(hidden_probability=0.5)
 
-    def record(seed: int, camera: PointCamera | None = often_hidden, noise: ArmSensorNoise | None = None) -> Recording:
-        simulation = SimulationOptions(3.0, time_step=1e-3)
-        experiment = VirtualExperiment(motion, None, simulation, noise or ArmSensorNoise(), camera, seed=seed)
-        return run_virtual_experiment(system, TRUTH, experiment)
-
-    first, again, blind, other = record(1), record(1), record(1, None, ArmSensorNoise(effort_std=0.3)), record(2)
+def test_sensors_have_their_own_noise(runs: Runs) -> None:
+    run = runs(1, 1e-3, 3.0)
+    run = replace(run, frame_times=run.t[::30], frame_point_positions=run.point_positions[::30])
+    often_hidden, quiet = PointCamera(hidden_probability=0.5), ArmSensorNoise()
+    first, again, other = (recorded(run, seed, quiet, often_hidden) for seed in (1, 1, 2))
+    blind = recorded(run, 1, ArmSensorNoise(effort_std=0.3))
     for a, b in zip(first.points, again.points, strict=True):
         np.testing.assert_array_equal(a.position, b.position)
     np.testing.assert_array_equal(first.joints.position, blind.joints.position)
@@ -75,30 +78,21 @@ def test_sensors_have_their_own_noise() -> None:
     assert np.isnan(first.points[1].position).any()
 
 
-def test_torques_are_off_by_a_constant_and_by_white_noise() -> None:
-    system = SYSTEMS[1]
-    motion = random_multisine_motion(system, TRUTH, seed=1)
+def test_torques_are_off_by_a_constant_and_by_white_noise(runs: Runs) -> None:
     white = (0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.14)
 
-    def joints(noise: ArmSensorNoise, seed: int = 1) -> JointGroup:
-        simulation = SimulationOptions(2.0, time_step=1e-3, controller_rate=200.0, effort_kind="sample")
-        experiment = VirtualExperiment(motion, None, simulation, noise, None, seed=seed)
-        group = run_virtual_experiment(system, TRUTH, experiment).joints
-        assert group is not None
-        return group
+    def joints(seed: int = 1, **noise: Any) -> JointGroup:
+        return recorded(runs(1, 1e-3, 3.0), seed, ArmSensorNoise(**noise)).joints
 
-    clean, noisy = joints(ArmSensorNoise()), joints(ArmSensorNoise(effort_std=white, effort_bias_std=0.3))
-    other, unstated = (
-        joints(ArmSensorNoise(effort_bias_std=0.3), 2),
-        joints(ArmSensorNoise(effort_bias_std=0.3, records_effort_std=False)),
-    )
+    clean, noisy = joints(), joints(effort_std=white, effort_bias_std=0.3)
+    other, unstated = joints(2, effort_bias_std=0.3), joints(effort_bias_std=0.3, records_effort_std=False)
     assert (clean.effort_kind, clean.effort_std, clean.effort_bias_std) == ("sample", 0.0, 0.0)
     assert noisy.effort_bias_std == 0.3
     np.testing.assert_array_equal(noisy.effort_std, white)
     assert (unstated.effort_std, unstated.effort_bias_std, unstated.position_std) == (None, None, 2e-4)
     error = noisy.effort - clean.effort
     offset = (unstated.effort - clean.effort)[0]
-    np.testing.assert_allclose(unstated.effort - clean.effort, np.tile(offset, (201, 1)), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(unstated.effort - clean.effort, np.tile(offset, (301, 1)), rtol=0, atol=1e-12)
     np.testing.assert_allclose((error - offset).std(0), white, rtol=0.2)
     assert 0.1 < offset.std() < 0.6
     assert len(np.unique(offset)) == 7
@@ -124,11 +118,11 @@ def test_recordings_are_reproducible(kind: str, arms: int, clean: Path, benchmar
     excitation = MultisineOptions(gripper_travel=torques.travel[arms], shake_torque_rms=torques.shake)
     seed, start = torques.motion_seeds[arms, "estimate"], {"initial_joint_angles": posture}
     motion = random_multisine_motion(system, made.TRUTH, seed=seed, excitation=excitation, **start)
-    run = simulate_in_mujoco(system, made.TRUTH, motion, replace(torques.simulation, duration=0.3), **start)
+    run = simulate_in_mujoco(system, made.TRUTH, motion, replace(torques.simulation, duration=0.1), **start)
     name = f"{['single', 'dual'][arms - 1]}_arm_no_vision_estimate.h5"
     joints = read_recording((DEFAULTS if torques.white else clean) / name).joints
     assert joints is not None
-    error = joints.effort[:31] - run.effort
+    error = joints.effort[:11] - run.effort
     # noise and offsets as stated lie on the effort of the rough ones, noise alone on the angles of both
     if torques.white:
         assert np.all(error.std(axis=0) < 1.5 * np.array(arms * torques.white))
@@ -136,4 +130,4 @@ def test_recordings_are_reproducible(kind: str, arms: int, clean: Path, benchmar
     else:
         np.testing.assert_allclose(error, 0.0, rtol=0, atol=1e-6)
     angles = run.q[:, list(system.driven_coordinate_indices)]
-    np.testing.assert_allclose(joints.position[:31], angles, rtol=0, atol=1.5e-3)
+    np.testing.assert_allclose(joints.position[:11], angles, rtol=0, atol=1.5e-3)

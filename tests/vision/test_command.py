@@ -29,6 +29,7 @@ track:
   n_drawn_frames: 1
   options: {{calibration: {{fix_pose: true}}, clock: {{search_half_width: 0}}}}
 """
+PLAIN = ("--set", "output.write_report=false")
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,7 @@ def test_wrong_input_is_said_and_leaves_nothing(cli, config, tmp_path, settings,
 
 
 def test_without_a_good_frame_the_reasons_and_pictures_are_left(cli, config, tmp_path):
-    done = cli("track", config, "--out", tmp_path / "run", "--set", "track.length_unit=mm")
+    done = cli("track", config, "--out", tmp_path / "run", "--set", "track.length_unit=mm", *PLAIN)
     assert done.code == 2
     assert "not one frame could be used" in done.err
     assert str(tmp_path / "run") in done.err
@@ -128,7 +129,8 @@ def test_what_an_interrupted_run_did_is_used_and_several_workers_do_the_rest(cli
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()
     monkeypatch.setattr(FrameTracker, "calibrate_sequence", None)  # it is known
-    again = cli("track", config, "--out", tmp_path / "run", "--set", "track.n_drawn_frames=0", "--workers", "2")
+    quick = (*PLAIN, "--set", "track.n_drawn_frames=0", "--workers", "2")
+    again = cli("track", config, "--out", tmp_path / "run", *quick)
     assert again.code == 0, again.err
     spent = [frame["seconds"] for frame in json.loads((tmp_path / "run" / "result.json").read_text())["frames"]]
     assert spent[0] == worked[0].cpu_seconds
@@ -143,9 +145,10 @@ def test_what_an_interrupted_run_did_is_used_and_several_workers_do_the_rest(cli
 def test_the_examples_run(cli, repository, tmp_path, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
-    short = ("duration=1.0", "frame_rate=4.0", "dropped_fraction=0.0")
-    arguments = [part for setting in short for part in ("--set", f"track.virtual_frames.{setting}")]
-    quick = ("--quiet", "--set", "track.n_drawn_frames=0", "--set", "track.keep_frames=true")
+    short = ("virtual_frames.duration=1.0", "virtual_frames.frame_rate=4.0", "virtual_frames.dropped_fraction=0.0")
+    coarse = ("options.filters.voxel_size=0.014", "options.calibration.n_frames=3")
+    arguments = [part for setting in (*short, *coarse) for part in ("--set", f"track.{setting}")]
+    quick = ("--quiet", *PLAIN, "--set", "track.n_drawn_frames=0", "--set", "track.keep_frames=true")
     done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)
     assert done.code == 0, done.err
     assert done.out.strip() == str(tmp_path / "run")

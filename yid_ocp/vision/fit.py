@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Annotated
 
@@ -266,10 +266,9 @@ class ShapeFitter:
         """The best shape through some of the nodes and points, then through those that are surely its own."""
         on_nodes, on_points = self._tasks(sight, *left)
         unit = np.eye(len(self.free_joints))
-        tried = [self._minimise(_Minimum(start, unit, math.inf, 0), on_nodes) for start in starts]
+        tried = [self._minimise(_Minimum(start, unit, math.inf), on_nodes) for start in starts]
         best = min(tried, key=lambda minimum: minimum.cost)
         last = self._minimise(best, on_points)
-        iterations = sum(minimum.iterations for minimum in tried) + last.iterations - best.iterations
         evidence = assess_shape_against_cloud(self.tube_links_at(last.q), sight, self.max_informative_surface_distance)
         keep = ~(evidence.is_contested | evidence.is_foreign)
         if on_points and keep.any():
@@ -277,7 +276,7 @@ class ShapeFitter:
             evidence = assess_shape_against_cloud(
                 self.tube_links_at(last.q), sight, self.max_informative_surface_distance
             )
-        return replace(last, iterations=iterations + last.iterations), evidence
+        return last, evidence
 
     @property
     def max_informative_surface_distance(self) -> float:
@@ -320,7 +319,7 @@ class ShapeFitter:
                 cost_tolerance=_TOLERANCE,
             )
             q[free] = found.x
-            end = _Minimum(q, found.final_model.hessian, found.final_model.cost, end.iterations + found.n_iterations)
+            end = _Minimum(q, found.final_model.hessian, found.final_model.cost)
         return end
 
     def _judged(
@@ -367,7 +366,6 @@ class ShapeFitter:
             grasp_gaps=np.array(self._gap(q)).reshape(-1, 3),
             contested_fraction=float(evidence.is_contested.sum() / max(on_shape.sum(), 1)),
             dimension_equations=self._size_rows(q, own[0] if own else None, evidence),
-            n_iterations=best.iterations,
             link_ends=corners,
         )
 
@@ -472,12 +470,11 @@ class ShapeFitter:
 
 @dataclass(frozen=True, eq=False)
 class _Minimum:
-    """Where passes ended: configuration, Hessian by the free bends and cost there, iterations so far."""
+    """Where passes ended: configuration, Hessian by the free bends and cost there."""
 
     q: Array
     hessian: Array
     cost: float
-    iterations: int
 
 
 @dataclass(frozen=True, eq=False)

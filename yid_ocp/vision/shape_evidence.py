@@ -391,7 +391,6 @@ class FrameShapeFit(ShapeFitQuality):
     # share of the points on the shape that may belong to a thing which touches it; they are left out
     contested_fraction: float
     dimension_equations: TubeDimensionCost  # what the frame says of lengths and radii
-    n_iterations: int
     link_ends: Array  # (K, 2, 3), start and end of every link [m]
 
     @property
