@@ -7,7 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH, Runs, mujoco
+from virtual_examples import SYSTEMS, TRUTH, Runs, grasp_gaps, mujoco
 
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
@@ -28,10 +28,7 @@ from yid_ocp.virtual.mujoco_simulation import (
 @pytest.mark.parametrize("arms", [1, 2])
 def test_grasps_hold(runs: Runs, arms: int) -> None:
     run, system = runs(arms, 2e-4), SYSTEMS[arms]
-    q = ca.SX.sym("q", system.n_coordinates)
-    phi = ca.Function(
-        "phi", [q], [system.constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))]
-    )
+    phi = grasp_gaps(system)
     gaps = np.array([phi(row) for row in run.q]).reshape(len(run.t), -1, 3)
     assert np.linalg.norm(gaps, axis=2).max() < 1e-4
 
@@ -77,10 +74,8 @@ def test_other_grasps_hold(kind: str) -> None:
     run = simulate_in_mujoco(
         system, TRUTH, motion, SimulationOptions(0.5, time_step=5e-4), initial_joint_angles=posture
     )
-    phi = ca.Function(
-        "phi", [q], [system.constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))]
-    )
     assert np.abs(run.q[-1] - run.q[0]).max() > 0.02
+    phi = grasp_gaps(system)
     residual = np.array([np.array(phi(row)).ravel() for row in run.q])
     assert residual.shape[1] == grasp.n_constraint_equations
     assert np.abs(residual).max() < 1e-4

@@ -7,7 +7,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH, mujoco
+from virtual_examples import SYSTEMS, TRUTH, mujoco, single_arm_xml
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import EFFECTS, make_effect
@@ -46,7 +46,7 @@ TWINS = ("payload", "joint_presliding", "effort_lag")
 
 def passive(effects, q, v):
     """MuJoCo's passive forces and joint inertias with effects, in configuration order."""
-    model = mujoco.MjModel.from_xml_string(mujoco_xml(SYSTEM, TRUTH))
+    model = mujoco.MjModel.from_xml_string(single_arm_xml())
     order = [model.joint(name).id for name in SYSTEM.mechanism.joint_names]
     data = mujoco.MjData(model)
     injected = _InjectedTerms(SYSTEM, TRUTH, effects)

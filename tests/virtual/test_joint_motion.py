@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS
+from virtual_examples import SYSTEMS, grasp_gaps
 
 from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
@@ -19,12 +19,8 @@ def test_initial_posture_reaches_the_tubes_within_the_limits() -> None:
         for name, angle in posture.items():
             joint = system.mechanism.joints[system.mechanism.joint_index(name)]
             assert joint.lower_limit <= angle <= joint.upper_limit
-        q = ca.SX.sym("q", system.n_coordinates)
-        phi = ca.Function(
-            "phi", [q], [system.constraint_residual(forward_kinematics(system.mechanism.with_numeric_values(), q))]
-        )
         full = [posture.get(name, 0.0) for name in system.mechanism.joint_names]
-        assert np.abs(np.array(phi(full))).max() < 1e-8
+        assert np.abs(np.array(grasp_gaps(system)(full))).max() < 1e-8
     with pytest.raises(ModelError, match="miss the grasped points"):
         grasping_joint_angles(SYSTEMS[1], {"T1.length": 3.0})
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH, mujoco
+from virtual_examples import SYSTEMS, TRUTH, mujoco, single_arm_xml
 
 from yid_ocp.virtual.injected import (
     _CORD_LENGTH,
@@ -20,7 +20,6 @@ from yid_ocp.virtual.injected import (
     InjectedEffect,
     _InjectedTerms,
 )
-from yid_ocp.virtual.mjcf import mujoco_xml
 
 SYSTEM = SYSTEMS[1]
 
@@ -29,7 +28,7 @@ class Bench:
     """MuJoCo's model with one effect, whose force is asked for at states of one's choice."""
 
     def __init__(self, kind, location, size, running=True):
-        self.model = mujoco.MjModel.from_xml_string(mujoco_xml(SYSTEM, TRUTH))
+        self.model = mujoco.MjModel.from_xml_string(single_arm_xml())
         self.data = mujoco.MjData(self.model)
         self.terms = _InjectedTerms(SYSTEM, TRUTH, [InjectedEffect(kind, location, {"size": size})])
         self.terms.edit_model(self.model)

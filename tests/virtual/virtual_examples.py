@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -23,6 +24,18 @@ TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T
 SYSTEMS = {arms: baxter_foam_y_system(arms) for arms in (1, 2)}
 SEEDS = {1: 7, 2: 7}
 Runs = Callable[..., SimulationResult]
+
+
+@cache
+def single_arm_xml() -> str:
+    """The paper's system with one arm in MuJoCo's words."""
+    return mujoco_xml(SYSTEMS[1], TRUTH)
+
+
+def grasp_gaps(system: System) -> ca.Function:
+    """From a configuration to what the grasps leave open."""
+    q = ca.SX.sym("q", system.n_coordinates)
+    return ca.Function("phi", [q], [system.constraint_residual(forward_kinematics(system.numeric_mechanism(), q))])
 
 
 def clamped_beam() -> System:
