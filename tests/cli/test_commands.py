@@ -43,6 +43,13 @@ def test_help_imports_nothing_but_the_standard_library(arguments):
     assert (module.returncode, module.stdout) == (0, done.stdout.partition("BEYOND")[0])
 
 
+def test_a_solve_waits_for_no_library_that_it_does_not_run():
+    heavy = "scipy.stats", "scipy.signal", "scipy.ndimage", "trimesh", "plotly", "jinja2", "rich", "mujoco"
+    code = f"import sys, yid_ocp.workflow.solve; print(sorted(set({heavy}) & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_every_command_is_a_file_of_workflow_and_prints_json(repository):
     for row in COMMANDS:
         source = (repository / "yid_ocp" / "workflow" / f"{row.workflow_module}.py").read_text()

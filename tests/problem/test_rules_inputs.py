@@ -310,6 +310,16 @@ def test_the_filter_is_butterworths_of_order_four_forth_and_back(frequency):
     np.testing.assert_allclose(found[middle], np.sin(2 * np.pi * frequency * t[middle]) / (1 + ratio**8), atol=1e-4)
 
 
+@pytest.mark.parametrize("columns", [0, 2])
+def test_it_begins_and_ends_steadily_as_signal_processing_has_it(columns):
+    """With values that go on beyond both ends in mirror, as long as the filter remembers."""
+    t, rng = 0.01 * np.arange(200), np.random.default_rng(2)
+    values = np.cumsum(rng.standard_normal((200, columns)), axis=0)
+    sections = scipy.signal.butter(4, 7.0 * 2 * 0.01, output="sos")
+    expected = scipy.signal.sosfiltfilt(sections, values, axis=0, padlen=42)
+    np.testing.assert_allclose(LowPassFilter(7.0)(t, values), expected, atol=1e-9)
+
+
 def test_without_a_cutoff_values_are_as_they_were():
     values = np.random.default_rng(1).standard_normal((5, 2))
     assert PLAIN(np.arange(5.0), values) is values

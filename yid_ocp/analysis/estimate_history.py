@@ -15,10 +15,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.stats
 
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
+from yid_ocp.inference.null_test import chi2_p_value
 
 _MIN_CORRELATION_EIGENVALUE = 1e-12
 """Smallest eigenvalue of a correlation matrix; what is known better than that follows from rounding."""
@@ -201,8 +201,3 @@ def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, in
     unit = apart / std
     chi2 = float(unit @ np.linalg.solve(covariance / np.outer(std, std), unit))
     return chi2, len(shared), shared[int(np.argmax(np.abs(unit)))]
-
-
-def chi2_p_value(chi2: float, degrees: int) -> float:
-    """Probability of a chi2 at least this large; 1 without degrees of freedom."""
-    return float(scipy.stats.chi2.sf(chi2, degrees)) if degrees else 1.0

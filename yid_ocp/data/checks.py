@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-import scipy.signal
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.channel_checks import (
@@ -325,7 +324,7 @@ def _smoothed(values: Array) -> Array:
     """Mean of nine neighbours, where there are so many."""
     if len(values) < 9:
         return values
-    return np.asarray(scipy.signal.convolve(values, np.full((9, 1), 1 / 9), mode="valid"))
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(values, 9, axis=0).mean(axis=-1))
 
 
 # -- several recordings -----------------------------------------------------------------------------------------------

@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from yid_ocp.analysis.estimate_history import (
     RunEstimates,
-    chi2_p_value,
     nearby_positive_definite_covariance,
     pool_estimates,
 )
@@ -28,6 +27,7 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import ConfigError, SolverError, YidError, nearest_name_hint
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.null_test import chi2_p_value
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.options import MultivariateGaussianPrior
@@ -145,7 +145,7 @@ class BaselineData:
             if weight > _MIN_INFORMED_FRACTION:
                 variance = c0 * weight + (counted - 1) * c * weight
                 score = (now - float(value)) / math.sqrt(variance)
-                p = float(2 * scipy.stats.norm.sf(abs(score)))
+                p = float(2 * scipy.special.ndtr(-abs(score)))
             known = (fit.problem.system.parameters[name].unit, float(value), float(std), now, fit.std[name])
             shifts.append(_ParameterShift(name, *known, score, p, p < limits.significance_level / len(known_before)))
         between = (self.between_runs_chi2, self.between_runs_p_value)

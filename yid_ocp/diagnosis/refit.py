@@ -12,13 +12,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.stats import chi2
 
 from yid_ocp.arrays import Array
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_labels, neutral_effect_parameter_values
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase, ReportedParameter
-from yid_ocp.inference.null_test import times_since_recording_start
+from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
 from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_widened_covariance, std_from_covariance
 from yid_ocp.inference.whitening import (
     max_normalized_torque_bias_difference,
@@ -248,7 +247,7 @@ def _half_done(
 
 def _leaves_noise(finish: Evaluation, limits: Thresholds) -> bool:
     """Whether a refit leaves no more than noise may, so that no other place can be better."""
-    return float(chi2.sf(2 * finish.cost, len(finish.residual))) >= limits.significance_level
+    return chi2_p_value(2 * finish.cost, len(finish.residual)) >= limits.significance_level
 
 
 def _cheaper(first: _Attempt | None, second: _Attempt | None) -> _Attempt | None:

@@ -19,8 +19,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.signal
-import scipy.stats
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
@@ -28,7 +26,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
-from yid_ocp.inference.null_test import ResidualChannelSamples, residual_channel_samples
+from yid_ocp.inference.null_test import ResidualChannelSamples, chi2_p_value, residual_channel_samples
 
 _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
 
@@ -165,6 +163,8 @@ def _pinv(matrix: Array) -> Array:
 
 def _coloured(columns: Array, series: Sequence[ResidualChannelSamples]) -> Array:
     """X' Omega X under the noise's known colour."""
+    import scipy.signal  # slow to import
+
     total = np.zeros((columns.shape[1], columns.shape[1]))
     least = 1e-6 * float(np.max(np.abs(columns), initial=0.0))
     for s in series:
@@ -242,7 +242,7 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Residu
     # a residual below the noise must not make a score look sure
     covariance = covariance if np.trace(covariance) > np.trace(floor) else floor
     statistic = float(slope @ _pinv(covariance) @ slope)
-    p_value = float(scipy.stats.chi2.sf(statistic, len(step)))
+    p_value = chi2_p_value(statistic, len(step))
     if len(step) == 1 and lower[0] == 0:
         statistic = statistic if step[0] > 0 else 0.0
         p_value = p_value / 2 if statistic > 0 else 1.0

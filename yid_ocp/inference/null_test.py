@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.problem.episodes import Episode
@@ -108,6 +108,11 @@ def _variance_inflation(colour: Array) -> float:
     return float(1 + 2 * np.sum(colour[1:] ** 2))
 
 
+def chi2_p_value(chi2: float, degrees: float) -> float:
+    """Probability of a chi2 at least this large; 1 without degrees of freedom."""
+    return float(scipy.special.chdtrc(degrees, max(chi2, 0.0))) if degrees else 1.0
+
+
 def run_null_test(
     series: Sequence[ResidualChannelSamples],
     residual: Array,
@@ -125,7 +130,7 @@ def run_null_test(
     effective = max(degrees - parameters, 1.0)
     total = float(sum(np.sum(residual[s.residual_indices] ** 2) for s in series))
     ratio = total / max(count - parameters, 1)
-    p_value = float(scipy.stats.chi2.sf(ratio * effective, effective))
+    p_value = chi2_p_value(ratio * effective, effective)
     channels = {}
     for channel in dict.fromkeys(s.channel for s in series):
         parts = [residual[s.residual_indices] for s in series if s.channel == channel]
@@ -177,7 +182,7 @@ def _windows(
                 total, count = total + float(r @ r), count + len(r)
                 degrees += len(r) / _variance_inflation(s.noise_autocorrelation)
             if count:
-                p_values.append(float(scipy.stats.chi2.sf(total / count * degrees, degrees)))
+                p_values.append(chi2_p_value(total / count * degrees, degrees))
                 raw.append((recording, channel, begin, min(begin + length, last)))
     flagged = benjamini_hochberg_mask(p_values, len(raw), level)
     return tuple(_ResidualWindow(*entry, flag) for entry, flag in zip(raw, flagged, strict=True))

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy.interpolate
-import scipy.signal
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.recording import JointGroup, Recording

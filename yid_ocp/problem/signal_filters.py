@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 import scipy.interpolate
-import scipy.signal
+import scipy.linalg.lapack
 import scipy.sparse
 import scipy.special
 
@@ -53,7 +53,7 @@ class LowPassFilter:
         pad = min(len(even) - 1, max(15, int(3 / (self.cutoff * step))))
         smooth = resampled
         for _ in range(self.passes):
-            smooth = scipy.signal.sosfiltfilt(sections, smooth, axis=0, padlen=pad)
+            smooth = _filtered_both_ways(sections, smooth, pad)
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
     def decorrelation_stride(self, step: float) -> int:
@@ -93,13 +93,14 @@ class LowPassFilter:
     def _response(self, step: float) -> Array:
         """To an impulse in the middle, at an odd number of samples."""
         length = 2 * int(5 * self.passes / (self.cutoff * step)) + 101
-        response = np.zeros(length)
+        response = np.zeros((length, 1))
         response[length // 2] = 1.0
         for _ in range(self.passes):
-            response = scipy.signal.sosfiltfilt(self._sections(step), response)
-        return np.asarray(response)
+            response = _filtered_both_ways(self._sections(step), response, 0)
+        return response[:, 0]
 
     def _sections(self, step: float) -> Array:
+        """Gain and the two feedback factors of every section, shape (order / 2, 3), by the bilinear transformation."""
         nyquist = 0.5 / step
         least = _MIN_CUTOFF_FRACTION * nyquist
         if not least < self.cutoff < nyquist:
@@ -107,7 +108,10 @@ class LowPassFilter:
                 f"path_cutoff = {self.cutoff:g} Hz",
                 allowed=f"above {least:.2g} and below {nyquist:g} Hz for this recording",
             )
-        return np.asarray(scipy.signal.butter(_FILTER_ORDER, self.cutoff / nyquist, output="sos"))
+        warped = math.tan(math.pi / 2 * self.cutoff / nyquist)
+        damping = 2 * warped * np.sin(np.pi / (2 * _FILTER_ORDER) * np.arange(1, _FILTER_ORDER, 2))
+        scale = 1 + damping + warped**2
+        return np.stack([warped**2 / scale, 2 * (warped**2 - 1) / scale, (1 - damping + warped**2) / scale], axis=1)
 
 
 @dataclass(frozen=True)
@@ -284,8 +288,28 @@ def _filtered(driven: Array, decay: Array) -> Array:
     """z_k = E z_{k-1} + driven_k along the first axis, with each channel's E."""
     result = np.empty_like(driven)
     for i, factor in enumerate(np.ravel(decay)):
-        result[:, i] = scipy.signal.lfilter([1.0], [1.0, -factor], driven[:, i], axis=0)
+        result[:, i] = _with_feedback(driven[:, i], -factor)
     return result
+
+
+def _with_feedback(driven: Array, *factors: float) -> Array:
+    """z with z_k + sum_i factors_i z_{k-i} = driven_k along the first axis, from rest."""
+    if not driven.size:  # LAPACK writes beyond arrays without columns
+        return driven
+    band = np.tile(np.array([[1.0], *([factor] for factor in factors)]), len(driven))
+    return np.asarray(scipy.linalg.lapack.dtbtrs(band, driven, uplo="L")[0])
+
+
+def _filtered_both_ways(sections: Array, values: Array, pad: int) -> Array:
+    """Values (M, k) filtered forward and backward, steady before `pad` samples that go on beyond each end in mirror."""
+    smooth = np.concatenate([2 * values[0] - values[pad:0:-1], values, 2 * values[-1] - values[-2 : -2 - pad : -1]])
+    for _ in range(2):
+        start, smooth = smooth[0], smooth - smooth[0]
+        for gain, *feedback in sections:
+            smooth[2:] += 2 * smooth[1:-1] + smooth[:-2]
+            smooth = _with_feedback(gain * smooth, *feedback)
+        smooth = (smooth + start)[::-1]
+    return smooth[pad : len(smooth) - pad]
 
 
 @lru_cache(maxsize=16)

@@ -30,7 +30,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import eigh
-from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -341,6 +340,8 @@ def _add_costs(
 
     Added to `total` (delays, cells); nothing where the camera would see too little of the arm.
     """
+    from scipy.ndimage import distance_transform_edt  # slow to import, and only for a camera whose place is sought
+
     points, part = arm.visible_surface_points(told, glimpse.stamp)
     own = told.world_to_measured_points(points)
     at = glimpse.points[:, :2] / glimpse.points[:, 2:]

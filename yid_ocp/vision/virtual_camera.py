@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.errors import ConfigError
@@ -66,6 +65,8 @@ class DepthCamera:
 
         From the true one [m], infinite where there is nothing, and the cosine of ray and normal, all (height, width).
         """
+        from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter  # slow to import
+
         scale = self.intrinsics.fx * self.baseline
         shape = depth.shape
         white = rng.standard_normal(shape)
