@@ -84,13 +84,12 @@ def test_readings_have_exact_slopes(which, prescribed, all_effects, sensors) -> 
         values |= somewhere(effect)
     theta = system.parameters.vector(values)
     rng = np.random.default_rng(0)
-    q, z, effort = (rng.normal(size=function.numel_in(i)) for i in (0, 2, 3))
-    at = (q, np.zeros(len(q)), z, effort, np.zeros(system.n_constraints))
-    exact = np.array(ca.densify(function(*at, theta)[6]))
+    at = {name: rng.normal(size=function.numel_in(name)) for name in ("q", "z", "load")}
+    exact = np.array(ca.densify(function(**at, theta=theta)["by_theta"]))
     for column, name in enumerate(names):
         shift = np.zeros(len(theta))
         shift[system.parameters.index(name)] = 1e-6
-        above, below = (np.array(function(*at, theta + sign * shift)[0]) for sign in (1, -1))
+        above, below = (np.array(function(**at, theta=theta + sign * shift)["y"]) for sign in (1, -1))
         assert np.allclose(exact[:, column], (above - below).ravel() / 2e-6, rtol=1e-6, atol=1e-8), name
 
 

@@ -300,14 +300,8 @@ def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
     whole = system.with_effects(effects)
     function = sensor_reading_function(whole, sensor, ())
     n = whole.n_coordinates
-    at = (
-        np.zeros(n) if q is None else q,
-        np.zeros(n),
-        np.zeros(len(whole.internal_coordinates)),
-        np.zeros(n) if effort is None else effort,
-        np.zeros(whole.n_constraints),
-    )
-    return np.array(function(*at, whole.parameters.vector())[0]).ravel()
+    at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
+    return np.array(function(**at, theta=whole.parameters.vector())["y"]).ravel()
 
 
 @dataclass(frozen=True)

@@ -168,9 +168,8 @@ def test_a_late_camera_sees_the_past(driven, sensors) -> None:
     position = np.maximum(moved.node + moved.fraction - 3.0, 0.0)
     n = driven.system.n_coordinates
     function = sensor_reading_function(task.system, sensors.camera, ())
-    still, lam = np.zeros(n), np.zeros(task.system.n_constraints)
     states = now.rollout.state
-    nodes = np.array([np.array(function(s[:n], still, [], still, lam, task.theta)[0]).ravel() for s in states])
+    nodes = np.array([np.array(function(q=s[:n], theta=task.theta)["y"]).ravel() for s in states])
     for k in range(6):
         expected = np.interp(position, np.arange(len(nodes)), nodes[:, k])
         assert late.predicted_outputs[at][:, k] == pytest.approx(expected, abs=1e-9)

@@ -48,10 +48,10 @@ def buckled(urdf_folder):
 
 def problem_of(step, state, first=0.1, std=1e-3, **options):
     """A recording of the rod at rest, its middle seen from `first` seconds on."""
-    n, m, t = step.system.n_coordinates, step.system.n_constraints, 0.01 * np.arange(int(100 * (first + 0.3)))
+    n, t = step.system.n_coordinates, 0.01 * np.arange(int(100 * (first + 0.3)))
     sensor = PointSensor("points_camera", (MIDDLE,), (MIDDLE,), None)
-    at = (state[:n], np.zeros(n), [], np.zeros(n), np.zeros(m), step.system.parameters.vector())
-    place = np.array(sensor_reading_function(step.system, sensor, ())(*at)[0])
+    function = sensor_reading_function(step.system, sensor, ())
+    place = np.array(function(q=state[:n], theta=step.system.parameters.vector())["y"])
     late = t[t >= first - 1e-9]
     camera = seen(
         [MIDDLE], late, np.tile(place.ravel(), (len(late), 1, 1)), "points_camera", std=np.full((len(late), 1, 3), std)

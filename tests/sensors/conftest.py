@@ -39,8 +39,7 @@ def read() -> Read:
     ) -> np.ndarray:
         n = system.n_coordinates
         function = sensor_reading_function(system, sensor, ())
-        at = (np.zeros(n) if q is None else q, np.zeros(n), np.zeros(len(system.internal_coordinates)))
-        loads = (np.zeros(n) if effort is None else effort, np.zeros(system.n_constraints))
-        return np.array(ca.densify(function(*at, *loads, system.parameters.vector())[0])).ravel()
+        at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
+        return np.array(ca.densify(function(**at, theta=system.parameters.vector())["y"])).ravel()
 
     return outputs

@@ -61,40 +61,31 @@ def test_outputs_have_a_row_for_every_reading(whole: System, sensor: Sensor) -> 
     function = sensor_reading_function(whole, sensor, NAMES)
     rows = sensor.outputs_per_channel * len(sensor.channel_names)
     n = whole.n_coordinates
-    assert [function.size_out(i) for i in range(7)] == [(rows, size) for size in (1, n, 0, 1, n, 0, len(NAMES))]
-    assert sensor_reading_function(whole, sensor, ()).size_out(6) == (rows, 0)
+    assert [function.size_out(i) for i in range(8)] == [(rows, size) for size in (1, n, 0, 0, 1, n, 0, len(NAMES))]
+    assert sensor_reading_function(whole, sensor, ()).size_out(7) == (rows, 0)
 
 
 @pytest.mark.parametrize("sensor", [CAMERA, EFFORT], ids=["points", "effort"])
 def test_derivatives_agree_with_differences(whole: System, sensor: Sensor) -> None:
     rng = np.random.default_rng(1)
     function = sensor_reading_function(whole, sensor, NAMES)
-    at = [
-        rng.uniform(-0.6, 0.6, whole.n_coordinates),
-        np.zeros(whole.n_coordinates),
-        np.array([0.4]),
-        rng.uniform(-1, 1, whole.n_coordinates),
-        np.zeros(0),
-        whole.parameters.vector(),
-    ]
-    exact = [np.array(ca.densify(value)) for value in function(*at)[1:]]
-    columns = {
-        0: range(whole.n_coordinates),
-        2: range(1),
-        3: range(whole.n_coordinates),
-        5: [whole.parameters.index(name) for name in NAMES],
-    }
+    n = whole.n_coordinates
+    at = {"q": rng.uniform(-0.6, 0.6, n), "z": np.array([0.4]), "load": rng.uniform(-1, 1, n)}
+    at["theta"] = whole.parameters.vector()
+    exact = {name: np.array(ca.densify(value)) for name, value in function(**at).items()}
+    chosen = [whole.parameters.index(name) for name in NAMES]
+    columns = {"q": range(n), "z": range(1), "load": range(n), "theta": chosen}
     step = 1e-6
     for which, indices in columns.items():
         differences = []
         for index in indices:
-            above, below = ([x.copy() for x in at] for _ in range(2))
+            above, below = ({name: x.copy() for name, x in at.items()} for _ in range(2))
             above[which][index] += step
             below[which][index] -= step
-            ahead, behind = (np.array(function(*x)[0]).ravel() for x in (above, below))
+            ahead, behind = (np.array(function(**x)["y"]).ravel() for x in (above, below))
             differences.append((ahead - behind) / (2 * step))
-        np.testing.assert_allclose(exact[which], np.transpose(differences), rtol=1e-7, atol=1e-8)
-    assert np.abs(exact[2]).max() > 0.01, "the memory of an effect is seen"
+        np.testing.assert_allclose(exact[f"by_{which}"], np.transpose(differences), rtol=1e-7, atol=1e-8)
+    assert np.abs(exact["by_z"]).max() > 0.01, "the memory of an effect is seen"
 
 
 def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None:
@@ -104,15 +95,14 @@ def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None
     effort[a], effort[b] = 2.0, 3.0
     assert a == 0
     function = sensor_reading_function(whole, EFFORT, ())
-    still = np.zeros(whole.n_coordinates)
-    read = np.array(function(still, still, [0.5], effort, [], whole.parameters.vector())[0]).ravel()
+    read = np.array(function(z=0.5, load=effort, theta=whole.parameters.vector())["y"]).ravel()
     drift = 0.2 * (0.25 + np.sin(2.0))
     assert read == pytest.approx([2.0 + drift, 0.8 * 3.0 + drift])
 
 
 @dataclass(frozen=True)
 class Hand(Sensor):
-    """How fast the elbow turns and what holds the hand: what a node has beside its coordinates."""
+    """How fast the elbow turns, how that changes and what holds the hand: what a node has beside its coordinates."""
 
     channel = ChannelKind("hand", "touch", "1")
     group_name: str = "hand.touch"
@@ -120,13 +110,13 @@ class Hand(Sensor):
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        return tuple(f"hand.touch.{name}" for name in ("speed", "force"))
+        return tuple(f"hand.touch.{name}" for name in ("speed", "acceleration", "force"))
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
-        return ca.vertcat(state.v[1] * ca.cos(state.q[0]), state.lam[0])
+        return ca.vertcat(state.v[1] * ca.cos(state.q[0]), state.a[1] * state.q[0], state.lam[0])
 
 
-def test_velocities_and_constraint_forces_are_read_along_a_rollout(urdf_folder):
+def test_rates_and_constraint_forces_are_read_along_a_rollout(urdf_folder):
     names = ("T1.bend", "shoulder.damping", "clock_scale@clock.scale")
     held = held_rod(urdf_folder, driven=("shoulder",), damping=0.3)
     held = held.with_effects([make_effect("clock_scale", "clock", held)])
@@ -136,15 +126,18 @@ def test_velocities_and_constraint_forces_are_read_along_a_rollout(urdf_folder):
     options = ProblemOptions(feedback="none", weighting="paper")
     tip = PointGroup("points", ("tip",), t, np.zeros((41, 1, 3)), 1.0)
     problem = EstimationProblem(step, [Recording(joints, (tip,), name="held")], names, options)
-    samples = measured(Hand(), [3, 7, 20, 39], [0.0, 0.5, 0.0, 1.0], np.zeros((4, 2)), span=(0, 40))
+    samples = measured(Hand(), [3, 7, 20, 39], [0.0, 0.5, 0.0, 1.0], np.zeros((4, 3)), span=(0, 40))
     problem = problem.with_episodes([replace(problem.episodes[0], measurements=(samples,))], [])
     x = problem.initial_unknowns
     evaluation = problem.evaluate(x)
     [prediction] = evaluation.episode_predictions
     rollout, scale = prediction.rollout, problem.theta[held.parameters.index(names[2])]
     speed = np.gradient(rollout.state[:, 1], H) * np.cos(rollout.state[:, 0]) / scale
+    change = np.pad(np.diff(rollout.state[:, 1], 2), 1, mode="edge") / (H * scale) ** 2 * rollout.state[:, 0]
     force = np.append(rollout.multipliers[:, 0], rollout.multipliers[-1, 0]) / H / scale
-    expected = np.stack([np.interp([3, 7.5, 20, 40], np.arange(41), series) for series in (speed, force)], axis=1)
+    expected = np.stack(
+        [np.interp([3, 7.5, 20, 40], np.arange(41), series) for series in (speed, change, force)], axis=1
+    )
     np.testing.assert_allclose(prediction.predicted_outputs[0], expected, rtol=1e-9, atol=1e-12)
     rows, gradient = problem.residual_rows.data, problem.cost_and_gradient(x)[1]
     np.testing.assert_allclose(gradient, evaluation.jacobian.T @ evaluation.residual, rtol=1e-6)

@@ -233,7 +233,7 @@ def nlp_stage_sparsity(
     measured[np.arange(f), np.arange(f)] = True  # priors
     for sensor in sensors:
         function = sensor_reading_function(system, sensor, tuple(free))
-        by_q, by_z, by_theta = (_mask(function.sparsity_out(i)) for i in (1, 3, 6))
+        by_q, by_z, by_theta = (_mask(function.sparsity_out(f"by_{name}")) for name in ("q", "z", "theta"))
         reading = np.hstack([by_theta, by_q, np.zeros((len(by_q), n), bool), by_z])
         measured |= _times(reading.T, reading)
     rows_blocks = _blocks(symbols, "del", "internal", "constraint", "p1", kept=kept)

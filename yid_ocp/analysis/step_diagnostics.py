@@ -253,16 +253,16 @@ class _WhitenedSensor:
 
 def _sensors(step: Step, episode: Episode, state: Array, theta: Array) -> list[_WhitenedSensor]:
     system, n, found = step.system, step.system.n_coordinates, []
-    at = [state[:n], np.zeros(n), state[2 * n :], np.zeros(n), np.zeros(system.n_constraints), theta]
+    at = {"q": state[:n], "z": state[2 * n :], "theta": theta}
     for samples in episode.measurements:
         known = np.where(np.isfinite(samples.std) & samples.used_output_mask, samples.std, np.nan)
         if np.any(np.isfinite(known)):
             used = np.any(samples.used_output_mask, axis=0)
             std = np.array([np.nanmedian(known[:, k]) if u else np.inf for k, u in enumerate(used)])
             function = sensor_reading_function(system, samples.sensor, system.parameters.names)
-            _, by_q, _, by_z, by_effort, _, by_theta = (np.array(x.full()) / std[:, None] for x in function.call(at))
-            by_state = np.hstack([by_q, np.zeros_like(by_q), by_z])
-            found.append(_WhitenedSensor(samples.sensor.group_name, by_state, by_effort, by_theta))
+            by = {name: np.array(ca.densify(x)) / std[:, None] for name, x in function(**at).items()}
+            by_state = np.hstack([by["by_q"], np.zeros_like(by["by_q"]), by["by_z"]])
+            found.append(_WhitenedSensor(samples.sensor.group_name, by_state, by["by_load"], by["by_theta"]))
     return found
 
 

@@ -85,8 +85,8 @@ class ResidualDerivativesAtNodes:
             read = function(course.node_values.at(used), theta)
             if read.needs_neighbours:
                 raise DataError(
-                    f"'{samples.sensor.group_name}' depends on velocities or constraint forces, which cannot be "
-                    "weighted beside noise that drives the motion",
+                    f"'{samples.sensor.group_name}' depends on velocities, accelerations or constraint forces, "
+                    "which cannot be weighted beside noise that drives the motion",
                     hint=f"set sensors.{samples.sensor.group_name}.use: false, or prescribe the arms' motion",
                 )
             slopes = np.zeros((*read.output.shape, nx))

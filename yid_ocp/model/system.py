@@ -144,6 +144,9 @@ class NodeState:
     v : casadi.SX, shape (n, 1)
         Velocity, the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; at the
         first and the last node that of the one step there, half a step off [rad/s or m/s].
+    a : casadi.SX, shape (n, 1)
+        Acceleration, the difference of these two midpoint velocities over h, of order two in h; the first and the last
+        node have that of their neighbour, of order one [rad/s^2 or m/s^2].
     load : casadi.SX, shape (n, 1)
         Torque at every joint that has one: the motor torque where driven, the predicted effort where prescribed, of
         the step that begins at the node, at the last node of the step before [N m or N].
@@ -159,6 +162,7 @@ class NodeState:
     kinematics: Kinematics
     q: ca.SX
     v: ca.SX
+    a: ca.SX
     z: ca.SX
     load: ca.SX
     lam: ca.SX

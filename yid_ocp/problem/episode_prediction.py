@@ -22,6 +22,8 @@ from yid_ocp.problem.model_functions import (
     CorrectedInputs,
     ModelFunctions,
     NodeStateValues,
+    node_acceleration,
+    node_acceleration_adjoint,
     node_velocity,
     node_velocity_adjoint,
 )
@@ -426,8 +428,9 @@ class EpisodePredictor:
         total = read.by_q @ along.by_state[nodes, :n]
         if read.by_z.shape[2]:
             total += read.by_z @ along.by_state[nodes, 2 * n :]
-        if read.by_v.shape[2]:
-            total += read.by_v @ node_velocity(along.by_state[:, :n], nodes, self.step.time_step)
+        for by_rate, rate in ((read.by_v, node_velocity), (read.by_a, node_acceleration)):
+            if by_rate.shape[2]:
+                total += by_rate @ rate(along.by_state[:, :n], nodes, self.step.time_step)
         loads = (
             (self.system.prescribed_coordinate_indices, along.by_effort),
             (self.system.driven_coordinate_indices, along.by_torque),
@@ -511,9 +514,10 @@ class EpisodePredictor:
         pulls.by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, read.by_q)
         pulls.by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, read.by_z)
         last, h = np.minimum(nodes, len(pulls.by_effort) - 1), self.step.time_step
-        if read.by_v.shape[2]:
-            by_velocity = np.einsum("mk,mkq->mq", at_nodes, read.by_v)
-            pulls.by_state[:, :n] += node_velocity_adjoint(by_velocity, nodes, len(pulls.by_state), h)
+        for by_rate, adjoint in ((read.by_v, node_velocity_adjoint), (read.by_a, node_acceleration_adjoint)):
+            if by_rate.shape[2]:
+                pulled = np.einsum("mk,mkq->mq", at_nodes, by_rate)
+                pulls.by_state[:, :n] += adjoint(pulled, nodes, len(pulls.by_state), h)
         if read.by_lam.shape[2]:
             np.add.at(pulls.by_multipliers, last, np.einsum("mk,mkq->mq", at_nodes, read.by_lam) / h)
         loads = (

@@ -261,8 +261,8 @@ class InitialStateFitter:
         nz, m = step.sizes["nz"], step.sizes["m"]
         residuals, jacobians = [], []
         for group, row in task.measured:
-            still = np.zeros(len(q))
-            y, by_q, *_, by_theta = self._sensor(group.sensor)(q, still, np.zeros(nz), still, np.zeros(m), theta)
+            read = self._sensor(group.sensor)(q=q, theta=theta)
+            y, by_q, by_theta = (read[name] for name in ("y", "by_q", "by_theta"))
             weight = group.weight[row] / task.softness
             value = np.where(weight > 0, group.value[row], 0.0)
             wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])

@@ -277,10 +277,11 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 @dataclass(frozen=True)
 class NodeStateValues:
-    """Values of `model.NodeState` at K nodes: q, v, load (K, n), z (K, nz), lam (K, m), rates by the recorded clock."""
+    """Values of `model.NodeState` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m), by the recorded clock."""
 
     q: Array
     v: Array
+    a: Array
     z: Array
     load: Array
     lam: Array
@@ -292,13 +293,13 @@ class NodeStateValues:
         """Values at all nodes of a trajectory (K, nx); loads and constraint forces are zero when absent."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
-        v = node_velocity(q, nodes, step.time_step)
+        v, a = (rate(q, nodes, step.time_step) for rate in (node_velocity, node_acceleration))
         lam = np.zeros((len(state), step.sizes["m"])) if lam is None else lam
-        return NodeStateValues(q, v, z, np.zeros_like(q) if load is None else load, lam)
+        return NodeStateValues(q, v, a, z, np.zeros_like(q) if load is None else load, lam)
 
     def at(self, nodes: IntArray) -> NodeStateValues:
         """The same values at the nodes with the given indices."""
-        return NodeStateValues(self.q[nodes], self.v[nodes], self.z[nodes], self.load[nodes], self.lam[nodes])
+        return NodeStateValues(*(values[nodes] for values in vars(self).values()))
 
 
 def node_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
@@ -317,12 +318,31 @@ def node_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: f
     return result
 
 
+def node_acceleration(q: Array, nodes: IntArray, time_step: float) -> Array:
+    """Acceleration at some nodes of a trajectory (K, ...), the second difference, shape (len(nodes), ...)."""
+    middle = _inner_nodes(nodes, len(q))
+    return np.asarray((q[middle + 1] - 2 * q[middle] + q[middle - 1]) / time_step**2) if len(q) > 2 else 0 * q[nodes]
+
+
+def node_acceleration_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
+    """Transpose of `node_acceleration`, shape (len(nodes), n) to (count, n)."""
+    middle, result = _inner_nodes(nodes, count), np.zeros((count, pull.shape[1]))
+    for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
+        np.add.at(result, middle + shift, factor / time_step**2 * pull)
+    return result
+
+
+def _inner_nodes(nodes: IntArray, count: int) -> IntArray:
+    return np.clip(nodes, 1, max(count - 2, 1))
+
+
 class _SensorReadings(NamedTuple):
     """Readings of a sensor at K nodes, (K, k), and their derivatives, (K, k, ...); see `sensor_reading_function`."""
 
     output: Array
     by_q: Array
     by_v: Array
+    by_a: Array
     by_z: Array
     by_load: Array
     by_lam: Array
@@ -330,8 +350,8 @@ class _SensorReadings(NamedTuple):
 
     @property
     def needs_neighbours(self) -> bool:
-        """Whether they depend on velocities or constraint forces, which the state of a node does not hold."""
-        return self.by_v.shape[2] + self.by_lam.shape[2] > 0
+        """Whether they depend on velocities, accelerations or constraint forces, which a node's state does not hold."""
+        return self.by_v.shape[2] + self.by_a.shape[2] + self.by_lam.shape[2] > 0
 
 
 @dataclass(frozen=True)
@@ -343,7 +363,7 @@ class _CompiledSensor:
 
     def __call__(self, at: NodeStateValues, theta: Array) -> _SensorReadings:
         """Readings at nodes."""
-        output, *slopes = self.all_derivatives(at.q, at.v, at.z, at.load, at.lam, theta)
+        output, *slopes = self.all_derivatives(at.q, at.v, at.a, at.z, at.load, at.lam, theta)
         if self.columns is not None:
             slopes[-1] = slopes[-1][:, :, list(self.columns)]
         return _SensorReadings._make([output[:, :, 0], *slopes])
@@ -413,4 +433,4 @@ class ModelFunctions:
     def _compiled(self, key: tuple[Sensor, bool]) -> MappedFunction:
         sensor, differentiated = key
         function = sensor_reading_function(self.step.system, sensor, self.parameter_names if differentiated else ())
-        return MappedFunction(function, shared_inputs=(5,), use_compiler=self.step.is_compiled)
+        return MappedFunction(function, shared_inputs=(6,), use_compiler=self.step.is_compiled)

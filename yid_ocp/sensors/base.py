@@ -283,7 +283,7 @@ class Sensor(ABC):
 
 
 def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
-    """A CasADi function for readings y(q, v, z, load, lam; theta), effects included, with their derivatives.
+    """A CasADi function for readings y(q, v, a, z, load, lam; theta), effects included, with their derivatives.
 
     Parameters
     ----------
@@ -293,15 +293,15 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     Returns
     -------
     casadi.Function
-        (q, v, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/dz, dy/dload, dy/dlam, dy/dtheta), as in `NodeState`; v and
-        lam by the recorded clock. Slopes by v and lam have no columns where nothing reads them.
+        (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), as in
+        `NodeState`; v, a and lam by the recorded clock. Slopes by these have no columns where nothing reads them.
     """
     rows = {name: i for i, name in enumerate(system.internal_coordinates)}
     n = system.n_coordinates
-    sizes = {"q": n, "v": n, "z": len(rows), "load": n, "lam": system.n_constraints}
+    sizes = {"q": n, "v": n, "a": n, "z": len(rows), "load": n, "lam": system.n_constraints}
     at = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
     kinematics, scale = forward_kinematics(system.mechanism, at["q"]), system.recorded_time_scale
-    true = (at["q"], at["v"] / scale, at["z"], at["load"], at["lam"] / scale)
+    true = (at["q"], at["v"] / scale, at["a"] / scale**2, at["z"], at["load"], at["lam"] / scale)
     state = NodeState(system, kinematics, *true, rows, sensor.camera_pose)
     parts = ca.vertsplit(sensor.ideal_reading(state), sensor.outputs_per_channel)
     read = []
@@ -315,9 +315,10 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     output = ca.densify(ca.substitute(output, symbols, at["z"]))
     chosen = ca.vertcat(*(system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     slopes = {name: ca.jacobian(output, symbol) for name, symbol in at.items()}
-    slopes |= {name: ca.SX(output.numel(), 0) for name in ("v", "lam") if not slopes[name].nnz()}
+    slopes |= {name: ca.SX(output.numel(), 0) for name in ("v", "a", "lam") if not slopes[name].nnz()}
     outputs = [output, *slopes.values(), ca.jacobian(output, chosen)]
-    return ca.Function("sensor", [*at.values(), system.parameters.symbols], ca.cse(outputs))
+    inputs, names_in = [*at.values(), system.parameters.symbols], [*at, "theta"]
+    return ca.Function("sensor", inputs, ca.cse(outputs), names_in, ["y", *(f"by_{name}" for name in names_in)])
 
 
 # -- from a recording -------------------------------------------------------------------------------------------------

@@ -485,23 +485,25 @@ class _Maker:
         key = (sensor, *_kind(episode))
         if key not in self._sensors:
             function = sensor_reading_function(self._problem.system, sensor, self._names)
-            if function.size2_out(2) + function.size2_out(5):
+            if any(function.size2_out(name) for name in ("by_v", "by_a", "by_lam")):
                 raise SolverError(
-                    f"'{sensor.group_name}' depends on velocities or constraint forces, which node states do not carry",
+                    f"'{sensor.group_name}' depends on velocities, accelerations or constraint forces, "
+                    "which node states do not carry",
                     where=episode.name,
                     hint="use gauss_newton",
                 )
-            loaded = function.nnz_out(4) > 0
+            loaded = function.nnz_out("by_load") > 0
             made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function)
             self._sensors[key] = made, loaded
         return self._sensors[key]
 
     def _unloaded(self, function: ca.Function) -> LocalVariableFunction:
         n = self._sizes["n"]
-        q, z, still, lam = ca.SX.sym("q", n), ca.SX.sym("z", self._sizes["nz"]), ca.SX(n, 1), ca.SX(self._sizes["m"], 1)
-        y, by_q, _, by_z, _, _, by_free = function(q, still, z, still, lam, self._freed.theta)
+        q, z = ca.SX.sym("q", n), ca.SX.sym("z", self._sizes["nz"])
+        read = function(q=q, z=z, theta=self._freed.theta)
         inputs = [ca.vertcat(self._freed.free, q, z), ca.SX(0, 1), self._freed.nominal]
-        return LocalVariableFunction("reading", inputs, y, ca.horzcat(by_free, by_q, by_z))
+        slopes = ca.horzcat(read["by_theta"], read["by_q"], read["by_z"])
+        return LocalVariableFunction("reading", inputs, read["y"], slopes)
 
     def _loaded(self, function: ca.Function, step: _DrivenStage) -> LocalVariableFunction:
         system, n, nx = self._problem.system, self._sizes["n"], self._sizes["nx"]
@@ -512,11 +514,12 @@ class _Maker:
         for index, values, by_these in pairs:
             for k, row in enumerate(index):
                 load[row], by_v[row, :] = values[k], by_these[k, :]
-        still, lam = ca.SX(n, 1), ca.SX(self._sizes["m"], 1)
-        y, by_q, _, by_z, by_load, _, by_free = function(node[:n], still, node[2 * n :], load, lam, self._freed.theta)
-        at_node = ca.horzcat(by_q, ca.SX(y.numel(), n), by_z)
+        read = function(q=node[:n], z=node[2 * n :], load=load, theta=self._freed.theta)
+        y = read["y"]
+        at_node = ca.horzcat(read["by_q"], ca.SX(y.numel(), n), read["by_z"])
         rest = ca.SX(y.numel(), size - len(self._names) - 2 * nx)
-        slopes = ca.mtimes(by_load, by_v) + ca.horzcat(by_free, (1 - last) * at_node, last * at_node, rest)
+        slopes = ca.horzcat(read["by_theta"], (1 - last) * at_node, last * at_node, rest)
+        slopes += ca.mtimes(read["by_load"], by_v)
         inputs = [step.v, ca.vertcat(step.data, last), self._freed.nominal]
         return LocalVariableFunction("reading_under_load", inputs, y, slopes)
 
