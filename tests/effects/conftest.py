@@ -155,10 +155,7 @@ class Bench:
         effort[:, list(system.prescribed_coordinate_indices)] = rollout.effort
         effort[:, list(system.driven_coordinate_indices)] = rollout.torque
         rows = zip(rollout.state[:-1], effort, strict=True)
-        still, lam = np.zeros(n), np.zeros(system.n_constraints)
-        return np.array(
-            [np.array(function(x[:n], still, still, x[2 * n :], e, lam, run.theta)[0]).ravel() for x, e in rows]
-        )
+        return np.array([np.array(function(q=x[:n], z=x[2 * n :], load=e, theta=run.theta)["y"]) for x, e in rows])
 
 
 PARENT = tuple(f"p{i}" for i in range(7))
