@@ -36,6 +36,7 @@ QUICK = {
         "problem.use_compiler=false",
         *UNREFINED,
     ),
+    "servo_pendulum": ("problem.duration=0.5", "solver.max_iterations=2", "problem.use_compiler=false", *UNREFINED),
     "panda_beam": (
         "problem.duration=0.8",
         "model.object.segments.beam.links=1",

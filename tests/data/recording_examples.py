@@ -25,7 +25,10 @@ def example() -> Recording:
     joints = JointGroup(
         names=("left_s0", "left_s1"),
         t=t,
-        **{channel: generator.normal(size=(50, 2)) for channel in JOINT_CHANNEL_UNITS},  # type: ignore[arg-type]
+        **{  # type: ignore[arg-type]
+            channel: generator.normal(size=(50, 2)) if unit != "1" else generator.integers(0, 2, (50, 2))
+            for channel, unit in JOINT_CHANNEL_UNITS.items()
+        },
         position_std=1e-3,
         velocity_std=np.array([0.01, 0.02]),
         effort_bias_std=np.array([0.2, 0.3]),

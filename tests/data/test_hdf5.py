@@ -74,6 +74,9 @@ def recordings(draw: st.DrawFn) -> Recording:
         shape = (len(t), len(joint_names))
         channels: dict[str, Any] = {"position": draw(hnp.arrays(float, shape, elements=finite(50.0)))}
         for channel in draw(st.sets(st.sampled_from(sorted(set(JOINT_CHANNEL_UNITS) - {"position"})))):
+            if JOINT_CHANNEL_UNITS[channel] == "1":
+                channels[channel] = draw(hnp.arrays(float, shape, elements=st.sampled_from([0.0, 1.0])))
+                continue
             bound = {"rad": 50.0, "rad/s": 1e6, "N m": 1e9}[JOINT_CHANNEL_UNITS[channel]]
             channels[channel] = draw(hnp.arrays(float, shape, elements=finite(bound)))
         std = st.none() | st.floats(0, 1e9) | hnp.arrays(float, shape[1], elements=st.floats(0, 1e9))

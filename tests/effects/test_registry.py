@@ -12,7 +12,7 @@ from yid_ocp.effects import base as places
 from yid_ocp.effects.base import EXCITATION_DESCRIPTIONS
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import Effect, Segment, System, flexible_object
-from yid_ocp.model.servos_and_springs import PositionServoOptions
+from yid_ocp.model.servos_and_springs import MotorOptions, PositionServoOptions
 from yid_ocp.model.system import RecordingErrorEffect
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import baxter_foam_y_system
@@ -35,13 +35,18 @@ def beam() -> System:
 
 
 # of arms that are moved by commanded positions
-OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation"}
+OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", "back_emf", "joint_load_friction"}
 
 
 def with_servos() -> System:
     """The papers' arm with a position servo on every joint."""
     system = baxter_foam_y_system(1)
-    return System.build(system.mechanism, driven=system.driven, servos=PositionServoOptions(), grasps=system.grasps)
+    return System.build(
+        system.mechanism,
+        driven=system.driven,
+        servos=PositionServoOptions(motor=MotorOptions("dc")),
+        grasps=system.grasps,
+    )
 
 
 def test_the_vocabulary_is_the_shared_one(shared) -> None:

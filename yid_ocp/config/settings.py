@@ -18,6 +18,7 @@ from ruamel.yaml.comments import CommentedSeq
 
 from yid_ocp.data.recording import ClockKind
 from yid_ocp.diagnosis.thresholds import Thresholds
+from yid_ocp.effects.friction import FrictionLaw
 from yid_ocp.errors import ConfigError
 from yid_ocp.inference.null_test import ExcessResidualCriteria
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
@@ -127,6 +128,22 @@ class ArmSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FrictionSettings:
+    """Ordinary friction in the robot's joints, whose size is estimated."""
+
+    law: Annotated[
+        FrictionLaw,
+        OptionInfo(
+            "viscous; coulomb beside it; stribeck (more at low speed) beside both; presliding (Dahl: holds at rest); "
+            "load (grows with the torque through the gear) beside Coulomb; load_stribeck, all of them"
+        ),
+    ]
+    joints: Annotated[
+        tuple[str, ...] | None, OptionInfo("joints of the robot that have it; all that move when absent")
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class ModelSettings:
     """Mechanical model: robot, flexible object, grasps, clamps, frames and effects."""
 
@@ -165,6 +182,9 @@ class ModelSettings:
             "N m s/rad",
         ),
     ] = 0.05
+    friction: Annotated[
+        FrictionSettings | None, OptionInfo("ordinary friction of the joints, its amplitudes and damping free")
+    ] = None
     gravity: Annotated[_Vector3, OptionInfo("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
     points: Annotated[
         tuple[str, ...] | None, OptionInfo("frames that sensors may see, such as T1:40%; the segments' tips")

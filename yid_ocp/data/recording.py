@@ -26,16 +26,24 @@ JOINT_CHANNEL_UNITS: Mapping[str, str] = {
     "position_command": "rad",
     "velocity_command": "rad/s",
     "external_effort": "N m",
+    "torque_enable": "1",
 }
 """Channels of a joint group and their units."""
 
-JOINT_STD_FIELD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
-"""Standard deviations that a joint group may have, in the units of their channels."""
+JOINT_CONSTANT_NAMES = (
+    "position_std",
+    "velocity_std",
+    "effort_std",
+    "effort_bias_std",
+    "position_resolution",
+    "proportional_gain",
+)
+"""Constants that a joint group may have, not negative, of all joints or one for each."""
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""
 _CONTROL_CHARACTER = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")  # what terminals obey and HDF5 cannot store
 
-_LARGEST = {"rad": 50.0, "rad/s": 1e6, "N m": 1e9}
+_LARGEST = {"1": 1.0, "rad": 50.0, "rad/s": 1e6, "N m": 1e9}
 """What no joint does: eight turns, which a posture in degrees nearly always exceeds, or beyond any machine."""
 _LARGEST_SPREAD = 1e9  # its square is a number still
 _LARGEST_DISTANCE = 50.0  # beyond any motion capture volume, whereas an object in millimetres is always larger
@@ -61,6 +69,10 @@ class JointGroup(ReprMixin):
     position_std, velocity_std, effort_std, effort_bias_std : float or ndarray, shape (nj,), or None
         Standard deviations of noise, white from sample to sample, and of a constant error of a joint's effort, where
         known [rad], [rad/s], [N m].
+    torque_enable : ndarray, shape (N, nj), or None
+        One where a servo's motor is on, zero where it is off.
+    position_resolution, proportional_gain : float or ndarray, shape (nj,), or None
+        Step of the encoder [rad]; proportional gain of a servo's firmware, in a unit of its own.
     effort_kind : {'sample', 'mean', 'command'} or None
         What `effort[k]` is of the true one: its value at t_k, its mean from t_k to t_{k+1}, or held until then.
     clock : {'recorded', 'nominal'}
@@ -77,10 +89,13 @@ class JointGroup(ReprMixin):
     position_command: Array | None = None
     velocity_command: Array | None = None
     external_effort: Array | None = None
+    torque_enable: Array | None = None
     position_std: float | Array | None = None
     velocity_std: float | Array | None = None
     effort_std: float | Array | None = None
     effort_bias_std: float | Array | None = None
+    position_resolution: float | Array | None = None
+    proportional_gain: float | Array | None = None
     effort_kind: EffortKind | None = None
     clock: ClockKind = "recorded"
 
@@ -89,7 +104,7 @@ class JointGroup(ReprMixin):
         for name in ("t", *JOINT_CHANNEL_UNITS):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, read_only_array(getattr(self, name), f"joints/{name}"))
-        for name in JOINT_STD_FIELD_NAMES:
+        for name in JOINT_CONSTANT_NAMES:
             if getattr(self, name) is not None:
                 std = read_only_array(getattr(self, name), f"joints, attribute {name}")
                 object.__setattr__(self, name, float(std) if std.ndim == 0 else std)
@@ -426,7 +441,10 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
             f"at most {_LARGEST[unit]:g} {unit}",
             degrees if unit == "rad" else "convert it again from what was recorded: no machine does that",
         )
-    for name in JOINT_STD_FIELD_NAMES:
+    enabled = joints.torque_enable
+    ok = enabled is None or bool(np.isin(enabled, (0.0, 1.0)).all())
+    raise_data_error_unless(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
+    for name in JOINT_CONSTANT_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")

@@ -15,7 +15,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data.hdf5_io import create_hdf5_atomically, open_checked_hdf5
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
-    JOINT_STD_FIELD_NAMES,
+    JOINT_CONSTANT_NAMES,
     POINT_GROUP_NAME_PATTERN,
     ChannelGroup,
     JointGroup,
@@ -33,9 +33,10 @@ from yid_ocp.sensors.base import declared_channel_kinds
 _RECORDING_FORMAT = "yid-recording/1"
 
 _STRAIGHT = "straight"
+_GAIN = "proportional_gain"
 _JOINT_UNITS = {"t": "s", **JOINT_CHANNEL_UNITS}
 _POINT_UNITS = {"t": "s", "position": "m", "std": "m"}
-_JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *JOINT_STD_FIELD_NAMES)
+_JOINT_ATTRIBUTES = ("names", "clock", "effort_kind", *JOINT_CONSTANT_NAMES)
 _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 
 
@@ -120,6 +121,9 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT
     )
     joints, points, straight, channels = None, [], None, []
+    gain = {}
+    if _GAIN in file.attrs:  # of all joints alike
+        gain = {_GAIN: read_only_array(file.attrs[_GAIN], f"{origin}, attribute {_GAIN}")}
     further = sorted({CHANNEL_KINDS[kind].group for kind in CHANNEL_KINDS} - {"joints", "points"})
     allowed = ", ".join(["joints, points, points_<name>", *(f"{name}, {name}_<name>" for name in further), _STRAIGHT])
     for name in map(str, file):
@@ -134,7 +138,8 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             isinstance(file[name], h5py.Group), f"'{name}' is not a group", where, "a group of datasets"
         )
         if name == "joints":
-            joints = JointGroup(**_read_group(file[name], where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",)))
+            found = _read_group(file[name], where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",))
+            joints = JointGroup(**gain | found)
         elif declared:
             units = {c.quantity: c.unit for c in declared}
             fields = tuple(entry for c in declared for entry in c.std_attribute_names)

@@ -50,6 +50,11 @@ def _servo_joints(system: System) -> tuple[str, ...]:
     return tuple(name for name in arm_joint_names(system) if name in system.servos)
 
 
+def _dc_motor_joints(system: System) -> tuple[str, ...]:
+    """Names of arm joints with a servo whose motor is of kind dc."""
+    return tuple(name for name in _servo_joints(system) if system.servos[name].motor_kind == "dc")
+
+
 def _geared_joints(system: System) -> tuple[str, ...]:
     """Names of arm joints whose effort is known; of joints with a servo where there are none."""
     return _effort_joints(system) or _servo_joints(system)
@@ -321,7 +326,39 @@ class ServoGain(_ServoChange):
     )
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
-        return {"gain": servo.gain * self["scale"], "damping": servo.damping * self["scale"]}
+        changed = {"gain": servo.gain * self["scale"]}
+        # a counter-voltage is the motor's, whatever its gain
+        return changed if servo.motor_kind == "dc" else changed | {"damping": servo.damping * self["scale"]}
+
+
+@EFFECTS.register("supply_voltage")
+class SupplyVoltage(_ServoChange):
+    """A direct-current motor's supply voltage multiplied by scale: the torque of its duty and the limit of that."""
+
+    equation = "torque = clip(scale gain (u - q), scale limit) - damping v"
+    possible_locations = _dc_motor_joints
+    declared_parameters = (
+        ParameterDefinition("scale", "1", 1.0, 0.2, 5.0, (0.5, 1.5), "true over nominal supply voltage"),
+    )
+
+    def _changes(self, servo: PositionServo) -> dict[str, Any]:
+        tightness = servo.torque_limit_tightness * self["scale"] ** -TORQUE_SATURATION_EXPONENT
+        return {"gain": servo.gain * self["scale"], "torque_limit_tightness": tightness}
+
+
+@EFFECTS.register("back_emf")
+class BackEmf(_ServoChange):
+    """A direct-current motor's torque against its speed, kt^2/R, multiplied by scale."""
+
+    equation = "torque = clip(gain (u - q)) - scale damping v"
+    required_excitation = "how fast it moves"
+    possible_locations = _dc_motor_joints
+    declared_parameters = (
+        ParameterDefinition("scale", "1", 1.0, 0.0, 20.0, (0.0, 3.0), "true over nominal torque per speed"),
+    )
+
+    def _changes(self, servo: PositionServo) -> dict[str, Any]:
+        return {"damping": servo.damping * self["scale"]}
 
 
 @EFFECTS.register("servo_delay")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Literal
 
 import casadi as ca
 
@@ -19,10 +20,31 @@ from yid_ocp.model.system import MidpointState, StepTerms, System
 
 _SIGN_SMOOTHING_SPEED = 0.02
 """Smoothing speed v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
+_LOAD_SIGN_SMOOTHING_SPEED = 0.005
+"""The same for friction that grows with the load, which also holds what the load would move [rad/s]."""
+_SMOOTHING_TORQUE = 1e-3
+"""Torque below which |torque| is smoothed [N m]."""
 _ABS_SMOOTHING_ANGLE = 1e-7
 """Angle turned in a step below which |d| in Dahl's law is smoothed [rad]."""
 _SERIES_MAX_ANGLE_RATIO = 1e-2
 """Ratio of step angle to yield angle below which a power series replaces the exponential, which loses digits there."""
+
+
+FrictionLaw = Literal["viscous", "coulomb", "stribeck", "presliding", "load", "load_stribeck"]
+FRICTION_LAWS: Mapping[FrictionLaw, tuple[str, ...]] = {
+    "viscous": (),
+    "coulomb": ("joint_coulomb",),
+    "stribeck": ("joint_coulomb", "joint_stribeck"),
+    "presliding": ("joint_presliding",),
+    "load": ("joint_coulomb", "joint_load_friction"),
+    "load_stribeck": ("joint_coulomb", "joint_load_friction", "joint_stribeck"),
+}
+"""The ladder of friction laws, each with the effects that it has at a joint beside the viscous `JOINT.damping`."""
+
+
+def _servo_joints(system: System) -> tuple[str, ...]:
+    """Names of arm joints with a servo: recorded torques leave no room for what a gear takes of them."""
+    return tuple(name for name in arm_joint_names(system) if name in system.servos)
 
 
 class _JointFriction(EffectBase):
@@ -75,6 +97,42 @@ class JointStribeck(_JointFriction):
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["tau_s"] * ca.exp(-((v / self["v_stribeck"]) ** 2)) * ca.tanh(v / _SIGN_SMOOTHING_SPEED)
+
+
+@EFFECTS.register("joint_load_friction")
+class JointLoadFriction(_JointFriction):
+    """Friction that grows with the torque through a gear: F = -share |motor torque - torque from outside| sgn(v).
+
+    The torque from outside is that of weights and grasps beyond the joint. Both signs are rounded off: that of the
+    speed below `_LOAD_SIGN_SMOOTHING_SPEED`, that of the torque below `_SMOOTHING_TORQUE`.
+
+    References
+    ----------
+    Duclusaud et al. (2024), Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650.
+    """
+
+    equation = "F = -share |tau_motor - tau_outside| tanh(v/v_s)"
+    candidate_locations = _servo_joints
+    declared_parameters = (
+        ParameterDefinition("share", "1", 0.0, 0.0, 2.0, (0.0, 0.5), "friction per torque through the gear"),
+    )
+
+    def _load(self, state: MidpointState) -> ca.SX:
+        """Torque through the gear [N m]."""
+        system, index = state.system, state.system.mechanism.joint_index(self.location)
+        outside = system.weight_and_grasp_force(state, index)
+        if self.location not in system.driven:  # its motor is taken to balance what pulls from outside
+            return -2 * outside
+        return system.input_force(state.u, state.q, state.v)[index] - outside
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        """The friction of the joint."""
+        load = self._load(state)
+        size = ca.sqrt(load**2 + _SMOOTHING_TORQUE**2) - _SMOOTHING_TORQUE
+        v = state.v[state.system.mechanism.joint_index(self.location)]
+        friction = self["share"] * size * ca.tanh(v / _LOAD_SIGN_SMOOTHING_SPEED)
+        # beside weight and motor it takes energy out, and its size follows both
+        return StepTerms(generalized_force=generalized_force_at_joint(state.system, self.location, -friction))
 
 
 @EFFECTS.register("joint_presliding")

@@ -12,10 +12,11 @@ import numpy as np
 import scipy.linalg.lapack
 from numpy.typing import ArrayLike
 
-from yid_ocp.arrays import Array
+from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.integrator.codegen import nonzero_indices
 from yid_ocp.integrator.discrete import EquilibriumEquations, equilibrium_equations
 from yid_ocp.integrator.step import Step, checked_float_array
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
 
@@ -108,7 +109,8 @@ class EquilibriumSolver:
             Known coordinates, driven then prescribed [rad or m].
         torque : array_like, shape (nu,), optional
             Measured torque at the posture [N m]; the holding spring then only makes up for noise. Of servos what they
-            are commanded: the posture is then where the search begins.
+            are commanded: the posture is then where the search begins. Where a motor is off (`MOTOR_OFF_COMMAND`) the
+            joint is held at its posture and let go as the motion begins.
         guess : array_like, shape (n,), optional
             Configuration to start from; the undeformed object when absent.
         names : sequence of str
@@ -125,7 +127,7 @@ class EquilibriumSolver:
         stiffness = holding_spring_stiffness(system, torque is not None)
         nu, nz = step.sizes["nu"], step.sizes["nz"]
         held = np.zeros(nu) if torque is None else checked_float_array("torque", torque, (nu,))
-        hold = _Hold(given, held, stiffness)
+        hold = _Hold(given, held, stiffness, np.where(_is_motor_off(system, held), _HOLD_STIFFNESS, 0.0))
         count, h = len(self.free_coordinates) + nz, step.equation_time_step(theta)
 
         def equations(w: Array) -> tuple[Array, Array]:
@@ -161,7 +163,7 @@ class EquilibriumSolver:
             far = f"{system.driven[joint]} would have to move by {abs(give[joint]):.3g} rad"
             message = f"the measured {parts} at rest: {far}"
         # torque and posture enter together, as the torque plus the holding spring's stiffness times the posture
-        by_torque = by_posture[:, :nu] / stiffness
+        by_torque = np.where(hold.by_hand > 0, 0.0, by_posture[:, :nu] / stiffness)
         return Equilibrium(
             state, held + stiffness * give, w[count:], by_theta, by_posture, by_torque, not failed, error, message
         )
@@ -198,8 +200,10 @@ class EquilibriumSolver:
         """Potential energy of a configuration, that of the holding springs included."""
         give = hold.give(q, self.step.system)
         energy = self._potential(q, q, z, z, hold.held + hold.stiffness * give, theta)
-        if not len(hold.held) or self.step.system.servos:
+        if not len(hold.held):
             return energy
+        if self.step.system.servos:
+            return energy + ca.dot(hold.by_hand, give**2) / 2
         return energy + hold.stiffness / 2 * ca.sumsqr(give) + ca.dot(hold.held, give)
 
     def _lowest_energy(self, theta: Array, hold: _Hold) -> Array | None:
@@ -274,6 +278,12 @@ class EquilibriumSolver:
                 rows[3][inner] = np.array(ca.densify(self._inner_slopes(None)(*at)))[:, chosen]
         for part in rows:
             part[:n] /= h
+        # what holds a joint whose motor is off lets go as the motion begins
+        hand = hold.by_hand * hold.give(q, system)
+        rows[0][driven] += hand
+        by_rows[driven, driven] -= hold.by_hand
+        momentum[0][driven] += h / 2 * hand
+        by_p[driven, driven] -= h / 2 * hold.by_hand
         for slopes in (by_rows, by_p):
             slopes[:, n + nz :] *= h
         return rows, momentum
@@ -285,15 +295,17 @@ class EquilibriumSolver:
         n, nz, nu = (self.step.sizes[key] for key in ("n", "nz", "nu"))
         free, fixed = len(self.free_coordinates), list(self.step.system.prescribed_coordinate_indices)
         (_, rows, push, others), (p, by_p, push_p, others_p) = self._rest_equations(w, theta, hold, h, names)
-        by_other = np.hstack([others, hold.stiffness * push, rows[:, fixed]])[self._sought]
+        driven = list(self.step.system.driven_coordinate_indices)
+        push, push_p = hold.stiffness * push, hold.stiffness * push_p
+        push[driven, range(nu)] += hold.by_hand
+        push_p[driven, range(nu)] += self.step.equation_time_step(theta) / 2 * hold.by_hand
+        by_other = np.hstack([others, push, rows[:, fixed]])[self._sought]
         change = -_solved(rows[np.ix_(self._sought, self._sought)], by_other)
         state = np.concatenate([self._configuration(w, hold.given), p, w[free : free + nz]])
         total = np.zeros((len(state), by_other.shape[1]))
         total[list(self.free_coordinates)] = change[:free]
         total[fixed, len(names) + nu + np.arange(len(fixed))] = 1.0
-        total[n : 2 * n] = by_p[:, self._sought] @ change + np.hstack(
-            [others_p, hold.stiffness * push_p, by_p[:, fixed]]
-        )
+        total[n : 2 * n] = by_p[:, self._sought] @ change + np.hstack([others_p, push_p, by_p[:, fixed]])
         total[2 * n :] = change[free : free + nz]
         return state, total[:, : len(names)], total[:, len(names) :]
 
@@ -316,7 +328,12 @@ def _servo_energy(system: System, u: ca.SX, q: ca.SX) -> ca.SX:
     """Sum of 1/2 gain (u - q)^2 over all servos [J]; their limits tell which of several equilibria is lowest as little
     as their dampers do."""
     at = zip(system.driven, system.driven_coordinate_indices, ca.vertsplit(u), strict=True) if system.servos else ()
-    return sum((0.5 * system.servos[name].gain * (part - q[i]) ** 2 for name, i, part in at), ca.SX(0))
+    return sum((system.servos[name].potential_energy(part, q[i]) for name, i, part in at), ca.SX(0))
+
+
+def _is_motor_off(system: System, command: Array) -> BoolArray:
+    """Which driven joints have a servo whose motor is off, shape (nu,)."""
+    return np.asarray(bool(system.servos) & (command >= MOTOR_OFF_COMMAND / 2))
 
 
 def holding_spring_stiffness(system: System, known: bool) -> float:
@@ -333,6 +350,7 @@ class _Hold:
     given: Array
     held: Array
     stiffness: float
+    by_hand: Array  # stiffness of what holds joints whose motor is off, (nu,) [N m/rad]
 
     def give(self, q: Any, system: System) -> Any:
         """By how much the driven joints are away from where they should be."""

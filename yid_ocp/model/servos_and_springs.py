@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 
 import casadi as ca
 
+from yid_ocp.errors import ConfigError
 from yid_ocp.model.mechanism import Joint, Mechanism
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
@@ -22,6 +23,138 @@ _DEFAULT_FULL_TORQUE_ERROR = 0.05  # at which a servo of unknown gain reaches it
 _DEFAULT_GAIN = 50.0  # of a servo without an effort limit [N m/rad or N/m]
 _DEFAULT_DAMPING_TIME = 0.1  # a servo's damping over its gain [s]
 _MAX_COMMAND_DELAY = 0.5  # [s]
+MOTOR_OFF_COMMAND = 1e6
+"""Input of a servo whose motor is off; from half of it on there is no torque [rad or m]."""
+
+SERVO_GAIN_FACTOR = "servo_gain_factor"
+"""Parameter of a joint by which a recording states the proportional gain of its servo's firmware."""
+
+MotorKind = Literal["ideal", "dc"]
+MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]
+
+
+@dataclass(frozen=True)
+class MotorFrictionData:
+    """Constants that were identified together with one friction law; those of another law do not go with them.
+
+    Attributes
+    ----------
+    torque_constant, resistance : float
+        kt [N m/A] and R [ohm] at the output shaft.
+    coulomb, viscous : float
+        [N m] and [N m s/rad]
+    load_share, stribeck, stribeck_speed : float
+        Friction per torque through the gear, friction at low speed [N m], and the speed beyond which it is gone
+        [rad/s]; zero where the law has none.
+    """
+
+    torque_constant: float
+    resistance: float
+    coulomb: float
+    viscous: float
+    load_share: float = 0.0
+    stribeck: float = 0.0
+    stribeck_speed: float = 0.0
+
+
+@dataclass(frozen=True)
+class DcMotorData:
+    """Published figures of a geared direct-current servo, starting values of what is estimated.
+
+    Attributes
+    ----------
+    supply_voltage : float
+        [V]
+    duty_per_gain : float
+        Duty per unit of the firmware's proportional gain and per error of the angle [1/rad].
+    duty_limit, armature : float
+        Largest duty [-]; inertia of rotor and gear at the output shaft [kg m^2].
+    plain, load_dependent : MotorFrictionData
+        With Coulomb and viscous friction; with friction that grows with the load, None where nobody published it.
+
+    References
+    ----------
+    Duclusaud et al. (2024), Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650,
+    and the figures published with it (Rhoban/bam, Apache-2.0).
+    """
+
+    supply_voltage: float
+    duty_per_gain: float
+    duty_limit: float
+    armature: float
+    plain: MotorFrictionData
+    load_dependent: MotorFrictionData | None = None
+
+    def servo_values(self, constants: MotorFrictionData) -> dict[str, float]:
+        """Values of a servo's parameters by name: torque = kt/R (duty V - kt speed) [N m/rad, N m s/rad, N m]."""
+        stall = constants.torque_constant * self.supply_voltage / constants.resistance
+        return {
+            "servo_gain": self.duty_per_gain * stall,
+            "servo_damping": constants.torque_constant**2 / constants.resistance,
+            "servo_torque_limit": self.duty_limit * stall,
+        }
+
+
+MOTOR_PRESETS: Mapping[MotorPreset, DcMotorData] = {
+    "xl330": DcMotorData(
+        7.4,
+        0.00288,
+        1.0,
+        0.00181,
+        MotorFrictionData(0.387, 4.02, 0.0128, 0.00366),
+        MotorFrictionData(0.386, 3.4, 0.00876, 0.00462, 0.068, 0.0, 2.56),
+    ),
+    "xl320": DcMotorData(
+        7.5,
+        0.0505,
+        1.0,
+        0.00112,
+        MotorFrictionData(0.987, 35.6, 0.0275, 0.00332),
+        MotorFrictionData(0.995, 26.2, 0.0, 0.00779, 0.221, 0.0215, 1.97),
+    ),
+    "mx64": DcMotorData(
+        15.0,
+        0.158,
+        0.9625,
+        0.012,
+        MotorFrictionData(1.62, 3.95, 0.0904, 0.0117),
+        MotorFrictionData(1.66, 3.16, 0.0615, 0.0148, 0.0, 0.0239, 1.52),
+    ),
+    "mx106": DcMotorData(
+        15.0,
+        0.158,
+        0.9625,
+        0.0266,
+        MotorFrictionData(2.19, 2.96, 0.104, 0.0352),
+        MotorFrictionData(2.23, 2.37, 0.0, 0.051, 0.00915, 0.105, 1.62),
+    ),
+    "sts3215": DcMotorData(7.4, 0.166, 0.97, 0.0284, MotorFrictionData(1.21, 2.68, 0.0524, 0.0591)),
+}
+"""Motors of desk arms by preset; `STS3215` at 7.4 V."""
+
+
+@dataclass(frozen=True)
+class MotorOptions:
+    """What turns a servo's command into torque."""
+
+    kind: Annotated[
+        MotorKind,
+        OptionInfo(
+            "ideal: torque = clip(gain error - damping speed); dc: torque = clip(gain error) - damping speed, where "
+            "the clip is that of the duty and the damping is the motor's counter-voltage; gain is per unit of the "
+            "firmware's gain where recordings state it (`proportional_gain`)"
+        ),
+    ] = "ideal"
+    preset: Annotated[
+        MotorPreset | None, OptionInfo("motor whose published figures are starting values and priors; of kind dc")
+    ] = None
+
+    def __post_init__(self) -> None:
+        if self.preset is not None and self.kind != "dc":
+            allowed, hint = "preset with kind: dc", "set model.arms.servo.motor.kind: dc, or leave the preset out"
+            raise ConfigError(
+                f"the motor is {self.kind} and has the preset '{self.preset}'", allowed=allowed, hint=hint
+            )
 
 
 @dataclass(frozen=True)
@@ -43,20 +176,24 @@ class PositionServoOptions:
     has_gravity_compensation: Annotated[
         bool, OptionInfo("whether the controller carries the robot's own weight, so that the servos need not")
     ] = False
+    motor: Annotated[MotorOptions, OptionInfo("of every servo")] = MotorOptions()
 
 
 @dataclass(frozen=True)
 class PositionServo:
     """A position servo on one joint, whose input is the commanded coordinate u.
 
-        demand = gain (u(t - delay) - q) - damping dq/dt       torque = demand / (1 + tightness demand^p)^(1/p)
+        ideal:  torque = clip(gain (u(t - delay) - q) - damping dq/dt)
+        dc:     torque = clip(gain (u(t - delay) - q)) - damping dq/dt
 
-    with p = `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, to which further limits add.
+    with clip(x) = x / (1 + tightness x^p)^(1/p), p = `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, to which
+    further limits add. Of a direct-current motor the limit is that of its duty, and the damping is its counter-voltage
+    (torque = kt/R (duty V - kt dq/dt)). At `MOTOR_OFF_COMMAND` there is no torque at all.
 
     Attributes
     ----------
     gain, damping, command_delay, torque_limit_tightness : casadi.SX
-        [N m/rad or N/m], [N m s/rad or N s/m], [s], [(N m)^-p]
+        [N m/rad or N/m], [N m s/rad or N s/m], [s], [(N m)^-p]; gain includes the firmware's where that is known.
     """
 
     gain: ca.SX
@@ -64,13 +201,22 @@ class PositionServo:
     command_delay: ca.SX
     torque_limit_tightness: ca.SX
     command_interpolation: CommandInterpolation = "held"
+    motor_kind: MotorKind = "ideal"
 
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
         """The servo's torque for a command, a coordinate and its rate [N m or N]."""
-        demand = self.gain * (command - q) - self.damping * v
-        return demand / (1 + self.torque_limit_tightness * demand**TORQUE_SATURATION_EXPONENT) ** (
+        on = command < MOTOR_OFF_COMMAND / 2
+        pull, drag = self.gain * (ca.if_else(on, command, q) - q), self.damping * v
+        demand = pull - drag if self.motor_kind == "ideal" else pull
+        clipped = demand / (1 + self.torque_limit_tightness * demand**TORQUE_SATURATION_EXPONENT) ** (
             1 / TORQUE_SATURATION_EXPONENT
         )
+        return ca.if_else(on, clipped if self.motor_kind == "ideal" else clipped - drag, 0)
+
+    def potential_energy(self, command: ca.SX, q: ca.SX) -> ca.SX:
+        """Energy 1/2 gain (u - q)^2 of the servo as a spring, without its limit [J]; none while its motor is off."""
+        error = ca.if_else(command < MOTOR_OFF_COMMAND / 2, command, q) - q
+        return 0.5 * self.gain * error**2
 
     @property
     def coefficients(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
@@ -99,18 +245,26 @@ def joint_spring_parameters(tree: Mechanism, joint: str, spring: RobotJointSprin
 
 
 def build_joint_servos(
-    tree: Mechanism, joints: Sequence[str], commands: CommandInterpolation = "held"
+    tree: Mechanism, joints: Sequence[str], options: PositionServoOptions
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
     """A servo on every named joint, and their parameters `JOINT.servo_gain`, `servo_damping`, ...
 
-    Values are those of a servo that gives its joint's effort limit at an error of `_DEFAULT_FULL_TORQUE_ERROR`.
+    Values are those of a servo that gives its joint's effort limit at an error of `_DEFAULT_FULL_TORQUE_ERROR`. Of a
+    direct-current motor `JOINT.servo_gain_factor` multiplies the gain: the firmware's, which recordings may state.
     """
     servos, entries = {}, []
     for joint in joints:
         at = tree.joints[tree.joint_index(joint)]
         own = _servo_parameters(at)
         gain, damping, delay, limit = (entry.symbol for entry in own)
-        servos[joint] = PositionServo(gain, damping, delay, limit**-TORQUE_SATURATION_EXPONENT, commands)
+        if options.motor.kind == "dc":
+            words = f"the firmware's proportional gain, servo of {joint}"
+            own.append(Parameter(f"{joint}.{SERVO_GAIN_FACTOR}", 1.0, "1", 0.0, math.inf, words))
+            gain = gain * own[-1].symbol
+        tightness = limit**-TORQUE_SATURATION_EXPONENT
+        servos[joint] = PositionServo(
+            gain, damping, delay, tightness, options.command_interpolation, options.motor.kind
+        )
         entries += own
     return servos, entries
 

@@ -369,7 +369,7 @@ class System(ReprMixin):
             stiffness, rest = joint_spring_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
-        moved, own = ({}, []) if servos is None else build_joint_servos(tree, driven, servos.command_interpolation)
+        moved, own = ({}, []) if servos is None else build_joint_servos(tree, driven, servos)
         tree = without_gravity(tree) if servos is not None and servos.has_gravity_compensation else tree
         segments: list[SegmentLayout] = []
         for item, frame, placement in options.get("objects", ()):
@@ -476,6 +476,20 @@ class System(ReprMixin):
             servo = self.servos.get(joint)
             force[index] = u[row] if servo is None else servo.torque(u[row], q[index], v[index])
         return ca.vertcat(*force)
+
+    def weight_and_grasp_force(self, state: MidpointState, index: int) -> ca.SX:
+        """Force of weights and grasps on one coordinate, from what it moves, at a step's midpoint [N m or N]."""
+        kinematics, tree = state.kinematics, self.mechanism
+        screw, force = kinematics.joint_screws[index], ca.SX(0)
+        for j, joint in enumerate(tree.joints):
+            for body in joint.bodies if index in tree.ancestor_joint_indices(j) else ():
+                com = kinematics.joint_rotations[j] @ body.center_of_mass + kinematics.joint_origins[j]
+                heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
+                force += heavy * ca.dot(ca.vertcat(ca.cross(com, self.gravity), self.gravity), screw)
+        if self.n_constraints:
+            slope = ca.jacobian(self.constraint_residual(kinematics), state.q[index])
+            force -= ca.dot(slope, state.constraint_force)
+        return force
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
         """Constraint residual phi(q) of all grasps, shape (m, 1)."""

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import scipy.interpolate
 
-from yid_ocp.arrays import Array, IntArray
+from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.effects import sensor_kinds
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.objects.base import ClampPoseDefinition
-from yid_ocp.model.servos_and_springs import PositionServo
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, SERVO_GAIN_FACTOR, PositionServo
 from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
@@ -55,7 +55,9 @@ def mean_step_inputs(
     late = np.zeros(len(driven)) if delay is None else delay
     courses = _courses(joints, driven, where, servos or {})
     total = [_summed(course, grid.node_times - shift) for course, shift in zip(courses, late, strict=True)]
-    return np.asarray(np.diff(np.stack(total, axis=1), axis=0) / grid.time_step)
+    mean = np.asarray(np.diff(np.stack(total, axis=1), axis=0) / grid.time_step)
+    mean[motor_off_steps(joints, driven, grid, where, bool(servos))] = MOTOR_OFF_COMMAND
+    return mean
 
 
 def mean_step_input_delay_derivative(
@@ -71,7 +73,54 @@ def mean_step_input_delay_derivative(
     for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
         sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
         result.append(-np.diff(sum(sides)) / 2 / grid.time_step)
-    return np.stack(result, axis=1)
+    slope = np.stack(result, axis=1)
+    slope[motor_off_steps(joints, driven, grid, where, bool(servos))] = 0.0
+    return slope
+
+
+def motor_off_steps(
+    joints: JointGroup, driven: tuple[str, ...], grid: TimeGrid, where: str, has_servos: bool
+) -> BoolArray:
+    """In which steps the motor of a servo is off, shape (steps, nu).
+
+    By `torque_enable`, held from sample to sample, at the middle of a step; all of them without commands.
+    """
+    off = np.zeros((grid.steps, len(driven)), bool)
+    if not has_servos:
+        return off
+    if joints.position_command is None:
+        return np.ones_like(off)
+    if joints.torque_enable is None:
+        return off
+    row = np.searchsorted(joints.t, grid.node_times[:-1] + grid.time_step / 2, "right") - 1
+    enabled = joints.torque_enable[:, recorded_joint_columns(joints, driven, where)]
+    return np.asarray(enabled[np.clip(row, 0, len(joints.t) - 1)] < 0.5)
+
+
+def recorded_servo_gain_factors(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
+    """Firmware gains that recordings state, as values of `JOINT.servo_gain_factor` by recording.
+
+    `DataError` where some recordings state it and others, whose motors are on, do not: their gains would not compare.
+    """
+    wanted = {name: f"{name}.{SERVO_GAIN_FACTOR}" for name in system.servos}
+    wanted = {name: parameter for name, parameter in wanted.items() if parameter in system.parameters}
+    found: dict[str, dict[str, float]] = {}
+    silent = []
+    for recording in recordings:
+        joints = recording.joints
+        if joints is None or not wanted:
+            continue
+        if joints.proportional_gain is None:
+            silent += [] if joints.position_command is None else [recording.name]
+            continue
+        gains = np.broadcast_to(joints.proportional_gain, (len(joints.names),))
+        columns = {name: joints.names.index(name) for name in wanted if name in joints.names}
+        found[recording.name] = {wanted[name]: float(gains[column]) for name, column in columns.items()}
+    if found and silent:
+        what = "the recording does not state the proportional gain of its servos, and others do"
+        hint = 'state it in all of them, or set parameters: {"*.servo_gain_factor": {initial: GAIN}}'
+        raise DataError(what, where=f"{silent[0]}: joints, attribute proportional_gain", hint=hint)
+    return found
 
 
 def _courses(
@@ -82,13 +131,16 @@ def _courses(
     # the last sample stands for as long as the one before it
     edges = np.append(t, 2 * t[-1] - t[-2])
     if servos:
+        if joints.position_command is None and joints.effort is not None and not np.any(joints.effort):
+            return [_held(np.zeros(len(t)), edges)] * len(driven)  # motors are off
         if joints.position_command is None:
             raise DataError(
                 "the recording has no commanded positions, which the arms' servos follow",
                 where=f"{where}: joints/position_command",
                 allowed="the commanded position of every joint beside the measured one",
                 hint="import them (the action of a LeRobot dataset, --command-topic of a bag), "
-                "or prescribe the arms' motion instead (model.arms.mode: prescribed)",
+                "or prescribe the arms' motion instead (model.arms.mode: prescribed); "
+                "with motors off an effort that is zero throughout says so",
             )
         rows = joints.position_command[:, recorded_joint_columns(joints, driven, where)].T
         held = [servos[name].command_interpolation == "held" for name in driven]

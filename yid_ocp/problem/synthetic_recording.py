@@ -9,6 +9,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import ChannelGroup, JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.errors import SolverError
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
@@ -188,8 +189,8 @@ def _commanded(
     """Joints of servos at every node, with what they were commanded there."""
     source, times = episode.recording.joints, episode.grid.node_times
     assert source is not None
-    assert source.position_command is not None
-    commands = source.position_command[:, [source.names.index(name) for name in names]]
+    columns = [source.names.index(name) for name in names]
+    commands = source.position[:, columns] if source.position_command is None else source.position_command[:, columns]
     rows = np.clip(np.searchsorted(source.t, times + 1e-9) - 1, 0, len(source.t) - 1)
     between = np.stack([np.interp(times, source.t, column) for column in commands.T], axis=1)
     held = [predictor.system.servos[name].command_interpolation == "held" for name in names]
@@ -198,7 +199,18 @@ def _commanded(
     )
     noisy = _noisy(position, np.broadcast_to(std, position.shape), rng)
     given = np.where(held, commands[rows], between)
-    return JointGroup(names, times, noisy, position_command=given, position_std=std)
+    off = np.stack([episode.torque[:, predictor.system.driven.index(name)] >= MOTOR_OFF_COMMAND / 2 for name in names])
+    enabled = None if not off.any() else np.append(~off, ~off[:, -1:], axis=1).T.astype(float)
+    gain = None if source.proportional_gain is None else np.broadcast_to(source.proportional_gain, len(source.names))
+    return JointGroup(
+        names,
+        times,
+        noisy,
+        position_command=given,
+        position_std=std,
+        torque_enable=enabled,
+        proportional_gain=None if gain is None else gain[columns],
+    )
 
 
 @dataclass(frozen=True)

@@ -169,6 +169,9 @@ def joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str,
 
     for joint, coefficient in system.joint_damping.items():
         add(joint, JointDynamicsTerms(damping=float(value(coefficient)[0])))
+    for joint, servo in system.servos.items():
+        if servo.motor_kind == "dc":  # its counter-voltage is beyond the limit of its duty
+            add(joint, JointDynamicsTerms(damping=float(value(servo.damping)[0])))
     for spring in system.elastic_joints:
         stiffness, rest, damping = (float(value(x)[0]) for x in (spring.stiffness, spring.rest_angle, spring.damping))
         add(spring.joint_name, JointDynamicsTerms(stiffness, stiffness * rest, damping=damping))
@@ -446,6 +449,7 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element,
         bias, between = [-offset, 0.0, 0.0], "linear"
         if servo is not None:
             own, damping, late, tightness = (float(value(x)[0]) for x in servo.coefficients)
+            damping = 0.0 if servo.motor_kind == "dc" else damping
             gain, bias, delay = own * gain, [own * bias[0], -own, -damping], delay + late
             between = "zoh" if servo.command_interpolation == "held" else "linear"
             limit = tightness ** (-1 / TORQUE_SATURATION_EXPONENT) if tightness > 0 else math.inf

@@ -16,6 +16,8 @@ from yid_ocp.config.settings import GraspSettings, ParameterSettings, RunSetting
 from yid_ocp.data.channel_checks import median_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
+from yid_ocp.effects.base import arm_joint_names
+from yid_ocp.effects.friction import FRICTION_LAWS
 from yid_ocp.errors import DataError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
@@ -23,7 +25,7 @@ from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.objects.base import CableTopology, ClampedObject
 from yid_ocp.model.parameters import Parameters
 from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
-from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.workflow.run_inputs import (
@@ -37,6 +39,7 @@ from yid_ocp.workflow.run_inputs import (
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping beside those of the joints
 _DEFAULT_JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
 _AXES = "xyz"
+_PRESET_RELATIVE_STD = 0.25  # of published motor constants, which move by 10 to 40 % from one friction law to another
 _OTHER_SIDE = {"left": "right", "right": "left"}
 
 
@@ -177,6 +180,11 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
     """The system with the effects and the parameters' values of the settings."""
+    named = {f"{said.kind}@{said.location}" for said in run.model.effects}
+    for joint in friction_joints(run, system):
+        assert run.model.friction is not None
+        kinds = FRICTION_LAWS[run.model.friction.law]
+        system = system.with_effects([make_effect(k, joint, system) for k in kinds if f"{k}@{joint}" not in named])
     for i, said in enumerate(run.model.effects):
         with add_setting_location_to_errors(run, "model", "effects", i):
             system = system.with_effects([make_effect(said.kind, said.location, system, dict(said.values))])
@@ -186,7 +194,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
             given, factor = chosen[entry.name], divided_link_parameter_scale(run, entry.name, link_division)
             lower, upper = (entry.lower, entry.upper) if given.bounds is None else (factor * b for b in given.bounds)
             value = entry.value if given.initial is None else factor * given.initial
-            key = [key for key in run.parameters if _matches(entry.name, key)][-1]
+            key = ([key for key in run.parameters if _matches(entry.name, key)] or [entry.name])[-1]
             if lower < entry.lower or upper > entry.upper or lower > upper:
                 what = f"the bounds {lower:g} to {upper:g} {entry.unit} of {entry.name} are not possible"
                 allowed = f"within {entry.lower:g} to {entry.upper:g} {entry.unit}, lower first"
@@ -204,9 +212,10 @@ def _matches(name: str, key: str) -> bool:
 def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
     """Settings by parameter name, for every name or pattern that matches; later keys override earlier ones.
 
-    `ConfigError` for a name or pattern that matches nothing.
+    Before them go those of the sections `model.friction` and `model.arms.servo.motor`. `ConfigError` for a name or
+    pattern that matches nothing.
     """
-    result: dict[str, ParameterSettings] = {}
+    result = _section_parameter_settings(run, parameters)
     for key, given in run.parameters.items():
         matches = [name for name in parameters.names if _matches(name, key)]
         if not matches:
@@ -215,6 +224,50 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
         said = {name: value for name, value in vars(given).items() if value is not None}
         result |= {name: replace(result.get(name, ParameterSettings()), **said) for name in matches}
     return result
+
+
+def friction_joints(run: RunSettings, system: System) -> tuple[str, ...]:
+    """Joints that have the friction of the settings: those named, or all of the arms; none without that section."""
+    if run.model.friction is None:
+        return ()
+    known = tuple(name for name in arm_joint_names(system) if name in system.joint_damping)
+    for i, name in enumerate(run.model.friction.joints or ()):
+        if name not in known:
+            raise unknown_name_error(run, "joint", name, known, "model", "friction", "joints", i)
+    return known if run.model.friction.joints is None else run.model.friction.joints
+
+
+def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
+    """What sections of the model say of parameters: ordinary friction is free, a known motor has values and priors."""
+    found: dict[str, ParameterSettings] = {}
+    friction, motor = run.model.friction, run.model.arms.servo.motor
+    law = None if friction is None else friction.law
+    arms = {name.rpartition(".")[0] for name in parameters.names if name.endswith(".damping")}
+    joints = sorted(arms if friction is None or friction.joints is None else arms & set(friction.joints))
+    values: dict[str, float] = {}
+    if motor.preset is not None and run.model.arms.mode == "servo":
+        data = MOTOR_PRESETS[motor.preset]
+        by_load = data.load_dependent if law is not None and law.startswith("load") else None
+        constants = data.plain if by_load is None else by_load
+        for joint in (name.rpartition(".")[0] for name in parameters.names if name.endswith(".servo_gain")):
+            own = {f"{joint}.{name}": value for name, value in data.servo_values(constants).items()}
+            own[f"rotor_inertia@{joint}.armature"] = data.armature
+            for name in own.keys() & set(parameters.names):
+                found[name] = ParameterSettings(initial=own[name], prior_std=_PRESET_RELATIVE_STD * own[name])
+            if friction is not None:
+                values |= {
+                    f"{joint}.damping": constants.viscous,
+                    f"joint_coulomb@{joint}.tau_c": constants.coulomb,
+                    f"joint_load_friction@{joint}.share": constants.load_share,
+                    f"joint_stribeck@{joint}.tau_s": constants.stribeck,
+                }
+    if law is not None:
+        for joint in joints:
+            own_effects = tuple(f"{kind}@{joint}." for kind in FRICTION_LAWS[law])
+            for name in parameters.names:
+                if name == f"{joint}.damping" or name.startswith(own_effects):
+                    found[name] = ParameterSettings(free=True, initial=values.get(name))
+    return found
 
 
 def free_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:

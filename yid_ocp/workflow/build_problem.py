@@ -39,6 +39,7 @@ from yid_ocp.model import System
 from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDefinition
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
+from yid_ocp.problem.recorded_inputs import recorded_servo_gain_factors
 from yid_ocp.sensors.base import declared_channel_kinds
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_measured_by_arm
 from yid_ocp.workflow.build import (
@@ -87,6 +88,10 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
             sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
     cable = clamped_cable_topology(run)
     own = marker_positions_from_reference_pose(run, system, recordings)
+    for name, factors in recorded_servo_gain_factors(system, recordings).items():
+        # what the settings say of a gain goes before what a recording states
+        unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
+        own[name] = own.get(name, {}) | unsaid
     clamps = tuple(
         ClampPoseDefinition(name, s.origin_point, s.z_axis_point, s.roll_convention)
         for name, s in run.model.clamps.items()

@@ -17,6 +17,7 @@ from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.localise import smoothed_unknown_units
 from yid_ocp.inference import whitening
 from yid_ocp.model.objects.base import CableTopology
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem import EstimationProblem, prediction_errors
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import Measurements
@@ -213,9 +214,9 @@ def write_solve_trajectories(
     """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1`.
 
     `unknowns/`: names, x, covariance. `recordings/NAME/`: `t` (N+1,) [s], `q`, `p` (N+1, n), `multipliers` (N, m)
-    [N s], `torque` (N, nu) [N m] or what servos are commanded, `command` (N, nu) [rad or m], `effort` (N, nc) [N m],
-    the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor `GROUP/` with `t`,
-    `measured`, `predicted`, `std` and the attributes `channels`, `unit`.
+    [N s], `torque` (N, nu) [N m] or what servos are commanded, `command` (N, nu) [rad or m] (NaN while a motor is off),
+    `effort` (N, nc) [N m], the attributes `joints` (n names), `driven` (nu) and `prescribed` (nc), and for every sensor
+    `GROUP/` with `t`, `measured`, `predicted`, `std` and the attributes `channels`, `unit`.
 
     Raises `OutputError`.
     """
@@ -243,7 +244,11 @@ def write_solve_trajectories(
                 "q": rollout.state[:, :n],
                 "p": rollout.state[:, n : 2 * n],
                 "multipliers": rollout.multipliers,
-                "command" if system.servos else "torque": rollout.torque,
+                "command" if system.servos else "torque": (
+                    np.where(rollout.torque < MOTOR_OFF_COMMAND / 2, rollout.torque, np.nan)
+                    if system.servos
+                    else rollout.torque
+                ),
                 "effort": rollout.effort,
             }
             _store(group, arrays)

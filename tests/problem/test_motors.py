@@ -1,0 +1,196 @@
+"""Direct-current motors, motors that are off, gains of a firmware, and friction in gears behind servos."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from small_problems import PENDULUM, H, joints, pendulum_step, recording
+
+from yid_ocp.data.recording import validate_recording
+from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.integrator.step import compile_step, simulate
+from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorOptions, PositionServoOptions
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.recorded_inputs import recorded_servo_gain_factors
+
+VALUES = {
+    "shoulder.servo_gain": 0.6, "shoulder.servo_damping": 4.0, "shoulder.servo_torque_limit": 9.0,
+    "shoulder.servo_gain_factor": 100.0, "elbow.servo_gain": 0.25, "elbow.servo_damping": 1.5,
+    "elbow.servo_torque_limit": 3.0, "elbow.servo_gain_factor": 100.0,
+}  # fmt: skip
+DC = PositionServoOptions(motor=MotorOptions("dc"))
+
+
+@pytest.fixture(scope="module")
+def step(urdf_folder):
+    return pendulum_step(urdf_folder, driven=PENDULUM, servos=DC)
+
+
+def torque_function(step):
+    system = step.system
+    u, q, v = (ca.SX.sym(name, 2) for name in "uqv")
+    function = ca.Function("torque", [u, q, v, system.parameters.symbols], [system.input_force(u, q, v)])
+    theta = system.parameters.vector({k: x for k, x in VALUES.items() if k in system.parameters})
+    return lambda *at: np.array(function(*at, theta)).ravel()
+
+
+def test_a_dc_motor_limits_its_duty_and_its_speed_takes_torque_beyond_the_limit(step) -> None:
+    torque = torque_function(step)
+    # an error of 1 rad asks for 60 N m, the duty gives 9, and 2 rad/s against it cost 8 more
+    assert torque([1.0, 0.0], [0.0, 0.0], [2.0, 0.0])[0] == pytest.approx(9.0 - 8.0)
+    assert torque([1.0, 0.0], [0.0, 0.0], [-2.0, 0.0])[0] == pytest.approx(9.0 + 8.0)
+    assert torque([0.05, 0.0], [0.0, 0.0], [0.1, 0.0])[0] == pytest.approx(60 * 0.05 - 0.4, abs=1e-6)
+
+
+def test_a_motor_that_is_off_gives_no_torque_however_fast_it_turns(step) -> None:
+    assert list(torque_function(step)([MOTOR_OFF_COMMAND] * 2, [0.3, 0.2], [3.0, -5.0])) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("preset", MOTOR_PRESETS)
+def test_a_preset_stalls_at_its_supply_over_its_resistance(preset) -> None:
+    data = MOTOR_PRESETS[preset]
+    for constants in filter(None, (data.plain, data.load_dependent)):
+        values = data.servo_values(constants)
+        stall = constants.torque_constant * data.supply_voltage / constants.resistance
+        assert values["servo_torque_limit"] == pytest.approx(data.duty_limit * stall)
+        # at no load it turns as fast as its counter-voltage is the supply's
+        assert stall / values["servo_damping"] == pytest.approx(data.supply_voltage / constants.torque_constant)
+
+
+def swing(steps: int = 60, **channels):
+    """Commands that hold, turn round and hold again: joints stick, slide and reverse."""
+    t = H * np.arange(steps + 1)
+    wave = np.clip(np.sin(9.0 * t[:, None] + np.array([0.0, 1.0])), -0.6, 0.6)
+    command = np.array([0.3, -0.2]) + 0.3 * np.minimum(t / 0.1, 1.0)[:, None] * wave
+    values = {"position": command, "position_command": command, "position_std": 1e-3} | channels
+    return joints(PENDULUM, t, values.pop("position"), **values)
+
+
+def problem_of(step, group, free=("shoulder.servo_gain",), values=None, **options) -> EstimationProblem:
+    known = {name: value for name, value in VALUES.items() if name in step.system.parameters}
+    return EstimationProblem(step, [recording(group)], list(free), ProblemOptions(**options), known | (values or {}))
+
+
+def test_a_preset_belongs_to_a_dc_motor() -> None:
+    with pytest.raises(ConfigError, match="ideal and has the preset 'xl330'"):
+        MotorOptions(preset="xl330")
+
+
+def test_recordings_state_the_gain_of_the_firmware_once_for_all_joints_or_for_each(step) -> None:
+    one = recording(swing(proportional_gain=400.0), name="one")
+    each = recording(swing(proportional_gain=np.array([400.0, 100.0])), name="each")
+    found = recorded_servo_gain_factors(step.system, [one, each])
+    assert found["one"] == {"shoulder.servo_gain_factor": 400.0, "elbow.servo_gain_factor": 400.0}
+    assert found["each"]["elbow.servo_gain_factor"] == 100.0
+    with pytest.raises(DataError, match="does not state the proportional gain"):
+        recorded_servo_gain_factors(step.system, [one, recording(swing(), name="silent")])
+
+
+def test_with_efforts_of_zero_and_no_commands_motors_are_off_and_joints_are_let_go(urdf_folder, step) -> None:
+    start = np.array([0.4, -0.3])
+    off = swing(position=np.tile(start, (61, 1)), position_command=None, effort=np.zeros((61, 2)))
+    problem = problem_of(step, off)
+    assert np.all(problem.episodes[0].torque == MOTOR_OFF_COMMAND)
+    state = problem.evaluate(problem.initial_unknowns).episode_predictions[0].rollout.state
+    assert state[0, :2] == pytest.approx(start, abs=1e-3)
+    # it falls from rest as a driven pendulum without torque does
+    free = pendulum_step(urdf_folder, driven=PENDULUM)
+    fallen = simulate(free, free.system.parameters.vector(), np.append(state[0, :2], [0, 0]), 60, np.zeros((60, 2)))
+    assert state[-1, 0] != pytest.approx(state[0, 0], abs=0.1)
+    assert state[:, :2] == pytest.approx(fallen.state[:, :2], abs=1e-6)
+
+
+def test_a_column_switches_motors_within_a_recording(step) -> None:
+    enabled = np.ones((61, 2))
+    enabled[20:35, 1] = 0.0
+    problem = problem_of(step, swing(torque_enable=enabled))
+    off = problem.episodes[0].torque >= MOTOR_OFF_COMMAND / 2
+    assert not off[:, 0].any()
+    assert list(np.flatnonzero(off[:, 1])) == list(range(20, 35))
+    found = problem.simulate_recording().joints
+    assert np.array_equal(found.torque_enable[:60], enabled[:60])
+    with pytest.raises(DataError, match="neither 0 nor 1"):
+        validate_recording(recording(swing(torque_enable=np.full((61, 2), 0.5))))
+
+
+LADDER = {
+    "coulomb": [("joint_coulomb", {"tau_c": 0.8})],
+    "stribeck": [("joint_coulomb", {"tau_c": 0.8}), ("joint_stribeck", {"tau_s": 0.2, "v_stribeck": 0.1})],
+    "presliding": [("joint_presliding", {"tau_c": 0.8})],
+    "load": [("joint_coulomb", {"tau_c": 0.3}), ("joint_load_friction", {"share": 0.2})],
+    "drive": [("supply_voltage", {"scale": 0.9}), ("back_emf", {"scale": 1.3}), ("servo_gain", {"scale": 0.8})],
+}
+
+
+@pytest.mark.parametrize("law", LADDER)
+@pytest.mark.parametrize("power", ["on", "switched", "off"])
+def test_slopes_through_sticking_reversal_and_rest_are_those_of_differences(urdf_folder, law, power) -> None:
+    effects = [(kind, joint, values) for kind, values in LADDER[law] for joint in PENDULUM]
+    step = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=DC)
+    enabled = np.ones((61, 2))
+    enabled[20:35] = 0.0
+    group = {
+        "on": swing(),
+        "switched": swing(torque_enable=enabled),
+        "off": swing(position_command=None, effort=np.zeros((61, 2))),
+    }[power]
+    names = step.system.parameters.names
+    # a delay moves the sample at which a motor is switched off: there is a jump, not a slope
+    free = [name for name in names if ("servo" in name or "@" in name) and "servo_delay" not in name]
+    values = dict(zip(names, step.system.parameters.vector(), strict=True))
+    made = problem_of(step, group, free, {name: value for name, value in values.items() if "@" in name})
+    x = made.initial_unknowns
+    at = made.evaluate(x)
+    assert at.ok, at.message
+    rows = made.residual_rows.data
+    for i, name in enumerate(made.unknown_names):
+        ends = []
+        for sign in (1, -1):
+            there = x.copy()
+            there[i] += sign * 1e-6 * max(1e-2, abs(x[i]))
+            ends.append(made.evaluate(there, False).residual[rows])
+        numeric = (ends[0] - ends[1]) / (2e-6 * max(1e-2, abs(x[i])))
+        exact = at.jacobian[rows, i]
+        assert np.abs(exact - numeric).max() < 2e-4 * np.abs(exact).max() + 1e-4, name
+
+
+def test_friction_of_a_load_grows_with_what_hangs_and_pulls(urdf_folder) -> None:
+    """Held against its weight by its motor, the gear carries the weight twice: motor and weight pull at both sides."""
+    step = pendulum_step(urdf_folder, [("joint_load_friction", "elbow", {"share": 0.1})], driven=PENDULUM, servos=DC)
+    system, e = step.system, step.equations
+    point = {"q": np.array([0.2, 0.7]), "v": np.array([0.0, 1.0])}
+    h = 1e-6
+    start, end = point["q"] - h / 2 * point["v"], point["q"] + h / 2 * point["v"]
+    balance = ca.Function("b", [e.q0, e.q1, e.p0, e.u, e.theta, e.time_step], [e.balance_remainder])
+
+    def remainder(share: float, command: float) -> float:
+        theta = system.parameters.vector(VALUES | {"joint_load_friction@elbow.share": share})
+        return float(balance(start, end, [0, 0], [0.2, command], theta, h)[1]) * 2 / h
+
+    torque = torque_function(step)
+    for command in (0.2, 0.7, 1.5):
+        pull = torque([0.2, command], point["q"], point["v"])[1]
+        # at rest both nodes are at the same place, and half the slope is of either
+        outside = -2 * float(weight_at(e, system, point["q"])[1])
+        expected = -0.1 * abs(pull - outside)
+        assert remainder(0.1, command) - remainder(0.0, command) == pytest.approx(expected, abs=2e-3)
+
+
+def weight_at(e, system, q):
+    slope = ca.gradient(e.rigid_body_terms.potential_energy, e.q0)
+    return np.array(ca.Function("w", [e.q0, e.q1, e.theta], [slope])(q, q, system.parameters.vector(VALUES))).ravel()
+
+
+def test_the_compiled_step_agrees(urdf_folder) -> None:
+    effects = [(kind, "elbow", values) for kind, values in [*LADDER["load"], *LADDER["drive"]]]
+    slow = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=DC)
+    fast = compile_step(slow.system, H)
+    if not fast.is_compiled:
+        pytest.skip("no C compiler")
+    enabled = np.ones((61, 2))
+    enabled[20:35] = 0.0
+    runs = [problem_of(s, swing(torque_enable=enabled), ["shoulder.servo_gain", "elbow.damping"]) for s in (slow, fast)]
+    one, other = (p.evaluate(p.initial_unknowns) for p in runs)
+    np.testing.assert_allclose(one.residual, other.residual, atol=1e-7)
+    np.testing.assert_allclose(one.jacobian, other.jacobian, rtol=1e-6, atol=1e-6)
