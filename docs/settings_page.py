@@ -123,6 +123,17 @@ model:
     mode: servo
     servo: {command_interpolation: interpolated, has_gravity_compensation: true}
 """,
+    "model.arms.servo.motor": """\
+model:
+  arms:
+    mode: servo
+    servo:
+      motor: {kind: dc, preset: sts3215}
+""",
+    "model.friction": """\
+model:
+  friction: {law: load, joints: [pan, lift, elbow]}
+""",
     "model.frames.NAME": """\
 model:
   frames:

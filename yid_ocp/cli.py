@@ -251,6 +251,7 @@ COMMANDS: tuple[_CliCommand, ...] = (
         "identifiability",
         _identifiability,
     ),
+    _CliCommand("friction", "say which law of friction the recordings warrant", "friction", _doubting),
     _CliCommand("diagnose", "find the gap between model and recordings, and what makes it", "diagnose", _diagnose),
     _CliCommand(
         "blind",

@@ -317,6 +317,15 @@ def profile_likelihood_figure(
     return figure
 
 
+def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) -> plotly.graph_objects.Figure:
+    """Figure of points (x, y) by name."""
+    figure = styled_report_figure(340, x, y)
+    for i, (name, (across, up)) in enumerate(clouds.items()):
+        points = {"x": np.asarray(across, np.float32), "y": np.asarray(up, np.float32)}
+        figure.add_scatter(**points, mode="markers", name=name, marker={"size": 3, "color": line_color(i)})
+    return figure
+
+
 def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
     """At most `_MAX_CURVE_POINTS` of a curve, in single precision, which takes half the room in a page."""
     count = len(t)

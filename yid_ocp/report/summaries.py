@@ -286,6 +286,30 @@ def _relative(value: float | None) -> str:
     return "unknown" if value is None else f"{percent_text(value)} %" if value < 10 else f"{value:.2g} times"
 
 
+def friction_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+    """Summary blocks of a `yid-friction/1` result."""
+    unit, best = result["unit"], result["warranted"]
+    rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "")]
+    keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
+    for law, entry in result["laws"].items():
+        sizes = (f"{entry[key]:.3g}" for key in keys)
+        note = "warranted" if law == best else ""
+        note += "" if entry["converged"] else " (the fit did not converge)"
+        rows.append((law, *sizes, unit, note))
+    own: TableRows = [("parameter", "value", "unit")]
+    for name, entry in result["laws"][best]["parameters"].items():
+        own.append((name, value_and_uncertainty_text(entry["value"], entry["std"], None), entry["unit"]))
+    text = f"the law '{best}' is warranted: it is the simplest whose error is within one standard error of the least "
+    text += f"({', '.join(result['kinds'])} left out in turn)"
+    joints = ", ".join(result["joints"])
+    return [
+        SummaryTable(rows, "Friction laws", is_key_table=True),
+        SummaryTable(own, f"Fit with the law '{best}'"),
+        SummaryStatement(text, "conclusion"),
+        CodeBlock(f"model:\n  friction: {{law: {best}, joints: [{joints}]}}"),
+    ]
+
+
 def plan_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     """Summary blocks of a `yid-plan/1` result."""
 
@@ -549,6 +573,7 @@ SUMMARY_BY_FORMAT: Mapping[str, Callable[[Mapping[str, Any]], list[SummaryBlock]
     "yid-identifiability/1": identifiability_summary,
     "yid-diagnosis/2": diagnose_summary,
     "yid-history/1": history_summary,
+    "yid-friction/1": friction_summary,
     "yid-plan/1": plan_summary,
     "yid-track/1": track_summary,
     "yid-check/1": check_summary,

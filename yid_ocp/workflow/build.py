@@ -237,13 +237,23 @@ def friction_joints(run: RunSettings, system: System) -> tuple[str, ...]:
     return known if run.model.friction.joints is None else run.model.friction.joints
 
 
+def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
+    """Names of the amplitudes of a run's ordinary friction, damping of its joints included."""
+    if run.model.friction is None:
+        return []
+    wanted = run.model.friction.joints
+    arms = {name.rpartition(".")[0] for name in parameters.names if name.endswith(".damping")}
+    joints = arms if wanted is None else arms & set(wanted)
+    starts = tuple(f"{kind}@{joint}." for kind in FRICTION_LAWS[run.model.friction.law] for joint in joints)
+    dampings = {f"{joint}.damping" for joint in joints}
+    return [name for name in parameters.names if name in dampings or name.startswith(starts)]
+
+
 def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dict[str, ParameterSettings]:
     """What sections of the model say of parameters: ordinary friction is free, a known motor has values and priors."""
     found: dict[str, ParameterSettings] = {}
     friction, motor = run.model.friction, run.model.arms.servo.motor
     law = None if friction is None else friction.law
-    arms = {name.rpartition(".")[0] for name in parameters.names if name.endswith(".damping")}
-    joints = sorted(arms if friction is None or friction.joints is None else arms & set(friction.joints))
     values: dict[str, float] = {}
     if motor.preset is not None and run.model.arms.mode == "servo":
         data = MOTOR_PRESETS[motor.preset]
@@ -261,12 +271,8 @@ def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dic
                     f"joint_load_friction@{joint}.share": constants.load_share,
                     f"joint_stribeck@{joint}.tau_s": constants.stribeck,
                 }
-    if law is not None:
-        for joint in joints:
-            own_effects = tuple(f"{kind}@{joint}." for kind in FRICTION_LAWS[law])
-            for name in parameters.names:
-                if name == f"{joint}.damping" or name.startswith(own_effects):
-                    found[name] = ParameterSettings(free=True, initial=values.get(name))
+    for name in friction_parameter_names(run, parameters):
+        found[name] = ParameterSettings(free=True, initial=values.get(name))
     return found
 
 

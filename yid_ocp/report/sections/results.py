@@ -165,6 +165,19 @@ def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
     return {"figure": figure, "changes": changes, "names": names} if figure is not None or changes else None
 
 
+@register_report_section("friction", 10, "Friction torque of the data and of the law")
+def _friction_torque(findings: ReportData) -> Mapping[str, Any] | None:
+    """Friction torque over speed and over the load, from the measured motion and from the fitted law."""
+    shown = []
+    for cloud in findings.section_data.get("friction_clouds", ()):
+        for words, along in (("speed [rad/s]", cloud.speed), ("torque through the gear [N m]", cloud.load)):
+            figure = figures.scatter_figure(
+                {"data": (along, cloud.measured), "law": (along, cloud.predicted)}, words, "friction [N m]"
+            )
+            shown.append((cloud.joint, figure))
+    return {"figures": shown} if shown else None
+
+
 @register_report_section("information", 10, "The motion that tells most")
 def _informative_motion(findings: ReportData) -> Mapping[str, Any] | None:
     """Joint positions, velocities and efforts over time."""

@@ -1,0 +1,208 @@
+"""The ladder of friction laws: which predicts motions it was not fitted to, and friction torque in the data."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.arrays import Array
+from yid_ocp.inference.uncertainty import ParameterEstimate
+from yid_ocp.model import forward_kinematics
+from yid_ocp.model.system import MidpointState
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode
+from yid_ocp.problem.prediction_errors import channel_predictions
+from yid_ocp.problem.recorded_inputs import smoothed_joint_angles
+from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.solvers import GaussNewton, Solution
+
+_MAX_FOLD_ITERATIONS = 15
+_MIN_MOTION_KINDS = 3  # fewer kinds by name than this say nothing of each other: every recording is one of its own
+_MAX_CLOUD_POINTS = 1500
+
+
+@dataclass(frozen=True)
+class FrictionLawFit:
+    """One law fitted to all recordings, and its errors on those left out in turn.
+
+    Attributes
+    ----------
+    parameters : mapping of str to ParameterEstimate
+        Of the fit to all recordings.
+    left_out_errors : mapping of recording to float
+        Root mean square error of each recording, predicted by a fit without its kind of motion; NaN where that failed.
+        In the channels' unit, or in standard deviations where units differ.
+    """
+
+    law: str
+    parameters: Mapping[str, ParameterEstimate]
+    left_out_errors: Mapping[str, float]
+    unit: str
+    is_converged: bool
+
+
+def motion_kinds(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
+    """Recordings by kind of motion: names up to a number, or each by itself; without those whose motors are off."""
+    names = [e.name for e in problem.episodes if not _is_motor_off(problem, e)]
+    found: dict[str, list[str]] = {}
+    for name in names:
+        found.setdefault(re.sub(r"[_-]?\d+$", "", name), []).append(name)
+    if len(found) < _MIN_MOTION_KINDS:
+        return {name: (name,) for name in names}
+    return {kind: tuple(own) for kind, own in found.items()}
+
+
+def _is_motor_off(problem: EstimationProblem, episode: Episode) -> bool:
+    joints = episode.recording.joints
+    return bool(problem.system.servos) and (joints is None or joints.position_command is None)
+
+
+def fit_friction_law(
+    law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
+) -> FrictionLawFit:
+    """Errors of a law on every kind of motion left out in turn, each fit begun at the fit to all recordings.
+
+    Parameters
+    ----------
+    problem : EstimationProblem
+        On all recordings, with the law in its model.
+    solution : Solution
+        Of `problem`.
+    """
+    errors: dict[str, float] = {}
+    units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
+    for own in kinds.values():
+        inside = [(e, f) for e, f in zip(problem.episodes, problem.whitening_filters, strict=True) if e.name not in own]
+        outside = [(e, f) for e, f in zip(problem.episodes, problem.whitening_filters, strict=True) if e.name in own]
+        (episodes, filters), (left, left_filters) = (zip(*pairs, strict=True) for pairs in (inside, outside))
+        fold = problem.with_episodes(episodes, left, filters, left_filters)
+        known = problem.named_values(solution.x)
+        start = fold.vector({name: known[name] for name in fold.unknown_names})
+        found = GaussNewton(max_iterations=_MAX_FOLD_ITERATIONS).minimize_cost(fold, start, None)
+        for episode, outcome in fold.predict_held_out(found.x):
+            if isinstance(outcome, str):
+                errors[episode.name] = float("nan")
+                continue
+            parts = channel_predictions(episode, outcome)
+            scale = [np.ones_like(p.residual) if len(units) == 1 else p.noise_std for p in parts]
+            squares = [np.sum((p.residual / s) ** 2, axis=1) for p, s in zip(parts, scale, strict=True)]
+            errors[episode.name] = float(np.sqrt(np.nanmean(np.concatenate(squares))))
+    unit = units.pop() if len(units) == 1 else "std"
+    free = {name: entry for name, entry in solution.parameters.items() if name in problem.free}
+    return FrictionLawFit(law, free, errors, unit, solution.status.value == "converged")
+
+
+def mean_and_standard_error(errors: Mapping[str, float], kinds: Mapping[str, Sequence[str]]) -> tuple[float, float]:
+    """Mean over kinds of motion of errors by recording, and its standard error."""
+    by_kind = np.array([np.mean([errors[name] for name in own]) for own in kinds.values()])
+    return float(np.mean(by_kind)), float(np.std(by_kind, ddof=1) / np.sqrt(len(by_kind)))
+
+
+def warranted_law(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
+    """The first law of the ladder whose error is within one standard error of the least one's.
+
+    References
+    ----------
+    Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, section 7.10,
+    doi:10.1007/978-0-387-84858-7.
+    """
+    sizes = [mean_and_standard_error(fit.left_out_errors, kinds) for fit in fits]
+    least, error = min((size for size in sizes if np.isfinite(size[0])), default=(np.inf, np.inf))
+    return next((fit for fit, (mean, _) in zip(fits, sizes, strict=True) if mean <= least + error), fits[0])
+
+
+@dataclass(frozen=True)
+class FrictionTorqueCloud:
+    """Friction torque of one joint over a recording's measured motion.
+
+    Attributes
+    ----------
+    speed, load, measured, predicted : ndarray, shape (M,)
+        Joint speed [rad/s]; motor torque less that from outside [N m]; the torque against the motion that the model
+        without friction lacks; that of the fitted law [N m].
+    """
+
+    joint: str
+    speed: Array
+    load: Array
+    measured: Array
+    predicted: Array
+
+
+def friction_torque_clouds(
+    problem: EstimationProblem, solution: Solution, friction_parameters: Sequence[str]
+) -> tuple[FrictionTorqueCloud, ...]:
+    """Friction torque of every driven joint with friction; none where a model has constraints or internal coordinates.
+
+    What the discrete equations lack along the smoothed measured angles with the friction at zero, and what the fitted
+    law adds there.
+    """
+    step, system = problem.step, problem.system
+    driven = system.driven
+    if not driven or step.sizes["m"] or step.sizes["nz"] or len(driven) != system.n_coordinates:
+        return ()
+    own = {name.rpartition(".")[0].rpartition("@")[2] for name in friction_parameters}
+    parts: dict[str, list[Array]] = {name: [] for name in driven if name in own}
+    loads = _load_function(problem)
+    for i, episode in enumerate(problem.episodes):
+        joints = episode.recording.joints
+        assert joints is not None
+        low_pass = LowPassFilter(problem.options.path_cutoff)
+        path = smoothed_joint_angles(joints, driven, episode.grid, episode.name, low_pass)
+        theta, _ = problem.split(solution.x, i)
+        theta = problem.predictor.theta_with_episode_values(episode, theta)
+        inputs = problem.predictor.corrected_inputs(episode, theta, ())
+        shift = inputs.driven_angles - episode.measured_driven_angles
+        q = np.zeros_like(path)
+        q[:, list(system.driven_coordinate_indices)] = path + shift
+        without = theta.copy()
+        without[[system.parameters.index(name) for name in friction_parameters]] = 0.0
+        lacking, given = (_missing_torque(problem, at, q, inputs.torque) for at in (without, theta))
+        speed = (q[2:] - q[:-2]) / (2 * step.time_step)
+        load = np.array(loads.map(len(speed))(q[1:-1].T, speed.T, inputs.torque[1:].T, theta)).T
+        for name, found in parts.items():
+            at = system.mechanism.joint_index(name)
+            found.append(np.stack([speed[:, at], load[:, at], -lacking[:, at], (given - lacking)[:, at]]))
+    clouds = []
+    for name, found in parts.items():
+        rows = np.concatenate(found, axis=1)
+        keep = np.unique(np.linspace(0, rows.shape[1] - 1, min(rows.shape[1], _MAX_CLOUD_POINTS)).astype(int))
+        speed, load, measured, predicted = rows[:, keep]
+        clouds.append(FrictionTorqueCloud(name, speed, load, -measured, -predicted))
+    return tuple(clouds)
+
+
+def _missing_torque(problem: EstimationProblem, theta: Array, q: Array, torque: Array) -> Array:
+    """Torque that each inner node lacks for the motion q, shape (N - 1, n) [N m]."""
+    step = problem.step
+    n, none = step.sizes["n"], np.zeros((len(torque), 0))
+    state = np.hstack([q, np.zeros((len(q), n))])
+    found = step.kernel.linearize(theta, state, none, torque, (), False)
+    return np.asarray((found.residual[1:, :n] + found.p1[:-1]) / step.time_step)
+
+
+def _load_function(problem: EstimationProblem) -> ca.Function:
+    """Torque through each joint's gear by (q, v, u, theta), shape (n,) [N m]."""
+    system = problem.system
+    n, nu = system.n_coordinates, len(system.driven)
+    q, v, u = ca.SX.sym("q", n), ca.SX.sym("v", n), ca.SX.sym("u", nu)
+    none = ca.SX(0, 1)
+    state = MidpointState(
+        system, forward_kinematics(system.mechanism, q), q, v, none, none, u, none, {}, ca.SX(problem.step.time_step)
+    )
+    outside = ca.vertcat(*(system.weight_and_grasp_force(state, i) for i in range(n)))
+    return ca.Function("load", [q, v, u, system.parameters.symbols], [system.input_force(u, q, v) - outside])
+
+
+def without_held_out(problem: EstimationProblem) -> EstimationProblem:
+    """The problem that estimates on its held-out recordings too."""
+    return problem.with_episodes(
+        (*problem.episodes, *(replace(held, initial_state_shared_with=None) for held in problem.held_out)),
+        (),
+        (*problem.whitening_filters, *problem.held_out_whitening_filters),
+        (),
+    )
