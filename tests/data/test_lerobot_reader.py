@@ -11,7 +11,7 @@ import pytest
 from recording_examples import joints_of
 
 from yid_ocp.data.readers import preview_file, read_any
-from yid_ocp.data.readers.lerobot import read_lerobot
+from yid_ocp.data.readers.lerobot import read_lerobot_episode
 from yid_ocp.errors import DataError
 
 NAMES = ["shoulder_pan.pos", "elbow_flex.pos", "gripper.pos"]
@@ -76,12 +76,12 @@ def test_state_and_action_of_an_episode(version: str, tmp_path: Path) -> None:
 def test_names_of_older_datasets(names: Any, tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v2.0", names)
     expected = ("a", "b", "c") if names else ("joint_0", "joint_1", "joint_2")
-    assert read_lerobot(path, units={"position": "deg", "position_command": "deg"}).joint_names == expected
+    assert read_lerobot_episode(path, units={"position": "deg", "position_command": "deg"}).joint_names == expected
 
 
 def test_velocities_and_currents_among_the_state(tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v3.0", ["a.pos", "a.vel", "a.current"])
-    joints = joints_of(read_lerobot(path, units={"position": "deg", "position_command": "deg", "effort": "mA"},
+    joints = joints_of(read_lerobot_episode(path, units={"position": "deg", "position_command": "deg", "effort": "mA"},
                                     torque_constants={"a": 2.0}, gears={"a": 100.0}))  # fmt: skip
     assert joints.names == ("a",)
     assert np.array_equal(joints.channels["velocity"][:, 0], [1, 11, 21, 31])
@@ -117,7 +117,7 @@ def test_the_preview_proposes_degrees(tmp_path: Path) -> None:
 def test_datasets_that_are_refused(more: Any, options: Any, message: str, tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v3.0", **more)
     with pytest.raises(DataError, match=message) as caught:
-        read_lerobot(path, **options)
+        read_lerobot_episode(path, **options)
     assert "arm" in caught.value.where
 
 
@@ -140,7 +140,7 @@ def test_datasets_that_are_refused(more: Any, options: Any, message: str, tmp_pa
 )
 def test_metadata_of_other_types_is_refused(more: Any, tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1", **more)
-    for read in (read_lerobot, preview_file):
+    for read in (read_lerobot_episode, preview_file):
         with pytest.raises(DataError) as caught:
             read(path)
         assert "info.json" in caught.value.where
@@ -157,7 +157,7 @@ def test_frame_numbers_that_are_none_are_refused(column: list[Any], tmp_path: Pa
         pyarrow.table({**table, "frame_index": column}), path / "data" / "chunk-000" / "episode_000000.parquet"
     )
     with pytest.raises(DataError):
-        read_lerobot(path)
+        read_lerobot_episode(path)
 
 
 @pytest.mark.parametrize("name", ["frame_index", "observation.state", "action"])
@@ -172,22 +172,22 @@ def test_texts_that_unpack_to_very_many_bytes_are_refused_by_their_type(name: st
     text = pyarrow.DictionaryArray.from_arrays(pyarrow.array([0] * len(table[name])), ["x" * 1_000_000])
     parquet.write_table(pyarrow.table({**table, name: text}), file, store_schema=False)
     with pytest.raises(DataError, match=f"{name} holds string where numbers are expected"):
-        read_lerobot(path)
+        read_lerobot_episode(path)
 
 
 def test_a_table_that_unpacks_to_more_than_fits_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1")
     monkeypatch.setattr("yid_ocp.files.MAX_INPUT_NUMBERS", 30)  # four frames of eight numbers and three lists
     with pytest.raises(DataError, match="more than can be meant"):
-        read_lerobot(path)
+        read_lerobot_episode(path)
 
 
 def test_a_damaged_table_and_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1")
     (path / "data" / "chunk-000" / "episode_000000.parquet").write_bytes(b"PAR1 and no more")
     with pytest.raises(DataError, match="table of the episode cannot be read"):
-        read_lerobot(path)
+        read_lerobot_episode(path)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(DataError, match="needs pyarrow") as caught:
-        read_lerobot(path)
+        read_lerobot_episode(path)
     assert caught.value.hint == "pip install 'yid-ocp[lerobot]'"

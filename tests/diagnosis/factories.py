@@ -26,7 +26,7 @@ from yid_ocp.diagnosis.screening import (
 )
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.diagnosis.verdict import TransferCheck
+from yid_ocp.diagnosis.verdict import ParameterTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
 from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult
 from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
@@ -172,9 +172,11 @@ def added(
     return SelectedEffect(of, fitted or fit([of]), part or closed(), (of, *rivals))
 
 
-def carried(label="friction@elbow", name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> TransferCheck:
+def carried(
+    label="friction@elbow", name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False
+) -> ParameterTransferCheck:
     """An amplitude on the recordings to estimate on and on the held-out ones."""
-    return TransferCheck(label, name, "N m", values[0], stds[0], values[1], stds[1], agrees)
+    return ParameterTransferCheck(label, name, "N m", values[0], stds[0], values[1], stds[1], agrees)
 
 
 # -- smoother ---------------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ _DIFFERENCE_STEP = 1e-5
 
 
 @dataclass(frozen=True)
-class CheckedLinearisation:
+class CheckedStepLinearisation:
     """A_k (nx, nx), B_k (nx, nu) and (nx, ntheta) at a state (q, p, z), with their deviation from finite differences.
 
     Attributes
@@ -55,7 +55,7 @@ def step_size_summary(step: Step) -> dict[str, Any]:
     return {"sizes": step.sizes, **counts, "functions": found}
 
 
-def linearise_and_check(step: Step, state: Array, torque: Array, theta: Array, path: Array) -> CheckedLinearisation:
+def linearise_and_check(step: Step, state: Array, torque: Array, theta: Array, path: Array) -> CheckedStepLinearisation:
     """Linearise a step at a state (nx,) (A_k, B_k) and compare it with central finite differences.
 
     The torque (nu,) is in N m; `path` (nc,) are the prescribed coordinates, before and after the step.
@@ -76,7 +76,7 @@ def linearise_and_check(step: Step, state: Array, torque: Array, theta: Array, p
         "B_theta": _error(b_theta, _differences(lambda v: after(state, torque, v), theta)),
     }
     radius = float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0))
-    return CheckedLinearisation(state, a, b_input, b_theta, radius, errors)
+    return CheckedStepLinearisation(state, a, b_input, b_theta, radius, errors)
 
 
 def linearise_step_equations(

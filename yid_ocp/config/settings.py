@@ -100,7 +100,7 @@ class EffectSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ArmSettings:
+class JointActuationSettings:
     """Moving joints of the robot and how each is driven."""
 
     joints: Annotated[tuple[str, ...] | None, OptionInfo("in configuration order; all movable ones when absent")] = None
@@ -158,7 +158,7 @@ class ModelSettings:
         Mapping[str, ClampSettings],
         OptionInfo("what moves an object without a robot, by name; a cable has its own at both ends"),
     ] = field(default_factory=dict)
-    arms: Annotated[ArmSettings, OptionInfo("the robot's joints")] = ArmSettings()
+    arms: Annotated[JointActuationSettings, OptionInfo("the robot's joints")] = JointActuationSettings()
     frames: Annotated[
         Mapping[str, FrameSettings],
         OptionInfo(

@@ -8,7 +8,7 @@ from yid_ocp.data.readers.bags import read_bag as read_bag
 from yid_ocp.data.readers.c3d import read_c3d as read_c3d
 from yid_ocp.data.readers.csv import CsvOptions as CsvOptions
 from yid_ocp.data.readers.csv import read_csv as read_csv
-from yid_ocp.data.readers.lerobot import read_lerobot as read_lerobot
+from yid_ocp.data.readers.lerobot import read_lerobot_episode as read_lerobot_episode
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS as JOINT_CHANNEL_UNITS
 from yid_ocp.data.recording import ChannelGroup as ChannelGroup
 from yid_ocp.data.recording import JointGroup as JointGroup

@@ -317,7 +317,7 @@ def _without_events(
         search, nominal, before = cleaned, again, events
         # what the smoother says is of all recordings, events not taken out
         events, smoothed = _happened(whole, nominal, search.thresholds)[0], None
-        if events.overlaps_on_same_channels(before):
+        if events.has_same_disturbances(before):
             break
     return search, nominal, events, smoothed
 

@@ -28,7 +28,7 @@ from yid_ocp.diagnosis.select import (
 )
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
-    TransferCheck,
+    ParameterTransferCheck,
     UnknownVerdictReason,
     failed_transfer_checks,
     independent_assumption_count,
@@ -86,7 +86,7 @@ class DiagnosisResult(ReprMixin):
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
     unknown_reason: UnknownVerdictReason = ""
     explained_fraction: float = 1.0  # what the effects explain over what the smoother explains
-    transfer_checks: tuple[TransferCheck, ...] = ()
+    transfer_checks: tuple[ParameterTransferCheck, ...] = ()
     events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
 
     def _summary(self) -> ReprSummary:
@@ -191,7 +191,11 @@ def statistics_compared_with_thresholds(finding: DiagnosisResult) -> dict[str, A
     """
     tests = (finding.nominal_test, finding.nominal_held_out_test)
     added, seen, before = finding.selected_effects, finding.smoother_result, finding.nominal_model
-    apart = [distance / std for distance, std in (entry.difference for entry in finding.transfer_checks) if std > 0]
+    apart = [
+        distance / std
+        for distance, std in (entry.estimate_difference_and_std for entry in finding.transfer_checks)
+        if std > 0
+    ]
     of_effects: dict[str, Any] = dict.fromkeys(("closure", "closure_low", "fall", "explained"))
     if added:
         fall = relative_rmse_reduction(before.held_out_loss, added[-1].refitted_model.held_out_loss)

@@ -105,7 +105,7 @@ class EventSet:
     def __bool__(self) -> bool:
         return bool(self.disturbances or self.overspeeds)
 
-    def overlaps_on_same_channels(self, other: EventSet) -> bool:
+    def has_same_disturbances(self, other: EventSet) -> bool:
         """Whether both hold events of the same channels at overlapping times."""
         return len(self.disturbances) == len(other.disturbances) and all(
             (a.recording, a.channel) == (b.recording, b.channel) and a.overlap_duration(b) > 0

@@ -27,7 +27,7 @@ _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
 
 @dataclass(frozen=True)
-class TransferCheck:
+class ParameterTransferCheck:
     """One parameter of an effect, estimated on the estimation recordings and again on the held-out ones."""
 
     effect_label: str
@@ -47,13 +47,13 @@ class TransferCheck:
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
     @property
-    def difference(self) -> tuple[float, float]:
+    def estimate_difference_and_std(self) -> tuple[float, float]:
         """Absolute difference of the two estimates, and its standard deviation."""
         spread = math.hypot(self.estimation_std, self.held_out_std)
         return abs(self.estimation_value - self.held_out_value), spread
 
 
-def check_parameter_transfer(search: RefitContext, fit: RefittedModel) -> tuple[TransferCheck, ...]:
+def check_parameter_transfer(search: RefitContext, fit: RefittedModel) -> tuple[ParameterTransferCheck, ...]:
     """Refit the effects on the held-out recordings and compare every amplitude.
 
     Empty if one recording is split, or if the model cannot be fitted there, which is no evidence against it.
@@ -77,24 +77,24 @@ def check_parameter_transfer(search: RefitContext, fit: RefittedModel) -> tuple[
 
 def _compare(
     effect: EffectBase, first: RefittedModel, second: RefittedModel, limits: Thresholds
-) -> list[TransferCheck]:
+) -> list[ParameterTransferCheck]:
     """The amplitudes of one effect in two fits."""
     neutral, found = effect.neutral_values, []
     width = {name: high - low for name, (low, high) in effect.prior_ranges.items()}
     size = max(abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitude_names)
     for name in effect.amplitude_names:
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
-        entry = TransferCheck(
+        entry = ParameterTransferCheck(
             effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit, *own, True
         )
-        apart, spread = entry.difference
+        apart, spread = entry.estimate_difference_and_std
         # what has no standard deviation says nothing against it
         sure = math.isfinite(spread) and apart > limits.transfer_z_max * spread
         found.append(replace(entry, is_consistent=not sure or apart <= limits.transfer_rtol * size * width[name]))
     return found
 
 
-def inflate_std_by_disagreement(fit: RefittedModel, entries: Sequence[TransferCheck]) -> RefittedModel:
+def inflate_std_by_disagreement(fit: RefittedModel, entries: Sequence[ParameterTransferCheck]) -> RefittedModel:
     """Return the fit with amplitude standard deviations inflated by the disagreement between the recordings.
 
     What a model misses of all of a recording its residual does not show: where two fits differ by more than
@@ -103,13 +103,13 @@ def inflate_std_by_disagreement(fit: RefittedModel, entries: Sequence[TransferCh
     """
     std = dict(fit.std)
     for entry in entries:
-        (apart, spread), name = entry.difference, f"{entry.effect_label}.{entry.parameter}"
+        (apart, spread), name = entry.estimate_difference_and_std, f"{entry.effect_label}.{entry.parameter}"
         if apart > _DISAGREEMENT_Z * spread:
             std[name] = max(std[name], apart / math.sqrt(2.0))
     return replace(fit, std=std)
 
 
-def failed_transfer_checks(entries: Sequence[TransferCheck]) -> tuple[TransferCheck, ...]:
+def failed_transfer_checks(entries: Sequence[ParameterTransferCheck]) -> tuple[ParameterTransferCheck, ...]:
     """Return the checks whose two estimates disagree."""
     return tuple(entry for entry in entries if not entry.is_consistent)
 

@@ -18,7 +18,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.model_functions import ModelFunctions, NodeStateValues
+from yid_ocp.problem.model_functions import ModelFunctions, TimeGridStateValues
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class NominalTrajectory:
     rollout: Rollout
     measurements: Sequence[Measurements]
     tracking_feedback: TrackingFeedback | None
-    node_values: NodeStateValues
+    node_values: TimeGridStateValues
     initial_state_by_angles: Array
     initial_state_by_torque: Array
 

@@ -347,7 +347,7 @@ def _position_limits(system: System) -> tuple[Array, Array]:
     return np.array([joint.lower_limit for joint in joints]), np.array([joint.upper_limit for joint in joints])
 
 
-def ordered_start_joint_positions(system: System, posture: Mapping[str, float]) -> Array:
+def start_joint_positions_as_array(system: System, posture: Mapping[str, float]) -> Array:
     """Start positions of the moved joints, given by name, as an array of shape (nc,).
 
     Raises `ConfigError` where a joint is missing, does not exist, or stands outside its range.

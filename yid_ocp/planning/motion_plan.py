@@ -23,9 +23,9 @@ from yid_ocp.planning.joint_paths import (
     SplinePath,
     check_standstill_limits,
     check_target_reachable,
-    ordered_start_joint_positions,
     solve_end_equilibrium,
     solve_start_equilibrium,
+    start_joint_positions_as_array,
 )
 from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShootingProblem, PlanShootingResult
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -115,14 +115,14 @@ def plan_motion_to_target(
 
 def _posture(system: System, options: PlanOptions, theta: Array) -> Array:
     if options.start_joint_positions is not None:
-        return ordered_start_joint_positions(system, options.start_joint_positions)
+        return start_joint_positions_as_array(system, options.start_joint_positions)
     if not system.grasps:
         what, where = "nothing says where the motion begins", "plan.start_joint_positions"
         hint = "only where a gripper holds the object do the angles follow from that"
         raise ConfigError(what, where=where, allowed="every joint that moves", hint=hint)
     by_name = dict(zip(system.parameters.names, map(float, theta), strict=True))
     angles = grasping_joint_angles(system, by_name)
-    return ordered_start_joint_positions(system, {name: angles[name] for name in angles if name in system.prescribed})
+    return start_joint_positions_as_array(system, {name: angles[name] for name in angles if name in system.prescribed})
 
 
 def _points(system: System, options: PlanOptions) -> tuple[FramePositionFunction, FramePositionFunction | None]:

@@ -29,8 +29,8 @@ from yid_ocp.planning.joint_paths import (
     PathSimulator,
     PlanOptions,
     SplinePath,
-    ordered_start_joint_positions,
     solve_start_equilibrium,
+    start_joint_positions_as_array,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
@@ -82,7 +82,7 @@ class PlannedExperiment:
         theta = step.system.parameters.vector(known)
         first = np.array(episode.initial_known_coordinates)
         if options.start_joint_positions is not None:
-            first = ordered_start_joint_positions(step.system, options.start_joint_positions)
+            first = start_joint_positions_as_array(step.system, options.start_joint_positions)
         path = SplinePath(options.duration, options.n_spline_coefficients)
         mover = PathSimulator(step, theta, solve_start_equilibrium(step, theta, first), path, options.hold_duration)
         _check_long_enough(problem, float(mover.node_times[-1]))

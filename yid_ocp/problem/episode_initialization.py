@@ -13,7 +13,7 @@ from yid_ocp.errors import DataError
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, InitialState, truncate_episode
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.model_functions import NodeStateValues
+from yid_ocp.problem.model_functions import TimeGridStateValues
 from yid_ocp.problem.recorded_inputs import denoised_gear_loads
 from yid_ocp.problem.unknown_vector import initial_state_offset_limits
 
@@ -83,7 +83,7 @@ def _error(predictor: EpisodePredictor, seen: Sequence[Measurements], start: Ini
     squares: list[Array] = []
     for samples in seen:
         read = predictor.model_functions.compiled_sensor_function(samples.sensor, predictor.unknowns.free_parameters)
-        predicted = read(NodeStateValues.from_trajectory(predictor.step, state), theta).output
+        predicted = read(TimeGridStateValues.from_trajectory(predictor.step, state), theta).output
         squares.append(samples.whitened_residual(predicted)[samples.used_output_mask] ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares))))
 

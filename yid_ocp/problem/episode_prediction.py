@@ -21,7 +21,7 @@ from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.model_functions import (
     CorrectedInputs,
     ModelFunctions,
-    NodeStateValues,
+    TimeGridStateValues,
     node_acceleration,
     node_acceleration_adjoint,
     node_velocity,
@@ -354,18 +354,18 @@ class EpisodePredictor:
         predicted : ndarray, shape (M, k)
         sensitivities : ndarray, shape (M, k, d)
         """
-        read = _Trajectory(NodeStateValues.from_trajectory(self.step, state), by_state, None, None, None)
+        read = _Trajectory(TimeGridStateValues.from_trajectory(self.step, state), by_state, None, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.free_parameters)
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
-    def node_values(self, rollout: Rollout) -> NodeStateValues:
+    def node_values(self, rollout: Rollout) -> TimeGridStateValues:
         """State values at all nodes of a rollout; the load is prescribed joints' effort and driven joints' torque."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
         load[:-1, list(self.system.driven_coordinate_indices)] = rollout.torque
         load[-1] = load[-2]
         lam = rollout.multipliers[np.minimum(np.arange(len(load)), len(load) - 2)] / self.step.time_step
-        return NodeStateValues.from_trajectory(self.step, rollout.state, load, lam)
+        return TimeGridStateValues.from_trajectory(self.step, rollout.state, load, lam)
 
     def _delay_in_steps(
         self, samples: Measurements, theta: Array, wanted: tuple[str, ...]
@@ -500,7 +500,9 @@ class EpisodePredictor:
             )
         return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)
 
-    def _pull(self, samples: Measurements, pull: Array, values: NodeStateValues, theta: Array, pulls: _Pulls) -> Array:
+    def _pull(
+        self, samples: Measurements, pull: Array, values: TimeGridStateValues, theta: Array, pulls: _Pulls
+    ) -> Array:
         """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
         n, wanted = self.system.n_coordinates, self.unknowns.free_parameters
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
@@ -534,7 +536,7 @@ class EpisodePredictor:
 class _Trajectory:
     """Values at all nodes and derivatives of states, efforts, applied torques and multipliers."""
 
-    values: NodeStateValues
+    values: TimeGridStateValues
     by_state: Array | None
     by_effort: Array | None
     by_torque: Array | None

@@ -276,7 +276,7 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 
 @dataclass(frozen=True)
-class NodeStateValues:
+class TimeGridStateValues:
     """Values of `model.NodeState` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m), by the recorded clock."""
 
     q: Array
@@ -289,17 +289,17 @@ class NodeStateValues:
     @staticmethod
     def from_trajectory(
         step: Step, state: Array, load: Array | None = None, lam: Array | None = None
-    ) -> NodeStateValues:
+    ) -> TimeGridStateValues:
         """Values at all nodes of a trajectory (K, nx); loads and constraint forces are zero when absent."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
         v, a = (rate(q, nodes, step.time_step) for rate in (node_velocity, node_acceleration))
         lam = np.zeros((len(state), step.sizes["m"])) if lam is None else lam
-        return NodeStateValues(q, v, a, z, np.zeros_like(q) if load is None else load, lam)
+        return TimeGridStateValues(q, v, a, z, np.zeros_like(q) if load is None else load, lam)
 
-    def at(self, nodes: IntArray) -> NodeStateValues:
+    def at(self, nodes: IntArray) -> TimeGridStateValues:
         """The same values at the nodes with the given indices."""
-        return NodeStateValues(*(values[nodes] for values in vars(self).values()))
+        return TimeGridStateValues(*(values[nodes] for values in vars(self).values()))
 
 
 def node_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
@@ -361,7 +361,7 @@ class _CompiledSensor:
     all_derivatives: MappedFunction
     columns: tuple[int, ...] | None = None
 
-    def __call__(self, at: NodeStateValues, theta: Array) -> _SensorReadings:
+    def __call__(self, at: TimeGridStateValues, theta: Array) -> _SensorReadings:
         """Readings at nodes."""
         output, *slopes = self.all_derivatives(at.q, at.v, at.a, at.z, at.load, at.lam, theta)
         if self.columns is not None:

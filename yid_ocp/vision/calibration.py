@@ -30,7 +30,7 @@ from yid_ocp.vision.camera_registration import (
     ArmSurface,
     CalibrationFrame,
     CameraState,
-    QuadraticRobustCost,
+    RobustCostQuadraticModel,
     SurfaceVisibility,
     initial_camera_states,
     quadratic_robust_cost,
@@ -404,7 +404,7 @@ class _Calibrator:
         along: bool,
         most: int,
         rounds: int,
-    ) -> tuple[CameraState, QuadraticRobustCost, list[CalibrationFrame]]:
+    ) -> tuple[CameraState, RobustCostQuadraticModel, list[CalibrationFrame]]:
         """The state after some steps on at most so many points of each frame, the sum there, and those points."""
         chosen = []
         for glimpse in glimpses:
@@ -419,7 +419,7 @@ class _Calibrator:
             what = "what the camera sees does not lie on it"
             raise _UntoldError(what, "check the told pose and the unit of the clouds")
 
-        def cost(state: CameraState) -> QuadraticRobustCost:
+        def cost(state: CameraState) -> RobustCostQuadraticModel:
             rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]
             return quadratic_robust_cost(rows, reach)
 

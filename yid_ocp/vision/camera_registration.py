@@ -238,7 +238,7 @@ class _SurfaceMatches:
 
 
 @dataclass(frozen=True, eq=False)
-class QuadraticRobustCost:
+class RobustCostQuadraticModel:
     """Quadratic model of the robust cost at a camera state."""
 
     gradient: Array  # (10,)
@@ -263,7 +263,7 @@ class QuadraticRobustCost:
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 
 
-def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -> QuadraticRobustCost:
+def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostQuadraticModel:
     """Robust cost over all points of all frames, scaled by their median error."""
     size = np.abs(np.concatenate([r.residuals for r in rows]))
     sigma = max(_TO_SIGMA * float(np.median(size)) if len(size) else reach, _LEAST_SIGMA)
@@ -291,7 +291,7 @@ def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -
         both = summed(frame * (patch.max() + 1) + patch)
         blocks = _at_least(both, summed(frame) + summed(patch) - both)
     curvature = max(bent / max(straight, 1e-12), _LEAST_CURVATURE)
-    return QuadraticRobustCost(gradient, hessian, curvature, blocks)
+    return RobustCostQuadraticModel(gradient, hessian, curvature, blocks)
 
 
 def _at_least(least: Array, matrix: Array) -> Array:

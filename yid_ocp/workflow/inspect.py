@@ -20,7 +20,7 @@ from yid_ocp.analysis.sparsity_patterns import (
     step_sparsity_patterns,
 )
 from yid_ocp.analysis.step_diagnostics import (
-    CheckedLinearisation,
+    CheckedStepLinearisation,
     ParameterEquationDependence,
     linearise_and_check,
     linearise_step_equations,
@@ -167,7 +167,7 @@ def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint
     return _LinearisationPoint(words, False, np.zeros(sizes["nx"]), np.zeros(sizes["nu"]), theta, np.zeros(sizes["nc"]))
 
 
-def _linearised(step: Step, point: _LinearisationPoint) -> tuple[CheckedLinearisation, StepEquationLinearizations]:
+def _linearised(step: Step, point: _LinearisationPoint) -> tuple[CheckedStepLinearisation, StepEquationLinearizations]:
     at = point.state, point.torque, point.theta, point.prescribed_positions
     try:
         found = linearise_and_check(step, *at)

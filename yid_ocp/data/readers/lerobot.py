@@ -64,7 +64,7 @@ class _Dataset:
 
 
 @READERS.register("LeRobot dataset")
-def read_lerobot(
+def read_lerobot_episode(
     path: str | os.PathLike[str],
     *,
     episode: int = 0,
@@ -106,7 +106,7 @@ def read_lerobot(
 
 @FILE_PREVIEWERS.register("LeRobot dataset")
 def _preview_lerobot(path: str | os.PathLike[str]) -> FilePreview:
-    """What a LeRobot dataset holds, by its first episode; errors as `read_lerobot`."""
+    """What a LeRobot dataset holds, by its first episode; errors as `read_lerobot_episode`."""
     dataset = _dataset(Path(path))
     table, _ = _episode(dataset, 0)
     names, channels, left = _channels(dataset, table)
