@@ -12,7 +12,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.export.models import effect_format_support, parameter_format_support
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
-from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, PositionServoOptions
+from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, MotorOptions, PositionServoOptions
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
@@ -82,6 +82,26 @@ def test_both_engines_move_alike(arm: System, recording: Recording) -> None:
     apart = np.abs(evaluated(arm, recording)[1] - joints.position).max(axis=0)
     assert apart.max() < 1e-3
     assert np.all(apart < 0.02 * np.abs(joints.position - joints.position_command).max(axis=0))
+
+
+def test_both_engines_move_a_direct_current_motor_alike() -> None:
+    """At its duty's limit a motor gives the limit less its counter-voltage, which a clip of the whole would not."""
+    robot, joints = read_urdf("default:servo_arm.urdf"), list(JOINTS)
+    kinds = {
+        kind: System.build(
+            robot, driven=JOINTS, servos=PositionServoOptions(motor=MotorOptions(kind)), damping=0.02, point_frames=[]
+        )
+        for kind in ("dc", "ideal")
+    }
+    limited = [("servo_saturation", "lift", {"limit": 1.3})]
+    made = played(kinds["dc"], *(InjectedEffect(*entry) for entry in limited))
+    assert made.joints is not None
+    apart = {}
+    for kind, system in kinds.items():
+        own = system.with_effects([make_effect(name, place, system, values) for name, place, values in limited])
+        apart[kind] = np.abs(evaluated(own, made)[1] - made.joints.position)[:, joints.index("lift")].max()
+    assert apart["dc"] < 2e-3
+    assert apart["ideal"] > 10 * apart["dc"]
 
 
 @pytest.mark.parametrize(
