@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.errors import WorkerError
 from yid_ocp.parallel import InlineExecutor, Task, WorkerConfig, run_tasks
 from yid_ocp.parallel.resumable_tasks import _dask_executor as connected
-from yid_ocp.progress import NullProgress
+from yid_ocp.progress import Progress
 from yid_ocp.version import software_fingerprint
 from yid_ocp.workflow.blind import run_blind
 
@@ -116,8 +117,8 @@ def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeyp
         connected(scheduler.address, squared_elsewhere, tmp_path),
     ):
         pass
-    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.Path.write_text", lambda *_, **__: 0)
-    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.Path.unlink", lambda *_, **__: None)
+    unseen = nullcontext(SimpleNamespace(name=str(tmp_path / "unseen")))
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.tempfile.NamedTemporaryFile", lambda **_: unseen)
     with pytest.raises(WorkerError, match=f"does not see {tmp_path}"), connected(scheduler.address, squared, tmp_path):
         pass
 
@@ -176,7 +177,7 @@ def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, monke
 CASES = 12
 
 
-class Killing(NullProgress):
+class Killing(Progress):
     """Ends a worker in the middle of the diagnoses, as soon as a third of them is done."""
 
     def __init__(self, scheduler: Any) -> None:

@@ -28,7 +28,7 @@ from yid_ocp.parallel import (
     run_tasks,
 )
 from yid_ocp.parallel import resumable_tasks as parallel_tasks
-from yid_ocp.parallel.threads_and_processes import max_threads as threads_of_process
+from yid_ocp.parallel.threads_and_processes import _max_threads as threads_of_process
 from yid_ocp.version import software_fingerprint
 
 # -- what tasks do ----------------------------------------------------------------------------------------------------

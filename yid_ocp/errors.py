@@ -4,24 +4,12 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import TypedDict
 
 
 class YidError(Exception):
-    """An error that the user can correct.
+    """An error that the user can correct: what is wrong in one clause, where, what is allowed, and what to do next.
 
     As text it has all four parts, at most 600 characters together, with control characters as escapes.
-
-    Parameters
-    ----------
-    what : str
-        What is wrong, in one clause.
-    where : str
-        The file, key, channel or object in which it was found.
-    allowed : str
-        What would be accepted.
-    hint : str
-        What to do next.
     """
 
     _usual_allowed = "what the documents describe"
@@ -107,13 +95,6 @@ def _shortened(text: str, length: int) -> str:
 _MAX_LISTED_NAMES, _N_NEAREST_NAMES = 40, 8  # names listed in full where none is similar, and listed otherwise
 
 
-class UnknownNameDetails(TypedDict):
-    """Allowed names and hint for an error about an unknown name."""
-
-    allowed: str
-    hint: str
-
-
 def nearest_name_hint(name: str, known: Iterable[str]) -> str:
     """Hint for an error about an unknown name: the most similar known name, or a list of known names.
 
@@ -123,7 +104,7 @@ def nearest_name_hint(name: str, known: Iterable[str]) -> str:
     return _meant(name, names) or f"known: {_listed(name, sorted(names)) or 'none'}"
 
 
-def unknown_name_details(name: str, known: Iterable[str]) -> UnknownNameDetails:
+def unknown_name_details(name: str, known: Iterable[str]) -> dict[str, str]:
     """Allowed names and hint for an error about an unknown name, as its arguments; long lists are cut."""
     names = [str(entry) for entry in known]
     return {"allowed": _listed(name, names) or "none", "hint": _meant(name, names)}

@@ -1,71 +1,41 @@
-"""Progress reporting of long work: the interface and its silent default (`workflow.progress` displays it)."""
+"""Progress of long work: what is told of it, silent unless a subclass shows it (`workflow.command_runner`)."""
 
 from __future__ import annotations
 
 import logging
 import threading
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 
-class AcceptedIterate(Protocol):
-    """A point that a search accepted: iteration, cost, elapsed time [s] and a note."""
-
-    @property
-    def iteration(self) -> int:
-        """Number of the iteration."""
-
-    @property
-    def cost(self) -> float:
-        """Cost at the point."""
-
-    @property
-    def seconds(self) -> float:
-        """Wall time since the search started [s]."""
-
-    @property
-    def note(self) -> str:
-        """Remark on the point, such as the number of its starting point."""
-
-
-class Progress(Protocol):
-    """Receiver of progress reports; called by one thread at a time."""
+class Progress:
+    """Receiver of progress reports, called by one thread at a time; this one ignores them."""
 
     def begin_stage(self, text: str) -> None:
         """Report that a new stage of the work begins."""
 
-    def report_iterate(self, entry: AcceptedIterate) -> None:
-        """Report that a search accepted a point."""
+    def report_iterate(self, entry: Any) -> None:
+        """Report that a search accepted a point: a `solvers.base.Iterate`."""
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Report that `done` of `total` parts of the stage are finished; `text` names the last or next one."""
 
 
-class NullProgress:
-    """Progress that is not reported."""
-
-    def begin_stage(self, text: str) -> None:
-        """Ignore the report."""
-
-    def report_iterate(self, entry: AcceptedIterate) -> None:
-        """Ignore the report."""
-
-    def report_parts_done(self, done: int, total: int, text: str) -> None:
-        """Ignore the report."""
+NULL_PROGRESS = Progress()
 
 
 @dataclass(frozen=True)
-class LoggingProgress(NullProgress):
+class LoggingProgress(Progress):
     """Progress as log messages."""
 
     log: logging.Logger
 
     def begin_stage(self, text: str) -> None:
-        """Log the name of the stage."""
+        """See `Progress`."""
         self.log.info("%s", text)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        """Log the number of finished parts."""
+        """See `Progress`."""
         self.log.info("%d of %d, %s", done, total, text)
 
 
@@ -81,6 +51,3 @@ class ParallelProgress:
         with self._lock:
             self._count += 1
             self._progress.report_parts_done(self._count, self._total, text)
-
-
-NULL_PROGRESS = NullProgress()

@@ -14,7 +14,7 @@ from yid_ocp.effects.base import EFFECTS as EFFECTS
 from yid_ocp.effects.base import EffectBase as EffectBase
 from yid_ocp.effects.base import ParameterDefinition as ParameterDefinition
 from yid_ocp.effects.base import ReportedParameter as ReportedParameter
-from yid_ocp.errors import ModelError, UnknownNameDetails, unknown_name_details
+from yid_ocp.errors import ModelError, unknown_name_details
 from yid_ocp.model.system import System
 
 _SENSOR_KINDS = ("joints.position", "joints.effort", "camera", "nominal_clock")
@@ -40,7 +40,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     """
     places = EFFECTS[kind].possible_locations(system)
     if location not in places:
-        said = UnknownNameDetails(allowed="nothing in this system", hint="leave it out")
+        said = {"allowed": "nothing in this system", "hint": "leave it out"}
         said = unknown_name_details(location, places) if places else said
         raise ModelError(f"{kind} does not fit '{location}'", where=f"{kind}@{location}", **said)
     return base.build_effect(kind, location, system, values or {})

@@ -17,8 +17,8 @@ import json
 import logging
 import multiprocessing
 import os
-import secrets
 import socket
+import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -45,27 +45,21 @@ TaskProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Task:
-    """Arguments of one function call; its name is for display only and does not decide what is resumed.
+    """Arguments of one function call."""
 
-    `arguments`, by keyword, are text, numbers, None, lists and mappings of them, and `Path` for what is read.
-    """
-
-    name: str
-    arguments: Mapping[str, Any]
+    name: str  # for display only; it does not decide what is resumed
+    arguments: Mapping[str, Any]  # text, numbers, None, lists and mappings of them, and `Path` for what is read
 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """The result of a task: what its function returned, as read back from its file, or why it failed.
-
-    `seconds` is the function's time, `was_resumed` tells that an earlier run did it.
-    """
+    """The result of a task: what its function returned, as read back from its file, or why it failed."""
 
     name: str
     value: Any = None
     error: str = ""
-    seconds: float = 0.0
-    was_resumed: bool = False
+    seconds: float = 0.0  # of the function
+    was_resumed: bool = False  # whether an earlier run did it
 
 
 @dataclass(frozen=True)
@@ -117,8 +111,6 @@ def run_tasks(
     ----------
     function : callable
         At the top of an importable module; returns what JSON can hold.
-    folder : Path
-        Of results; made where absent.
     workers : WorkerConfig or concurrent.futures.Executor
         Processes of this machine stop at once when the run is interrupted, and one that dies takes no task with it but
         the one that killed it. Workers of a scheduler end the task that they are at.
@@ -127,19 +119,13 @@ def run_tasks(
 
     Raises
     ------
-    DataError
-        A task's file cannot be read.
-    OutputError
-        The folder cannot be made.
-    WorkerError
-        As `WorkerConfig.check_available`.
+    DataError, OutputError, WorkerError
+        A task's file cannot be read, the folder cannot be made, and as `WorkerConfig.check_available`.
     """
     own, maker = package_source_hash() if code is None else code, software_fingerprint()
-    jobs = []
-    for task in tasks:
-        # paths are absolute, because a worker may run in another folder
-        anywhere = replace(task, arguments=_mapped(task.arguments, Path.absolute))
-        jobs.append(_Job(function, anywhere, _task_input(function, task, own), folder.absolute(), maker))
+    # paths are absolute, because a worker may run in another folder
+    anywhere = [replace(task, arguments=_mapped(task.arguments, Path.absolute)) for task in tasks]
+    jobs = [_Job(function, task, _task_input(function, task, own), folder.absolute(), maker) for task in anywhere]
     unique = {job.key: job for job in reversed(jobs)}
     make_folder(folder, "the folder of results")
     kept = {key: job.kept() for key, job in unique.items()}
@@ -161,10 +147,7 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Values of tasks that must all have succeeded.
-
-    `WorkerError` where one failed for a reason that its reader can mend, `RuntimeError` where for another one.
-    """
+    """Values of tasks, none of which may have failed: `WorkerError` if that can be mended, else `RuntimeError`."""
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]
@@ -417,8 +400,7 @@ def _client(distributed: Any, where: dict[str, str]) -> Any:
 def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | None) -> None:
     """Refuse workers with other versions, with several threads, or without access to the same files.
 
-    What they are asked travels whole, not by name: a worker without this package could not even read the name of a
-    function of it, and would be lost for its scheduler.
+    What they are asked travels whole: a worker without this package that reads the name of a function of it is lost.
     """
     for address, count in client.nthreads().items():
         if count > 1:
@@ -432,14 +414,9 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
         if said.split(".")[:2] != here["python"].split("."):  # functions do not travel between these
             raise _unfit(address, [f"python {said} instead of {here['python']}"])
     module = "" if function is None or function.__module__ == "__main__" else function.__module__
-    probes = [] if folder is None else [folder / f".{secrets.token_hex(8)}.probe"]
-    try:
-        for probe in probes:
-            probe.write_text("", encoding="utf-8")
-        found = client.run(_question(module, "".join(map(str, probes))))
-    finally:
-        for probe in probes:
-            probe.unlink(missing_ok=True)
+    with contextlib.ExitStack() as held:
+        probe = folder and held.enter_context(tempfile.NamedTemporaryFile(dir=folder, prefix=".", suffix=".probe")).name
+        found = client.run(_question(module, probe or ""))
     for address, said in found.items():
         if isinstance(said, str):
             allowed = "workers that import the same modules and see the same folders as this process"

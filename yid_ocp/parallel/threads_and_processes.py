@@ -29,16 +29,13 @@ _Answer = TypeVar("_Answer")
 
 
 def map_in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Results in the order of the items, computed in as many threads as the process may use.
-
-    Compiled code runs outside Python's lock, so that threads share memory and still work side by side.
-    """
+    """Results in the order of the items, computed in as many threads as the process may use."""
     entries = list(items)
-    workers = min(len(entries), max_threads())
+    workers = min(len(entries), _max_threads())
     if workers < 2:
         return [function(entry) for entry in entries]
-    own = max_threads() // workers
-    with ThreadPoolExecutor(max_workers=workers, initializer=limit_max_threads, initargs=(own,)) as pool:
+    own = _max_threads() // workers
+    with ThreadPoolExecutor(max_workers=workers, initializer=_limit_max_threads, initargs=(own,)) as pool:
         return list(pool.map(function, entries))
 
 
@@ -47,7 +44,7 @@ def available_processor_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def max_threads() -> int:
+def _max_threads() -> int:
     """Number of threads that the caller may use: the process's limit, or its share within `map_in_threads`.
 
     `ConfigError` where `YID_OCP_THREADS` is no number of threads.
@@ -59,7 +56,7 @@ def max_threads() -> int:
     return min(own, getattr(_SHARE, "count", own))
 
 
-def limit_max_threads(count: int) -> None:
+def _limit_max_threads(count: int) -> None:
     """Limit the number of threads that the current thread may use."""
     _SHARE.count = count
 
@@ -71,11 +68,7 @@ CASADI_LOCK = threading.RLock()
 
 
 class CasadiLockedCache(Generic[_Key, _Value]):
-    """Cached values by key, each computed once under the CasADi lock.
-
-    For what is made of CasADi's expressions, which threads must not work on side by side. `compute_value` may depend on
-    the key alone.
-    """
+    """Cached values by key, each computed once under the CasADi lock; `compute_value` depends on the key alone."""
 
     def __init__(self, compute_value: Callable[[_Key], _Value]) -> None:
         self._make = compute_value
@@ -131,7 +124,6 @@ class _March:
             self.running.acquire()
 
     def leave(self) -> None:
-        """Register that one thread has no more items."""
         with self.changed:
             self.live -= 1
             self.changed.notify_all()
@@ -184,22 +176,22 @@ def batched_call(function: Callable[[list[_Query]], list[_Answer]], questions: l
 
 
 def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Results of a function for all items, run concurrently so that their `batched_call` calls are batched.
+    """Results of a function for all items, which wait for each other wherever one calls `batched_call`.
 
-    As many run as there are threads to use; they wait for each other wherever one calls `batched_call`, so that all are
-    answered at once. Which questions meet depends on the items alone. No item may hold a lock while it asks.
+    As many run as there are threads to use. Which questions meet depends on the items alone. No item may hold a lock
+    while it asks.
     """
     entries = list(items)
     if len(entries) < 2 or getattr(_SHARE, "march", None) is not None:
         return [function(entry) for entry in entries]
-    march = _March(min(_MAX_CONCURRENT_ITEMS, len(entries)), threading.Semaphore(max_threads()))
+    march = _March(min(_MAX_CONCURRENT_ITEMS, len(entries)), threading.Semaphore(_max_threads()))
     queue, guard = iter(range(len(entries))), threading.Lock()
     results: dict[int, _Result] = {}
     errors: dict[int, BaseException] = {}
 
     def work() -> None:
         _SHARE.march = march
-        limit_max_threads(1)
+        _limit_max_threads(1)
         try:
             while not march.abandoned and not errors:
                 with guard:
@@ -256,7 +248,7 @@ def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
     """
     count = workers or available_processor_count()
     context = multiprocessing.get_context("spawn")
-    each = max(1, max_threads() // count)
+    each = max(1, _max_threads() // count)
     return ProcessPoolExecutor(count, mp_context=context, initializer=_begin_worker, initargs=(each,))
 
 

@@ -253,7 +253,7 @@ class InitialStateFitter:
 
         found = levenberg_marquardt(rows, np.concatenate([q[free], theta[wanted]]), projection=allowed)
         q, theta = spread(found.x)
-        return q, theta[index], found.sum_of_squares
+        return q, theta[index], found.final_model.cost
 
     def _rows(self, q: Array, theta: Array, task: _Task) -> tuple[Array, Array]:
         """Residual of a fit and its derivative by the free coordinates and the parameters sought."""

@@ -17,11 +17,13 @@ from yid_ocp import interruption
 from yid_ocp.config.reader import load_config
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
-from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
+from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.terminal import SummaryBlock, summary_terminal_lines
 
 if TYPE_CHECKING:
     import rich.progress
+
+    from yid_ocp.solvers.base import Iterate
 
 EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 """Exit codes of commands that ran to their end; the last where they were told to be strict and found something."""
@@ -120,12 +122,12 @@ def _format_duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds >= 1.5 * 60 else f"{seconds:.0f} s"
 
 
-def _format_iterate(entry: AcceptedIterate) -> str:
+def _format_iterate(entry: Iterate) -> str:
     note = f", {entry.note}" if entry.note else ""
     return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
 
 
-class StderrLineProgress:
+class StderrLineProgress(Progress):
     """Progress as lines on standard error, for logs and pipes.
 
     One for every stage and iterate, for every tenth of a stage, and for what is done some seconds after the last line.
@@ -140,7 +142,7 @@ class StderrLineProgress:
         self._tenths, self._last, self._left = 0, time.monotonic(), _RemainingTime()
         print(f"{text} ...", file=sys.stderr, flush=True)
 
-    def report_iterate(self, entry: AcceptedIterate) -> None:
+    def report_iterate(self, entry: Iterate) -> None:
         """See `Progress`."""
         print(f"  {_format_iterate(entry)}", file=sys.stderr, flush=True)
 
@@ -153,7 +155,7 @@ class StderrLineProgress:
             print(f"  {done} of {total}, {text}{left}", file=sys.stderr, flush=True)
 
 
-class _BarProgress:
+class _BarProgress(Progress):
     """Progress as one bar for the running stage, below a line for each finished stage."""
 
     def __init__(self, bars: rich.progress.Progress) -> None:
@@ -167,7 +169,7 @@ class _BarProgress:
         self._text, self._left, self._begun = text, _RemainingTime(), time.monotonic()
         self._task = self._bars.add_task(text, total=None)
 
-    def report_iterate(self, entry: AcceptedIterate) -> None:
+    def report_iterate(self, entry: Iterate) -> None:
         if self._task is not None:
             self._bars.update(self._task, description=f"{self._text}: {_format_iterate(entry)}")
 

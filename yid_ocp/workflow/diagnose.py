@@ -24,11 +24,12 @@ from yid_ocp.errors import DataError, OutputError
 from yid_ocp.files import dataclass_from_plain_data, json_sha256, read_input_json, to_lossless_plain_data, write_json
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import NULL_PROGRESS, AcceptedIterate, Progress
+from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, make_animation
 from yid_ocp.report.summaries import diagnose_summary
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
+from yid_ocp.solvers.base import Iterate
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print
 from yid_ocp.workflow.plan import discrimination_plan_settings
@@ -120,7 +121,7 @@ def run_diagnose(
 
 
 @dataclass(frozen=True)
-class _LoggedProgress:
+class _LoggedProgress(Progress):
     """Progress that is shown, and entered in the run folder's log."""
 
     shown: Progress
@@ -130,7 +131,7 @@ class _LoggedProgress:
         self.folder.log_event("stage", text=text)
         self.shown.begin_stage(text)
 
-    def report_iterate(self, entry: AcceptedIterate) -> None:
+    def report_iterate(self, entry: Iterate) -> None:
         self.shown.report_iterate(entry)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
