@@ -23,7 +23,6 @@ from yid_ocp.errors import DataError, OutputError
 
 _DataclassType = TypeVar("_DataclassType")
 
-
 MAX_INPUT_NUMBERS = 50_000_000
 """Largest count of numbers of one file from outside: as float64 with copies, 40 bytes each, they are 2 GB."""
 MAX_TEXT_BYTES = 1 << 26  # of a file that is read as one text
@@ -31,14 +30,10 @@ _MEMORY_OF_READING = 7 << 28  # address space that a library may take to read a 
 
 
 def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
-    """Check that a file from outside is a regular file, behind links as well, of at most `max_bytes`; returns it.
+    """Return the path of a file from outside; `DataError` unless it is a regular file, of at most `max_bytes`.
 
     Pipes, devices and what never ends are refused before anything is read. Every file that the package did not write or
     ship is opened after this check.
-
-    Raises
-    ------
-    DataError
     """
     allowed = "a regular file"
     try:
@@ -116,10 +111,7 @@ def read_input_json(path: Path) -> Any:
 def atomic_write(path: Path) -> Iterator[Path]:
     """Context manager that writes a file atomically: the yielded temporary file replaces `path` on success.
 
-    Raises
-    ------
-    OutputError
-        If the folder is missing or the file cannot be written.
+    `OutputError` where the folder is missing or the file cannot be written.
     """
     if path.is_dir() or not path.parent.is_dir():
         what = "the name of the file is that of a folder" if path.is_dir() else "the folder to write to does not exist"
@@ -166,13 +158,7 @@ def is_file(path: Path) -> bool:
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, or of all files in a folder in the order of their names; 64 hexadecimal digits.
-
-    Raises
-    ------
-    DataError
-        If it is missing or cannot be read.
-    """
+    """SHA-256 of a file, or of all files in a folder by name, in hexadecimal; `DataError` where it cannot be read."""
     digest = hashlib.sha256()
     for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
         with check_input_file(entry).open("rb") as file:

@@ -15,10 +15,7 @@ from types import FrameType
 
 _RERAISE_INTERVAL = 2.0  # time after which a suppressed interruption is raised again [s]
 _FORCED_EXIT_DELAY = 10.0  # time after which a process that does not end is killed [s]
-_TERMINATION_SIGNALS = tuple(
-    signal.Signals[name] for name in ("SIGINT", "SIGTERM", "SIGHUP") if name in signal.Signals.__members__
-)
-"""Signals that end a command, as far as the system has them."""
+_TERMINATION_SIGNALS = [number for number in signal.Signals if number.name in ("SIGINT", "SIGTERM", "SIGHUP")]
 
 
 class InterruptedBySignal(KeyboardInterrupt):

@@ -44,14 +44,11 @@ class OptionInfo:
 
 @dataclass(frozen=True)
 class RegistryChoice:
-    """Annotation of a type: the user chooses a class of a registry by `selector_key`, or by a mapping's key.
-
-    Another key than `name` is a field of every class as well.
-    """
+    """Annotation of a type: the user chooses a class of a registry by `selector_key`, or by a mapping's key."""
 
     registry: Registry[Any]
     default_name: str = ""
-    selector_key: str = "name"
+    selector_key: str = "name"  # another one is a field of every class as well
 
 
 @dataclass(frozen=True)
@@ -139,12 +136,7 @@ def _words(hint: Any) -> str:
 
 
 def check_option_bounds(options: Any, where: str) -> None:
-    """Check that all numbers of an options object are within their bounds.
-
-    Raises
-    ------
-    ConfigError
-    """
+    """Raise `ConfigError` where a number of an options object is not within its bounds."""
     kind: Any = type(options)
     for name, option in dataclass_options(kind).items():
         value = getattr(options, option.field_name)

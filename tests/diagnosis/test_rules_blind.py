@@ -11,7 +11,9 @@ import pytest
 from factories import amplitude, cases, effect, shape, signature
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.diagnosis import blind as module
 from yid_ocp.diagnosis.blind import (
+    MAX_CASE_DRAWS,
     BlindCaseGenerator,
     CaseGroundTruth,
     PlannedBlindCase,
@@ -19,8 +21,6 @@ from yid_ocp.diagnosis.blind import (
     plan_blind_cases,
     scale_parameters_to_more_links,
 )
-from yid_ocp.diagnosis.blind import ensemble as module
-from yid_ocp.diagnosis.blind.ensemble import MAX_CASE_DRAWS
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.virtual.injected import OUT_OF_LIBRARY_EFFECTS, InjectedEffect

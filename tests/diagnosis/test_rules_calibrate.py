@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 
 from yid_ocp.diagnosis import Thresholds
-from yid_ocp.diagnosis.blind import CaseGroundTruth, calibrate_thresholds, permissive_thresholds, score_blind_case
-from yid_ocp.diagnosis.blind.score import (
+from yid_ocp.diagnosis.blind import CaseGroundTruth
+from yid_ocp.diagnosis.blind_scores import (
     _CALIBRATION_FORMAT,
     _CALIBRATION_RULES,
     _conformal_quantile,
     _recommended_settings,
+    calibrate_thresholds,
+    permissive_thresholds,
+    score_blind_case,
 )
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
 from yid_ocp.virtual.injected import InjectedEffect

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 from types import SimpleNamespace
@@ -11,21 +10,13 @@ import pytest
 from factories import amplitude, cases, effect, fit, loss
 
 from yid_ocp.cli import main
-from yid_ocp.diagnosis.blind import (
-    BlindCase,
-    CaseGroundTruth,
-    ensemble_success_rates,
-    open_sealed_labels,
-    score_blind_case,
-    seal_labels_with_hash,
-)
+from yid_ocp.diagnosis import blind, blind_scores
+from yid_ocp.diagnosis.blind import BlindCase, CaseGroundTruth, open_sealed_labels, seal_labels_with_hash
+from yid_ocp.diagnosis.blind_scores import ensemble_success_rates, score_blind_case
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
 
-# the package's own name `ensemble_success_rates` is the function
-scoring = importlib.import_module("yid_ocp.diagnosis.blind.score")
-ensemble_module = importlib.import_module("yid_ocp.diagnosis.blind.ensemble")
 KV, DRY = InjectedEffect("kelvin_voigt", "T1", {"tau": 0.05}), InjectedEffect("joint_coulomb", "elbow", {"tau_c": 2.0})
 DAMPER = effect("kelvin_voigt@T1", amplitude("tau", expected=(0.0, 0.2), unit="s"))
 FRICTION = effect("joint_coulomb@elbow", amplitude("tau_c", expected=(0.0, 3.0)))
@@ -188,7 +179,7 @@ def marked(category, **changed):
         "closure": 0.9,
         "best": 1.0,
     }
-    return scoring.BlindCaseScore(**(usual | changed))
+    return blind_scores.BlindCaseScore(**(usual | changed))
 
 
 def test_rates_are_over_the_cases_that_they_speak_of():
@@ -251,7 +242,7 @@ def test_no_cases_of_a_sort_have_no_rate():
     [(0, 10, 0.0, 0.3085), (10, 10, 0.6915, 1.0), (3, 60, 0.0104, 0.1392), (85, 100, 0.7647, 0.9135)],
 )
 def test_rates_have_binomial_intervals(count, total, low, high):
-    found = scoring._binomial_proportion([True] * count + [False] * (total - count))
+    found = blind_scores._binomial_proportion([True] * count + [False] * (total - count))
     assert (found["count"], found["of"], found["rate"]) == (count, total, count / total)
     assert (found["low"], found["high"]) == (pytest.approx(low, abs=1e-4), pytest.approx(high, abs=1e-4))
 
@@ -265,7 +256,7 @@ def test_what_was_said_of_what_is_counted():
         score_blind_case(label("null"), said("unknown")),
         score_blind_case(label("null"), said("no_gap")),
     ]
-    found = scoring._confusion_matrix(marks)
+    found = blind_scores._confusion_matrix(marks)
     assert (found["true"], found["said"]) == (
         ["kelvin_voigt", "null"],
         ["density", "kelvin_voigt", "no_gap", "unknown"],
@@ -282,7 +273,7 @@ def test_intervals_and_p_values_are_held_against_what_they_promise():
         told = said("no_gap")
         return score_blind_case(label("null"), {**told, "gap": {**told["gap"], "before": {"p_value": p}}})
 
-    found = scoring._calibration_rates([single(0.5), single(-1.5), single(2.1), null(0.03), null(0.4), null(0.9)])
+    found = blind_scores._calibration_rates([single(0.5), single(-1.5), single(2.1), null(0.03), null(0.4), null(0.9)])
     held = {entry["level"]: entry["count"] for entry in found["intervals"]}
     assert (held[0.5], held[0.8], held[0.9], held[0.95], held[0.99]) == (1, 1, 2, 2, 3)
     assert {entry["level"]: entry["count"] for entry in found["p_values"]} == {0.01: 0, 0.05: 1, 0.1: 1, 0.2: 1, 0.5: 2}
@@ -336,19 +327,17 @@ def test_the_best_that_could_be_closed_is_that_of_the_true_effects(monkeypatch, 
         return AllCandidatesProblem("from the start", tuple(effects), False)
 
     nominal = fit(lost=loss(2.0, 2.0), values={"k": 3.0}, problem="settled")
-    monkeypatch.setattr(ensemble_module, "make_candidate_effects", lambda *_: [stiff, FRICTION])
-    monkeypatch.setattr(ensemble_module, "AllCandidatesProblem", SimpleNamespace(from_problem=composed_from))
-    monkeypatch.setattr(ensemble_module, "fit_nominal_model", lambda *_: nominal)
+    monkeypatch.setattr(blind, "make_candidate_effects", lambda *_: [stiff, FRICTION])
+    monkeypatch.setattr(blind, "AllCandidatesProblem", SimpleNamespace(from_problem=composed_from))
+    monkeypatch.setattr(blind, "fit_nominal_model", lambda *_: nominal)
 
     def refit(composed, chosen, start):
         asked.append((composed.problem, [e.kind for e in chosen], dict(start)))
         return fit(chosen, loss(1.25, 1.25)) if refitted else None
 
-    monkeypatch.setattr(ensemble_module, "refit_with_effects", refit)
+    monkeypatch.setattr(blind, "refit_with_effects", refit)
     ensemble = SimpleNamespace(_nominal_problem=lambda recording: SimpleNamespace(system="system"))
-    found = ensemble_module.true_effects_gap_closure(
-        ensemble, case(), CaseGroundTruth("c", "single", injected, 1.0, {})
-    )
+    found = blind.true_effects_gap_closure(ensemble, case(), CaseGroundTruth("c", "single", injected, 1.0, {}))
     assert found == pytest.approx(expected, nan_ok=True)
     at_truth = {"kelvin_voigt@T1.tau": 0.05} if injected else {}
     assert asked == [["held out"], ("settled", ["kelvin_voigt"] if injected else [], {"k": 3.0} | at_truth)]

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.diagnosis.blind import BlindCaseScore, ensemble_success_rates
+from yid_ocp.diagnosis.blind_scores import BlindCaseScore, ensemble_success_rates
 from yid_ocp.errors import ConfigError, DataError, OutputError
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import InlineExecutor

@@ -23,8 +23,7 @@ import numpy as np
 from yid_ocp.config.reader import DEFAULT_CONFIG, DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
-from yid_ocp.diagnosis import blind
-from yid_ocp.diagnosis.blind.ensemble import MAX_CASE_DRAWS
+from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.diagnosis_result import statistics_compared_with_thresholds
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_json, write_text
@@ -121,11 +120,11 @@ def run_blind(
         log.warning("finished cases are in %s; the same command goes on with the others", proof.folder)
         raise
     marks = [
-        blind.score_blind_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
+        blind_scores.score_blind_case(label, found["result"], best.get(label.case, math.nan), float(found["seconds"]))
         for label, found in zip(labels, answers, strict=True)
     ]
     flags = ["--cases", count, "--seed", seed, *(["--calibration"] if purpose == blind.ENSEMBLE_PURPOSES[1] else [])]
-    result = blind.ensemble_success_rates(marks) | {
+    result = blind_scores.ensemble_success_rates(marks) | {
         "seed": seed,
         "purpose": purpose,
         "code": package_source_hash(),
@@ -137,7 +136,7 @@ def run_blind(
         "variations": {name: varied.description for name, varied in EXPERIMENT_VARIATIONS.items()},
     }
     if purpose == blind.ENSEMBLE_PURPOSES[1]:
-        found = blind.calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
+        found = blind_scores.calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
         write_json(proof.folder / "thresholds.json", to_json_types(found | made))
@@ -306,8 +305,9 @@ def diagnose_case_task(
         result = {"verdict": "insufficient_data", "message": str(error), **_NO_ANSWER}
     found: dict[str, Any] = to_json_types({"seconds": time.perf_counter() - begun, "result": result})
     if experiment["purpose"] == blind.ENSEMBLE_PURPOSES[1] and result["verdict"] == "no_gap":
+        wide = blind_scores.permissive_thresholds(run.diagnosis)
         try:
-            anything = blind.diagnose_blind_case(ensemble, case, candidates, blind.permissive_thresholds(run.diagnosis))
+            anything = blind.diagnose_blind_case(ensemble, case, candidates, wide)
             found["open"] = to_json_types(statistics_compared_with_thresholds(anything))
         except YidError as error:
             found["open"] = {"message": str(error)}
@@ -412,7 +412,7 @@ class BlindExperiment:
         values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
         conditions = replace(self._recording_conditions(), has_camera=vision)
         posture = blind.initial_driven_joint_positions(system, first[0])
-        for attempt in range(MAX_CASE_DRAWS):
+        for attempt in range(blind.MAX_CASE_DRAWS):
             rng = np.random.default_rng([self.seed, blind.ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
             try:
                 made = blind.simulate_random_motion(system, system, posture, values, values, (), rng, conditions)
@@ -421,7 +421,7 @@ class BlindExperiment:
             write_recording(replace(made, name="first", description="", source="", true_parameters={}), file)
             return
         hint = "an object that is thrown about needs more damping, or a start of its arms in which it hangs calm"
-        what = f"none of {MAX_CASE_DRAWS} motions can be simulated"
+        what = f"none of {blind.MAX_CASE_DRAWS} motions can be simulated"
         raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", hint=hint)
 
     def _build_ensemble(self, first: Path) -> tuple[RunSettings, blind.BlindCaseGenerator]:

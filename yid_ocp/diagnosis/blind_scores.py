@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import scipy.stats
 
-from yid_ocp.diagnosis.blind.ensemble import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
+from yid_ocp.diagnosis.blind import BLIND_CASE_CATEGORY_SHARES, CaseGroundTruth
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EFFECTS
 from yid_ocp.files import to_json_types

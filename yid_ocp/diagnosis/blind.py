@@ -7,7 +7,8 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, TypeVar
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,6 @@ from yid_ocp.effects.base import EffectBase, segment_elastic_joints
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.progress import Progress
 from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment
 from yid_ocp.virtual.injected import (
     INJECTABLE_EFFECT_KINDS,
@@ -35,9 +35,7 @@ from yid_ocp.virtual.injected import (
 from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
-_Key = TypeVar("_Key", str, float)
-_DETECTABLE_MULTIPLES = (1.0, 3.0, 10.0)
-"""Multiples of the detectable size."""
+_DETECTABLE_MULTIPLES = (1.0, 3.0, 10.0)  # of the detectable size
 BLIND_CASE_CATEGORY_SHARES: Mapping[str, float] = {
     "null": 0.2,
     "single": 0.48,
@@ -72,19 +70,13 @@ def plan_blind_cases(
     """Return the planned cases of an ensemble, in an order given by the seed.
 
     The weights are how large a part of the cases each experiment gets; fewer than `_MIN_CASES_PER_EXPERIMENT` are none,
-    but for the largest. The objects of `chains` can be made of finer links.
-
-    Raises
-    ------
-    ConfigError
-        No case at all.
+    but for the largest. The objects of `chains` can be made of finer links. `ConfigError` where there is no case.
     """
     if count < 1:
         raise ConfigError(f"an ensemble of {count} cases", where="--cases", allowed="a whole number from 1")
     total = sum(weights.values())
     kept = {name: part / total for name, part in weights.items() if count * part / total >= _MIN_CASES_PER_EXPERIMENT}
-    if not kept:
-        kept = {max(weights, key=lambda name: weights[name]): 1.0}
+    kept = kept or {max(weights, key=lambda name: weights[name]): 1.0}
     slots: list[tuple[str, float | None]] = []
     for category, number in _dealt(count, BLIND_CASE_CATEGORY_SHARES).items():
         if category == "single":
@@ -105,7 +97,7 @@ def plan_blind_cases(
     return [PlannedBlindCase(number, *cases[int(place)]) for number, place in enumerate(order)]
 
 
-def _dealt(count: int, parts: Mapping[_Key, float]) -> dict[_Key, int]:
+def _dealt(count: int, parts: Mapping[Any, float]) -> dict[Any, int]:
     """So many things in these proportions, by the largest remainders."""
     total = sum(parts.values())
     exact = {key: count * part / total for key, part in parts.items()}
@@ -178,13 +170,7 @@ def seal_labels_with_hash(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
 
 
 def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
-    """Read sealed labels after checking their hash.
-
-    Raises
-    ------
-    DataError
-        The text is not the one that was committed to.
-    """
+    """Read sealed labels; `DataError` where the text is not the one that was committed to."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
         raise DataError("the labels are not those that were committed to", where="sealed labels")
     return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
@@ -207,7 +193,7 @@ amplitudes a move the residual."""
 
 
 class BlindCaseGenerator:
-    """Generator of random blind cases of one experiment.
+    """Generator of random blind cases of one experiment; `ConfigError` where its system has no driven joints.
 
     Parameters
     ----------
@@ -215,15 +201,8 @@ class BlindCaseGenerator:
         Its system, options and free parameters are every case's; its first recording gives the initial posture.
     finer : callable, optional
         The system with so many times its links.
-    limits : Thresholds
-        For the detectable size.
     simulated_system : System, optional
         What moves, where that is not the problem's: the same with its arms driven.
-
-    Raises
-    ------
-    ConfigError
-        A system without driven joints, which MuJoCo could not be made to move.
     """
 
     def __init__(
@@ -253,7 +232,6 @@ class BlindCaseGenerator:
         if not {effect.kind for effect in self._effects} & set(INJECTABLE_EFFECT_KINDS):
             what, where = "none of the candidates can be done in MuJoCo", "diagnosis.candidates"
             raise ConfigError(what, where=where, allowed=", ".join(INJECTABLE_EFFECT_KINDS))
-        self._detectable: tuple[_Detectable, ...] | None = None
 
     def _rng(self, *path: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, ENSEMBLE_PURPOSES.index(self.conditions.purpose), *path])
@@ -272,12 +250,9 @@ class BlindCaseGenerator:
         links: int = 1,
     ) -> Recording:
         """Simulate one recording with injected effects; it carries no description or truth."""
-        nominal, system, values = self.simulated_system, self.simulated_system, truth
-        if links > 1:
-            assert self._finer is not None
-            system = self._finer(links)
-            values = scale_parameters_to_more_links(nominal, system, truth)
-        posture = self.initial_configuration
+        nominal, posture = self.simulated_system, self.initial_configuration
+        system = nominal if links == 1 or self._finer is None else self._finer(links)
+        values = truth if links == 1 else scale_parameters_to_more_links(nominal, system, truth)
         made = simulate_random_motion(nominal, system, posture, truth, values, injected, rng, self.conditions)
         return replace(made, name=name, description="", source="", true_parameters={})
 
@@ -294,21 +269,19 @@ class BlindCaseGenerator:
         composed = replace(composed, problem=nominal.problem)
         return linearize_candidates(composed, (), nominal.values, self._limits.shape_grid_size)
 
-    @property
-    def _detectable_effects(self) -> tuple[_Detectable, ...]:
-        """Sensitivity of every candidate, computed once."""
-        if self._detectable is None:
-            self._detectable = tuple(
-                (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r")))
-                for s in self._linearize_clean_recordings().signatures
-            )
-        return self._detectable
+    @cached_property
+    def _detectable(self) -> tuple[_Detectable, ...]:
+        """Sensitivity of every candidate."""
+        return tuple(
+            (s.effect, s.shape_values, np.asarray(np.linalg.qr(s.projected_sensitivity, mode="r")))
+            for s in self._linearize_clean_recordings().signatures
+        )
 
     def detectable_effect_sizes_to_json(self) -> list[dict[str, Any]]:
         """Return the sensitivity of every candidate, which gives its detectable size, JSON-compatible."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
-            for effect, shape, factor in self._detectable_effects
+            for effect, shape, factor in self._detectable
         ]
 
     def load_detectable_effect_sizes(self, detectable: Sequence[Mapping[str, Any]]) -> None:
@@ -320,19 +293,12 @@ class BlindCaseGenerator:
         )
 
     def _nominal_problem(self, recordings: Sequence[Recording]) -> EstimationProblem:
-        """The nominal estimation problem of some recordings."""
         nominal = self.problem
         values = dict(zip(nominal.system.parameters.names, map(float, nominal.theta), strict=True))
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
     def draw_planned_case(self, wanted: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
-        """Draw a planned case; the same seed and purpose give the same case.
-
-        Raises
-        ------
-        ModelError
-            None of several draws could be simulated.
-        """
+        """Draw a planned case, the same for the same seed and purpose; `ModelError` if no draw can be simulated."""
         name = f"case_{wanted.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
         for attempt in range(MAX_CASE_DRAWS):
@@ -357,7 +323,7 @@ class BlindCaseGenerator:
         )
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
-        kinds = sorted({e.kind for e, *_ in self._detectable_effects} - {effect.kind for effect in injected})
+        kinds = sorted({e.kind for e, *_ in self._detectable} - {effect.kind for effect in injected})
         return (str(rng.choice(kinds)),) if len(kinds) > 1 else ()
 
     def _injected(
@@ -375,7 +341,7 @@ class BlindCaseGenerator:
     def _inside(self, rng: np.random.Generator, wanted: float) -> tuple[InjectedEffect, float]:
         """An effect of the library at so many times its detectable size, or as near as its range lets it come."""
         groups: dict[str, dict[str, list[_Detectable]]] = {}
-        for entry in self._detectable_effects:
+        for entry in self._detectable:
             if entry[0].kind in INJECTABLE_EFFECT_KINDS:
                 groups.setdefault(entry[0].kind, {}).setdefault(entry[0].location, []).append(entry)
         drawn = []
@@ -464,22 +430,13 @@ def simulate_random_motion(
 
 
 def initial_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:
-    """Return the initial positions of the driven joints of a recording.
-
-    Raises
-    ------
-    ConfigError
-        One of them is not recorded.
-    """
+    """Return the initial positions of the driven joints of a recording; `ConfigError` where one is not recorded."""
     joints = recording.joints
     names = [] if joints is None else list(joints.names)
     missing = [name for name in system.driven if name not in names]
     if joints is None or missing:
-        raise ConfigError(
-            f"the first recording does not say where {missing[0]} begins",
-            where="recordings.estimate",
-            allowed="a recording of all driven joints",
-        )
+        what = f"the first recording does not say where {missing[0]} begins"
+        raise ConfigError(what, where="recordings.estimate", allowed="a recording of all driven joints")
     return {name: float(joints.position[0, names.index(name)]) for name in system.driven}
 
 
@@ -510,12 +467,10 @@ def diagnose_blind_case(
     case: BlindCase,
     candidates: CandidateChoice = "all",
     thresholds: Thresholds | None = None,
-    progress: Progress | None = None,
 ) -> DiagnosisResult:
     """Diagnose a blind case from its recordings alone."""
     problem, held_out = ensemble._nominal_problem(case.estimation_recordings), [case.held_out_recording]
-    how: dict[str, Any] = {"thresholds": thresholds, "progress": progress, "exclude": case.excluded_kinds}
-    return diagnose(problem, candidates, held_out, **how)
+    return diagnose(problem, candidates, held_out, thresholds=thresholds, exclude=case.excluded_kinds)
 
 
 def true_effects_gap_closure(
