@@ -15,6 +15,7 @@ two arms move what they hold.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.effects import make_effect
+from yid_ocp.errors import ConfigError
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model.system import System
 from yid_ocp.planning.joint_paths import (
@@ -76,12 +78,13 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
     while len(found) < count:
         way = rng.normal(size=3)
         x, y, z = way / np.linalg.norm(way) * rng.uniform(0.04, 0.08)
-        end = solve_end_equilibrium(step, theta, start, tip, begin + np.array((x, y, z)), 1e-3)
-        if (
-            end.target_distance < 1e-4
-            and np.abs(end.joint_positions - start.state[list(system.prescribed_coordinate_indices)]).max() < TRAVEL
-        ):
-            found.append((float(x), float(y), float(z)))
+        place = begin + np.array((x, y, z))
+        with contextlib.suppress(ConfigError):
+            end = solve_end_equilibrium(step, theta, start, tip, place, 1e-3)
+            rest = tip.positions_and_jacobian(end.state[None, : system.n_coordinates], theta)[0][0]
+            travel = (end.state - start.state)[list(system.prescribed_coordinate_indices)]
+            if np.linalg.norm(rest - place) < 1e-4 and np.abs(travel).max() < TRAVEL:
+                found.append((float(x), float(y), float(z)))
     return found
 
 

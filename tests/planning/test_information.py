@@ -12,13 +12,8 @@ from small_problems import pendulum_step, taken
 from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.errors import ConfigError, YidError
 from yid_ocp.planning.information_plan import plan_informative_motion
-from yid_ocp.planning.informative_motion_search import (
-    DOptimalityCriterion,
-    EffectDiscriminationCriterion,
-    InformativeMotionSearch,
-)
 from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
-from yid_ocp.planning.plan_shooting import _ValueWithJacobian
+from yid_ocp.planning.motion_search import DOptimalityCriterion, EffectDiscriminationCriterion, InformativeMotionSearch
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 
@@ -186,9 +181,7 @@ def searched(limits, rounds=50):
         simulator=simulator, search_problem_sensitivities=line, sensitivity_derivatives_by_coefficients=slopes
     )
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
-    kept = SimpleNamespace(
-        limit_rows=bounded, limited_quantity_values=lambda rolled, w: _ValueWithJacobian(*values(w.ravel()))
-    )
+    kept = SimpleNamespace(limit_rows=bounded, limited_quantity_values=lambda rolled, w: values(w.ravel()))
     search = InformativeMotionSearch(experiment, kept, DOptimalityCriterion((0, 1), (0, 1)))
     return search.improve_motion(np.array([[0.1], [-0.05]]), rounds)
 

@@ -17,15 +17,15 @@ from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_UNINFORMED_RELATIVE_STD
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.options import check_option_bounds
-from yid_ocp.planning.informative_motion_search import (
+from yid_ocp.planning.joint_paths import FramePositionFunction, PlannedMotion, PlanOptions
+from yid_ocp.planning.motion_search import (
     DOptimalityCriterion,
     EffectDiscriminationCriterion,
     InformativeMotionSearch,
     MotionSearchResult,
     OptimalityCriterion,
+    PlanResidualsAndLimits,
 )
-from yid_ocp.planning.joint_paths import FramePositionFunction, PlannedMotion, PlanOptions
-from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -208,7 +208,7 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualsAndLimits)
             what = f"{name} begins {max(low, -high):.3g} beyond the limit of the joint"
             hint = "give a plan.start_joint_positions within the limits"
             raise ConfigError(what, where="plan.start_joint_positions", hint=hint)
-    broken = limits.worst_violation_per_limit(limits.limited_quantity_values(mover.simulate_path(still), still).value)
+    broken = limits.worst_violation_per_limit(limits.limited_quantity_values(mover.simulate_path(still), still)[0])
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
         said = "; ".join(f"{name}: {x:.4g} where {bound:.4g} is allowed, {what}" for what, name, x, bound in parts)
@@ -374,7 +374,7 @@ def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: 
     def reached(names: Sequence[str], is_near: BoolArray) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
 
-    values = limits.limited_quantity_values(mover.simulate_path(w), w).value
+    values = limits.limited_quantity_values(mover.simulate_path(w), w)[0]
     for rows, own in limits.limits_with_quantity_values(values):
         near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
         found[rows.description] = reached(rows.row_names, near)

@@ -331,16 +331,6 @@ class PlannedMotion:
         return self.simulator.step.system.point_frames
 
 
-@dataclass(frozen=True)
-class _EndEquilibrium:
-    """An equilibrium at which the point rests near its target."""
-
-    joint_positions: Array  # (nc,), moved joints [rad or m]
-    equilibrium: Equilibrium
-    target_distance: float  # distance of the point from its target [m]
-    joints_at_limit: tuple[str, ...]
-
-
 def _position_limits(system: System) -> tuple[Array, Array]:
     """Lower and upper limits of the moved joints, shape (nc,) each."""
     joints = [system.mechanism.joints[i] for i in system.prescribed_coordinate_indices]
@@ -348,10 +338,7 @@ def _position_limits(system: System) -> tuple[Array, Array]:
 
 
 def start_joint_positions_as_array(system: System, posture: Mapping[str, float]) -> Array:
-    """Start positions of the moved joints, given by name, as an array of shape (nc,).
-
-    Raises `ConfigError` where a joint is missing, does not exist, or stands outside its range.
-    """
+    """Start positions (nc,) of the moved joints, given by name; `ConfigError` if one is missing or out of range."""
     where = "plan.start_joint_positions"
     for name in posture:
         if name not in system.prescribed:
@@ -410,10 +397,10 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
 
 def solve_end_equilibrium(
     step: Step, theta: Array, start: Equilibrium, point: FramePositionFunction, place: Array, tolerance: float
-) -> _EndEquilibrium:
-    """Solve for joint positions within their limits, near the start, at which the point rests nearest to its target.
+) -> Equilibrium:
+    """Solve for the equilibrium near the start, joints within their limits, at which the point rests at its target.
 
-    Raises `ConfigError` where no joint moves the point.
+    Raises `ConfigError` where no joint moves the point, or where it cannot rest there.
     """
     statics, system = EquilibriumSolver(step), step.system
     n, first = system.n_coordinates, start.state[list(system.prescribed_coordinate_indices)]
@@ -444,9 +431,19 @@ def solve_end_equilibrium(
     )
     rest = statics.solve(found.x, theta, guess=guess[0])
     distance = float(np.linalg.norm(point_and_slope(rest)[0] - place)) if rest.is_converged else np.inf
-    near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
-    limits = tuple(name for name, one in zip(system.prescribed, near, strict=True) if one)
-    return _EndEquilibrium(found.x, rest, distance, limits)
+    if not distance <= TARGET_REACHED_TOLERANCE_FACTOR * tolerance:
+        off = f"{1e3 * distance:.3g} mm off" if rest.is_converged else "nowhere, as no posture near it is at rest"
+        near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
+        names = ", ".join(name for name, one in zip(system.prescribed, near, strict=True) if one)
+        limits = f", with {names} at the joint's limit" if names else ""
+        raise ConfigError(
+            f"the goal is out of reach: '{point.names[0]}' comes to rest {off}{limits}",
+            where=f"plan.target_position ({', '.join(f'{x:.4g}' for x in place)} m in the world)",
+            allowed="a place at which the point can rest",
+            hint="take a nearer place, a smaller plan.target_offset, or another plan.start_joint_positions to begin "
+            "with",
+        )
+    return rest
 
 
 def last_value_kept(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
@@ -459,18 +456,3 @@ def last_value_kept(function: Callable[[Array], _Value]) -> Callable[[Array], _V
         return last[-1][1]
 
     return at
-
-
-def check_target_reachable(end: _EndEquilibrium, name: str, place: Array, tolerance: float) -> None:
-    """Raise `ConfigError` where the point cannot rest at its target."""
-    if end.target_distance <= TARGET_REACHED_TOLERANCE_FACTOR * tolerance:
-        return
-    known = np.isfinite(end.target_distance)
-    off = f"{1e3 * end.target_distance:.3g} mm off" if known else "nowhere, as no posture near it is at rest"
-    limits = f", with {', '.join(end.joints_at_limit)} at the joint's limit" if end.joints_at_limit else ""
-    raise ConfigError(
-        f"the goal is out of reach: '{name}' comes to rest {off}{limits}",
-        where=f"plan.target_position ({', '.join(f'{x:.4g}' for x in place)} m in the world)",
-        allowed="a place at which the point can rest",
-        hint="take a nearer place, a smaller plan.target_offset, or another plan.start_joint_positions to begin with",
-    )

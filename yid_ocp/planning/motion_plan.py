@@ -22,12 +22,11 @@ from yid_ocp.planning.joint_paths import (
     PlanOptions,
     SplinePath,
     check_standstill_limits,
-    check_target_reachable,
     solve_end_equilibrium,
     solve_start_equilibrium,
     start_joint_positions_as_array,
 )
-from yid_ocp.planning.plan_shooting import PlanResidualsAndLimits, PlanShootingProblem, PlanShootingResult
+from yid_ocp.planning.motion_search import PlanResidualsAndLimits, PlanShootingProblem, PlanShootingResult
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.virtual.joint_motion import grasping_joint_angles
 
@@ -74,11 +73,7 @@ def plan_motion_to_target(
 
     Parameters are the system's values when `theta` is absent; the covariance of some of them may be `known`. There is a
     plan also where no motion within the limits was found: its `message` says which one is passed, and by how much.
-
-    Raises
-    ------
-    ConfigError, ModelError
-        A goal that cannot be reached, names that do not exist, an empty box, no rest to begin from.
+    `ConfigError` or `ModelError`: a goal out of reach, names that do not exist, an empty box, no rest to begin from.
     """
     check_option_bounds(options, "plan")
     system = step.system
@@ -97,12 +92,12 @@ def plan_motion_to_target(
         _check_box(options, inside, mover.trajectories(inside, start.state[None])[0], place)
     check_standstill_limits(step, values, start, options.limits, "where the motion begins")
     end = solve_end_equilibrium(step, values, start, point, place, options.position_tolerance)
-    check_target_reachable(end, point.names[0], place, options.position_tolerance)
-    check_standstill_limits(step, values, end.equilibrium, options.limits, "where it ends")
+    check_standstill_limits(step, values, end, options.limits, "where it ends")
 
     def attempt(duration: float) -> TargetMotionPlan:
         own = replace(mover, path=replace(path, duration=duration))
-        straight = own.path.straight_line_coefficients(end.joint_positions - own.moved_joint_start_positions)
+        travel = end.state[own.moved_joint_indices] - own.moved_joint_start_positions
+        straight = own.path.straight_line_coefficients(travel)
         rows = PlanResidualsAndLimits(own, replace(options, duration=duration), point, place, straight, inside)
         return _attempt(rows, known)
 
@@ -259,7 +254,7 @@ def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: Para
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
     course = rows.reference_point_positions
     off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
-    broken = rows.worst_violation_per_limit(rows.limited_quantity_values(rollout, shot.w).value)
+    broken = rows.worst_violation_per_limit(rows.limited_quantity_values(rollout, shot.w)[0])
     message = shot.message
     for what, (name, value, bound) in broken.items():
         message += f"; {name} passes its limit of {what}: {value:.4g} where {bound:.4g} is allowed"

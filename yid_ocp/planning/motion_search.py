@@ -1,0 +1,481 @@
+"""Goal and limits of a planned motion with Jacobians, and searches within limits: for a goal, and for information.
+
+For a goal it is single shooting. Bounds of the unknowns are kept by the trust region, all other limits by an augmented
+Lagrangian: a row g <= u adds rho/2 max(0, g - u + lam/rho)^2 to the cost, and lam is raised until no row is passed.
+
+For information, sensitivities J(w) and limits are linearised in every round and the criterion of the linear J is
+maximised within a trust region (Burke and Ferris 1995, doi:10.1007/BF01585997) by SLSQP (Kraft 1988, DFVLR-FB 88-28).
+All iterates keep the limits. Every parameter has a prior standard deviation of `MAX_WEAK_RELATIVE_STD` of its value, so
+that a criterion stays finite where no measurement informs one.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares, minimize
+
+from yid_ocp.arrays import Array
+from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
+from yid_ocp.integrator.step_model import Rollout
+from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanOptions, last_value_kept
+from yid_ocp.planning.planned_experiment import PlannedExperiment
+from yid_ocp.progress import NULL_PROGRESS, Progress
+
+_LIMIT_NODE_STRIDE = 2  # nodes between those at which limits on what moves freely are asked for
+_QUASI_STATIC_DISTANCE = 1.0  # RMS distance of the joints from the quasi-static motion that counts as one [rad or m]
+_ACCELERATION_WEIGHT = 1e-3  # of their mean square, in parts of their limit: of equal motions the calmer one
+
+
+@dataclass(frozen=True, eq=False)
+class _LimitRows:
+    """Bounds of limit rows of one kind."""
+
+    description: str  # the limited quantity, with its unit
+    lower: Array  # (rows,)
+    upper: Array  # (rows,)
+    unit: Array  # (rows,), divisor that scales each row to order one
+    row_names: tuple[str, ...]  # joint, spring or frame of each row
+
+
+def _limit_units_and_scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array, Array, Array]:
+    """Units of all limit rows, and their lower and upper bounds in these units, shape (rows,) each."""
+    unit, lower, upper = (np.concatenate([getattr(rows, k) for rows in limits]) for k in ("unit", "lower", "upper"))
+    return unit, lower / unit, upper / unit
+
+
+@dataclass(eq=False)
+class PlanResidualsAndLimits:
+    """Goal residuals and limited quantities of a planned motion, for one set of model parameters."""
+
+    simulator: PathSimulator
+    options: PlanOptions
+    point: FramePositionFunction  # of the frame that is to arrive, and of all frames that are to rest
+    target: Array  # (3,), where it is to arrive [m]
+    quasi_static_coefficients: Array  # (K, nc); of motions that do equally well, the one nearest to them is wanted
+    inside: FramePositionFunction | None = None  # frames that stay in the box
+
+    def __post_init__(self) -> None:
+        system = self.simulator.step.system
+        self._joints = [system.mechanism.joints[i] for i in self.simulator.moved_joint_indices]
+        able = self.options.limits.effort_fraction
+        self._effort_limit = able * np.array([joint.effort_limit for joint in self._joints])
+        self._springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
+        self.limit_rows = self._bounded()
+
+    @property
+    def reference_point_positions(self) -> Array | None:
+        """Reference position of the point at every node, shape (N + 1, 3) [m]; None where only the end counts."""
+        if self.options.goal != "path":
+            return None
+        begin = self.simulator.start_configuration[None]
+        first = self.point.positions_and_jacobian(begin, self.simulator.theta)[0][0, :3]
+        places = np.vstack([first, *(first + np.asarray(via) for via in self.options.waypoint_offsets), self.target])
+        at = np.linspace(0.0, self.simulator.path.duration, len(places))
+        # the clock starts and stops gently as well, so that the way is one that can be followed
+        return np.array(CubicSpline(at, places, bc_type="clamped")(np.minimum(self.simulator.node_times, at[-1])))
+
+    def _goal_residual(self, rollout: Rollout, w: Array) -> list[tuple[Array, Array]]:
+        """Goal residual and Jacobian in parts: distances and speeds over their tolerances, and weak regularisation."""
+        mover, options, h = self.simulator, self.options, self.simulator.step.time_step
+        n, size = mover.step.system.n_coordinates, w.size
+        assert rollout.state_sensitivity is not None
+        assert rollout.effort_sensitivity is not None
+        at, by_q = self.point.positions_and_jacobian(rollout.state[:, :n], mover.theta)
+        by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n, -size:])
+        end, course = mover.standstill_node_indices, self.reference_point_positions
+        after, before, reached = end[1:], end[1:] - 1, options.position_tolerance
+        by_speed = (by_w[after] - by_w[before]) / h
+        parts = [_rows(at[end, :3] - self.target, by_w[end, :3], reached)]
+        parts.append(_rows((at[after] - at[before]) / h, by_speed, options.rest_speed_tolerance))
+        if course is not None:
+            parts.append(_rows(at[:, :3] - course, by_w[:, :3], reached))
+        bend = mover.path.coefficients_to_control_points_matrix(2) / options.limits.max_acceleration
+        parts.append(_rows(bend @ w, _by_coefficients(bend, w), _ACCELERATION_WEIGHT**-0.5))
+        parts.append(_rows(w - self.quasi_static_coefficients, np.eye(size), _QUASI_STATIC_DISTANCE))
+        if options.effort_weight:
+            finite = np.isfinite(self._effort_limit)
+            unit = self._effort_limit[finite] / np.sqrt(options.effort_weight)
+            by_effort = rollout.effort_sensitivity[:, finite, -size:] / unit[:, None]
+            parts.append(_rows(rollout.effort[:, finite] / unit, by_effort, 1.0))
+        return parts
+
+    def limited_quantity_values(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
+        """Values (rows,) of the limited quantities along a motion, in the order of `limit_rows` and in their own units.
+
+        With their Jacobian (rows, K nc) by the spline coefficients where the rollout has sensitivities.
+        """
+        mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
+        n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
+        controls = [mover.path.coefficients_to_control_points_matrix(order) for order in (1, 2)]
+        parts: list[tuple[Array, Array | None]] = [(matrix @ w, _by_coefficients(matrix, w)) for matrix in controls]
+        finite = np.isfinite(self._effort_limit)
+        parts.append((rollout.effort[every, finite], None if pushed is None else pushed[every, finite, -size:]))
+        if self.options.limits.max_spring_angle is not None:
+            slope = None if moved is None else moved[every, self._springs, -size:]
+            parts.append((rollout.state[every, self._springs], slope))
+        if self.inside is not None:
+            at, by_q = self.inside.positions_and_jacobian(rollout.state[every, :n], mover.theta)
+            parts.append((at, None if moved is None else np.einsum("tiq,tqd->tid", by_q, moved[every, :n, -size:])))
+        value = np.concatenate([rows.ravel() for rows, _ in parts])
+        slopes = [slope.reshape(-1, size) for _, slope in parts if slope is not None]
+        return value, np.vstack(slopes) if len(slopes) == len(parts) else None
+
+    def _bounded(self) -> list[_LimitRows]:
+        mover, limits = self.simulator, self.options.limits
+        names = tuple(joint.name for joint in self._joints)
+        speed = limits.velocity_fraction * np.array([joint.velocity_limit for joint in self._joints])
+        sharp = np.full(len(names), limits.max_acceleration)
+        count = len(mover.path.coefficients_to_control_points_matrix())
+        found = [_even("velocity [rad/s or m/s]", names, speed, count - 1)]
+        found.append(_even("acceleration [rad/s^2 or m/s^2]", names, sharp, count - 2))
+        finite = np.isfinite(self._effort_limit)
+        steps = len(range(0, len(mover.node_times) - 1, _LIMIT_NODE_STRIDE))
+        able = tuple(name for name, one in zip(names, finite, strict=True) if one)
+        found.append(_even("effort [N m or N]", able, self._effort_limit[finite], steps))
+        nodes = len(range(0, len(mover.node_times), _LIMIT_NODE_STRIDE))
+        if limits.max_spring_angle is not None:
+            springs = tuple(mover.step.system.mechanism.joint_names[i] for i in self._springs)
+            found.append(_even("angle [rad]", springs, np.full(len(springs), limits.max_spring_angle), nodes))
+        if self.inside is not None and self.options.box is not None:
+            low, high = (np.tile(corner, len(self.inside.names) * nodes) for corner in self.options.box)
+            axes = tuple(f"{name}, {axis}" for name in self.inside.names for axis in "xyz")
+            found.append(_LimitRows("place [m]", low, high, np.full(len(low), 0.1), axes * nodes))
+        return found
+
+    def limits_with_quantity_values(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
+        """Every kind of limit with its rows of `limited_quantity_values`."""
+        ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
+        return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
+
+    def worst_violation_per_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
+        """The worst violated row of each kind of limit: its name, value and bound."""
+        found = {}
+        for rows, own in self.limits_with_quantity_values(value):
+            over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
+            worst = int(np.argmax(over)) if len(own) else 0
+            if len(own) and over[worst] > 1e-4:
+                bound = rows.upper[worst] if own[worst] > rows.upper[worst] else rows.lower[worst]
+                found[rows.description] = (rows.row_names[worst], float(own[worst]), float(bound))
+        return found
+
+
+def _by_coefficients(matrix: Array, w: Array) -> Array:
+    """Derivative of `matrix @ w` by the coefficients, row by row."""
+    return np.einsum("tk,ji->tjki", matrix, np.eye(w.shape[1])).reshape(-1, w.size)
+
+
+def _rows(value: Array, slope: Array, unit: float) -> tuple[Array, Array]:
+    """Rows of nodes (N, m), so that the sum of their squares is the mean over the nodes in squares of the unit."""
+    scale = 1.0 / (unit * np.sqrt(len(value)))
+    return scale * value.ravel(), scale * slope.reshape(value.size, -1)
+
+
+def _even(what: str, names: tuple[str, ...], limit: Array, count: int) -> _LimitRows:
+    upper = np.tile(limit, count)
+    return _LimitRows(what, -upper, upper, np.where(np.isfinite(upper), upper, 1.0), names * count)
+
+
+_INITIAL_PENALTY, _PENALTY_GROWTH, _MAX_PENALTY = 1e3, 10.0, 1e8
+_LIMIT_TOLERANCE = 1e-4  # largest violation of a limit, in parts of it, that counts as none
+_MAX_OUTER_ITERATIONS = 12
+_FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: the trust region shrinks
+
+
+@dataclass(frozen=True)
+class PlanShootingResult:
+    """Result of a search for a planned motion: coefficients w (K, nc), converged only if within the limits."""
+
+    w: Array
+    is_converged: bool
+    message: str
+    n_evaluations: int
+
+
+class PlanShootingProblem:
+    """Shooting problem with the residuals of several parameter cases and the limits of the first case."""
+
+    def __init__(self, cases: Sequence[PlanResidualsAndLimits], shape: tuple[int, int]) -> None:
+        self._cases, self._shape = list(cases), shape
+        self._residual_and_limit_values = last_value_kept(self._evaluated)
+        self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(self._cases[0].limit_rows)
+        self.evaluations = 0
+
+    def _evaluated(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        """Residual and its Jacobian, scaled limit values and theirs; not finite where a rollout fails."""
+        self.evaluations += 1
+        w = x.reshape(self._shape)
+        rollouts = [case.simulator.simulate_path(w, True) for case in self._cases]
+        pairs = zip(self._cases, rollouts, strict=True)
+        parts = [rows for case, rollout in pairs for rows in case._goal_residual(rollout, w)]
+        value, slope = (np.concatenate(rows) / np.sqrt(len(self._cases)) for rows in zip(*parts, strict=True))
+        limited, by_w = self._cases[0].limited_quantity_values(rollouts[0], w)
+        assert by_w is not None
+        return value, slope, limited / self._unit, by_w / self._unit[:, None]
+
+    def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> PlanShootingResult:
+        """Optimise a motion from initial coefficients within bounds, all of shape (K, nc).
+
+        References
+        ----------
+        Rockafellar (1973), Math. Programming 5:354, doi:10.1007/BF01580138.
+        Branch, Coleman and Li (1999), SIAM J. Sci. Comput. 21(1):1, doi:10.1137/S1064827595289108.
+        """
+        low, high = lower.ravel(), upper.ravel()
+        x = np.clip(start.ravel(), low + 1e-9, high - 1e-9)
+        pull = np.zeros((2, len(self._unit)))
+        penalty, before, ended = _INITIAL_PENALTY, np.inf, False
+        for _ in range(_MAX_OUTER_ITERATIONS):
+            value, slope = (functools.partial(self._penalised, pull, penalty, part) for part in (0, 1))
+            stop = {"max_nfev": iterations, "ftol": 1e-6, "xtol": 1e-7, "gtol": 1e-8}
+            found = least_squares(value, x, jac=slope, bounds=(low, high), x_scale=1.0, **stop)
+            x, ended = found.x, found.status > 0
+            reached = self._residual_and_limit_values(x)[2]
+            over = np.vstack([reached - self._upper, self._lower - reached])
+            passed = float(np.max(over, initial=0.0))
+            if passed <= _LIMIT_TOLERANCE or not np.isfinite(passed):
+                break
+            pull = np.maximum(0.0, pull + penalty * over)
+            if passed > 0.25 * before:
+                penalty = min(_PENALTY_GROWTH * penalty, _MAX_PENALTY)
+            before = passed
+        finished = bool(ended and passed <= _LIMIT_TOLERANCE)
+        message = "the motion was found" if finished else "no motion within the limits was found"
+        if not ended and not passed > _LIMIT_TOLERANCE:
+            message = f"the search was stopped after {iterations} evaluations; raise plan.max_iterations"
+        return PlanShootingResult(x.reshape(self._shape), finished, message, self.evaluations)
+
+    def _penalised(self, pull: Array, penalty: float, part: int, x: Array) -> Array:
+        """Residual with the penalties of the limits (part 0), or its Jacobian (part 1)."""
+        residual, by_x, limited, limits_by_x = self._residual_and_limit_values(x)
+        root = np.sqrt(penalty)
+        sides = ((1.0, limited - self._upper, pull[0]), (-1.0, self._lower - limited, pull[1]))
+        # a one beside them: the search ends where the cost falls by little of what counts as reached
+        values, slopes = [np.ones(1), residual], [np.zeros((1, len(x))), by_x]
+        for sign, over, raised in sides:
+            shifted = np.maximum(over + raised / penalty, 0.0)
+            values.append(root * shifted)
+            slopes.append(sign * root * np.where(shifted > 0, 1.0, 0.0)[:, None] * limits_by_x)
+        value, slope = np.concatenate(values), np.vstack(slopes)
+        if np.all(np.isfinite(value)) and np.all(np.isfinite(slope)):
+            return (value, slope)[part]
+        return (np.full(len(value), _FAILED_ROLLOUT_RESIDUAL), np.zeros_like(slope))[part]
+
+
+# -- motions that tell most -------------------------------------------------------------------------------------------
+
+
+def _prior(columns: int, bounded: Sequence[int]) -> Array:
+    """Information beforehand: of parameters `MAX_WEAK_RELATIVE_STD`, of all else next to none (it is in the rows)."""
+    prior = np.full(columns, 1e-6)
+    prior[list(bounded)] = MAX_WEAK_RELATIVE_STD**-2
+    return prior
+
+
+@dataclass(frozen=True)
+class DOptimalityCriterion:
+    """Minus half the log determinant of the covariance of chosen parameters, all others and nuisances eliminated.
+
+    With all parameters chosen that is D-optimality, with some of them D_s-optimality, with one its standard deviation.
+
+    References
+    ----------
+    Atkinson, Donev and Tobias (2007), Optimum Experimental Designs, with SAS, sections 10.2 and 10.3.
+    """
+
+    chosen_columns: tuple[int, ...]
+    parameter_columns: tuple[int, ...]
+
+    def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
+        """Criterion [nat] at sensitivities (nr, columns) to relative changes, and its gradient by them if asked for."""
+        information, chosen = rows.T @ rows, list(self.chosen_columns)
+        information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
+        whole = np.asarray(scipy.linalg.inv(information))
+        own = whole[np.ix_(chosen, chosen)]
+        found = -0.5 * float(np.linalg.slogdet(own)[1])
+        if not slope:
+            return found, np.zeros((0, 0))
+        # d C = -C d(J'J) C
+        wide = whole[:, chosen]
+        return found, rows @ (wide @ np.linalg.solve(own, wide.T))
+
+
+@dataclass(frozen=True)
+class EffectDiscriminationCriterion:
+    """Criterion of how far each effect's change of the readings is from what another and the unknowns can imitate.
+
+    d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
+    -1/2 log sum_ij 1 / (1 + d_ij^2).
+    """
+
+    amplitude_columns: tuple[tuple[int, ...], ...]  # of every effect
+    # of the amplitudes, in units of the columns, (amplitudes, cases): one case where they are known, else one for each
+    amplitude_cases: tuple[Array, ...]
+    parameter_columns: tuple[int, ...]  # with a prior: of the nominal parameters and of the effects
+
+    def pairwise_effect_distances(self, rows: Array) -> Array:
+        """Distances of effect i's (row) changes from what effect j can imitate [data stds]; diagonal infinite."""
+        found = np.full((len(self.amplitude_columns),) * 2, np.inf)
+        for i, j in itertools.permutations(range(len(found)), 2):
+            found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
+        return found
+
+    def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
+        """As `DOptimalityCriterion.value_and_gradient_by_sensitivities`."""
+        total, by_rows = 0.0, np.zeros_like(rows)
+        for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
+            square, rest, others, used = self._apart(rows, i, j)
+            weight = 1.0 / (1.0 + square)
+            total += weight
+            if slope:
+                factor = 2.0 * weight**2 / len(self.amplitude_cases[i].T)
+                by_rows[:, list(self.amplitude_columns[i])] += factor * rest @ self.amplitude_cases[i].T
+                by_rows[:, others] -= factor * rest @ used.T
+        return -0.5 * float(np.log(total)), 0.5 * by_rows / total if slope else np.zeros((0, 0))
+
+    def _apart(self, rows: Array, i: int, j: int) -> tuple[float, Array, list[int], Array]:
+        """Squared distance, what is left of the change by i, the columns of what may explain it, and how they do."""
+        away = {column for k, effect in enumerate(self.amplitude_columns) if k != j for column in effect}
+        others = [column for column in range(rows.shape[1]) if column not in away]
+        change, basis = rows[:, list(self.amplitude_columns[i])] @ self.amplitude_cases[i], rows[:, others]
+        prior = _prior(rows.shape[1], self.parameter_columns)[others]
+        used = scipy.linalg.solve(basis.T @ basis + np.diag(prior), basis.T @ change, assume_a="pos")
+        rest = change - basis @ used
+        square = float(np.sum(rest**2) + np.sum(prior[:, None] * used**2)) / change.shape[1]
+        return square, rest, others, used
+
+
+OptimalityCriterion = DOptimalityCriterion | EffectDiscriminationCriterion
+
+_INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 0.05, 0.4  # of the trust region, for every unknown of the motion [rad or m]
+_MIN_TRUST_RADIUS = 1e-3
+_MIN_STEP = 1e-9  # step in the linear picture that counts as none [rad or m]
+_MAX_INNER_ITERATIONS = 100  # iterations of the inner search
+_LIMIT_SLACK = 1e-3  # by which the linear limits are tighter, in parts of the limits
+_MIN_GAIN = 1e-2  # of the criterion [nat]: less in a round is the end
+_MAX_LIMIT_CORRECTIONS = 2  # of the linear limits where a step passes the true ones
+
+
+@dataclass(frozen=True)
+class MotionSearchResult:
+    """Result of a motion search: final spline coefficients w (K, nc), initial and final criterion [nat]."""
+
+    w: Array
+    initial_criterion: float
+    final_criterion: float
+    is_converged: bool
+    n_iterations: int
+    configured_criterion: float = -np.inf  # in the configured problem; minus infinity where that cannot be simulated
+
+
+class InformativeMotionSearch:
+    """Search for the motion of an experiment that maximises a criterion within limits."""
+
+    def __init__(
+        self, experiment: PlannedExperiment, limits: PlanResidualsAndLimits, criterion: OptimalityCriterion
+    ) -> None:
+        self.experiment, self.limits, self.criterion = experiment, limits, criterion
+        self.lower, self.upper = (bound.ravel() for bound in experiment.simulator.coefficient_bounds())
+        self._unit, self._low, self._high = _limit_units_and_scaled_bounds(limits.limit_rows)
+
+    def _limited_values(self, w: Array) -> tuple[Array, bool]:
+        """Limited quantities of a motion in parts of their limits, and whether it can be simulated and keeps these."""
+        value = self.limits.limited_quantity_values(self.experiment.simulator.simulate_path(w), w)[0] / self._unit
+        flat = w.ravel()
+        within = np.all((value <= self._high) & (value >= self._low))  # not where a value is not finite
+        return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
+
+    def shrink_to_limits(self, w: Array) -> Array:
+        """Spline coefficients (K, nc) of the motion, scaled down until it keeps the limits."""
+        for _ in range(60):
+            if self._limited_values(w)[1]:
+                return w
+            w = 0.8 * w
+        return np.zeros_like(w)
+
+    def _value_and_rows(self, w: Array) -> tuple[float, Array | None]:
+        """Criterion and sensitivities of a motion; minus infinity where it cannot be simulated."""
+        rows = self.experiment.search_problem_sensitivities(w)
+        return -np.inf if rows is None else self.criterion.value_and_gradient_by_sensitivities(rows, False)[0], rows
+
+    def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
+        """Maximise the criterion from spline coefficients (K, nc) that keep the limits, until convergence."""
+        w, radius = start, _INITIAL_TRUST_RADIUS
+        value, rows = self._value_and_rows(w)
+        first, finished, done = value, False, 0
+        while rows is not None and done < rounds and not finished:
+            done += 1
+            slopes = self.experiment.sensitivity_derivatives_by_coefficients(w, rows)
+            rolled = self.experiment.simulator.simulate_path(w, True)
+            limited, by_w = self.limits.limited_quantity_values(rolled, w)
+            if slopes is None or by_w is None:
+                break
+            bounded = limited / self._unit, by_w / self._unit[:, None]
+            gained, small, still = 0.0, False, False
+            while not small:
+                step = self._step(rows, slopes, w, bounded, radius)
+                still = not np.any(np.abs(step) > _MIN_STEP)
+                if still:
+                    break
+                there, its = self._value_and_rows(w + step)
+                small = radius <= _MIN_TRUST_RADIUS
+                if its is not None and there > value:
+                    gained, w, value, rows = there - value, w + step, there, its
+                    radius = min(2.0 * radius, _MAX_TRUST_RADIUS) if np.abs(step).max() > 0.9 * radius else radius
+                    break
+                radius = max(0.3 * radius, 0.5 * _MIN_TRUST_RADIUS)
+            progress.report_parts_done(done, rounds, f"{value - first:.3g} nat beyond the start")
+            # a motion from which no step gains anything at all is too rough to be improved, as where the object snaps
+            finished = gained < _MIN_GAIN and (done > 1 or gained > 0.0 or still)
+            if gained == 0.0:
+                break
+        return MotionSearchResult(w, first, value, finished, done)
+
+    def _step(self, rows: Array, slopes: Array, w: Array, bounded: tuple[Array, Array], radius: float) -> Array:
+        """The best step in the linear picture within a trust region, made such that the true limits are kept."""
+        value, slope = bounded
+        reach = np.abs(slope).sum(1) * radius
+        shift = np.zeros_like(value)
+        for _ in range(1 + _MAX_LIMIT_CORRECTIONS):
+            high, low = self._high - _LIMIT_SLACK - value - shift, value + shift - self._low - _LIMIT_SLACK
+            near_high, near_low = np.flatnonzero(reach > high), np.flatnonzero(reach > low)
+            normal = np.vstack([-slope[near_high], slope[near_low]])
+            room = np.maximum(np.concatenate([high[near_high], low[near_low]]), 0.0)
+            step = self._inner(rows, slopes, w, normal, room, radius)
+            there = w + step.reshape(w.shape)
+            true, is_within = self._limited_values(there)
+            if is_within:
+                return there - w
+            if not np.all(np.isfinite(true)):
+                break
+            shift = true - value - slope @ step
+        for share in (0.9, 0.7, 0.4, 0.2, 0.1):
+            part = share * step.reshape(w.shape)
+            if self._limited_values(w + part)[1]:
+                return part
+        return np.zeros_like(w)
+
+    def _inner(self, rows: Array, slopes: Array, w: Array, normal: Array, room: Array, radius: float) -> Array:
+        """Maximise the criterion of linear sensitivities over steps with normal @ step + room >= 0."""
+        # in parts of the radius, so that the first step of the inner search is neither tiny nor far
+        flat, normal = radius * slopes.reshape(len(slopes), -1), radius * normal
+
+        def cost(x: Array) -> tuple[float, Array]:
+            found, by_rows = self.criterion.value_and_gradient_by_sensitivities(rows + (x @ flat).reshape(rows.shape))
+            return -found, -(flat @ by_rows.ravel())
+
+        low = np.maximum(-1.0, np.minimum(self.lower - w.ravel(), 0.0) / radius)
+        high = np.minimum(1.0, np.maximum(self.upper - w.ravel(), 0.0) / radius)
+        constraints = [{"type": "ineq", "fun": lambda x: normal @ x + room, "jac": lambda x: normal}]
+        found = minimize(
+            cost, np.zeros(w.size), jac=True, method="SLSQP", bounds=list(zip(low, high, strict=True)),
+            constraints=constraints if len(room) else (), options={"maxiter": _MAX_INNER_ITERATIONS, "ftol": 1e-4},
+        )  # fmt: skip
+        step = radius * np.clip(found.x, low, high)
+        return step if np.all(np.isfinite(step)) else np.zeros_like(step)
