@@ -21,7 +21,6 @@ from yid_ocp.effects.base import EffectBase
 from yid_ocp.export.equations import _MAX_JACOBIAN_OPERATIONS
 from yid_ocp.files import file_sha256
 from yid_ocp.integrator.discrete import discrete_equations
-from yid_ocp.model.system import RecordingErrorEffect
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram
 from yid_ocp.workflow.build import build_system
 
@@ -179,7 +178,6 @@ def test_the_methods_of_an_effect_that_the_page_names_exist(page):
     for name, arguments, examples in rows:
         code = getattr(EffectBase, name).__code__
         assert list(code.co_varnames[1 : code.co_argcount]) == arguments.split(", ")
-        assert hasattr(RecordingErrorEffect, name)
         for kind in re.findall(r"`(\w+)`", examples):
             assert kind in EFFECTS
             assert getattr(EFFECTS[kind], name) is not getattr(EffectBase, name)

@@ -16,7 +16,6 @@ from yid_ocp.model import (
     Parameter,
     Parameters,
     Segment,
-    StepTerms,
     System,
     flexible_object,
     forward_kinematics,
@@ -102,29 +101,16 @@ def test_grasp_equations(kind, count):
     assert (np.max(np.abs(residual(bent))[3:], initial=0.0) > 1e-5) == (kind != "point")
 
 
-class Heavier:
+class Heavier(Effect):
     """An effect that doubles gravity at parameter one and adds nothing else."""
-
-    kind, location = "heavier", "world"
-
-    def __init__(self):
-        self.parameters = Parameters([Parameter("heavier@world.fraction", 0.0, "1")])
-        self.internal_coordinates = {}
 
     def apply_to_system(self, system):
         return replace(system, gravity=system.gravity * (1 + self.parameters.symbols[0]))
 
-    def step_terms(self, state):
-        return StepTerms()
-
-    def distorted_reading(self, channel, output, state):
-        return output
-
 
 def test_effects_are_appended(robot):
     plain = System.build(robot)
-    effect = Heavier()
-    assert isinstance(effect, Effect)
+    effect = Heavier("heavier", "world", Parameters([Parameter("heavier@world.fraction", 0.0, "1")]))
     system = plain.with_effects([effect])
     assert system.parameters.names == (*plain.parameters.names, "heavier@world.fraction")
     assert system.effects == (effect,)
@@ -133,7 +119,7 @@ def test_effects_are_appended(robot):
     double = system.parameters.vector({"heavier@world.fraction": 1.0})
     np.testing.assert_allclose(numbers(gravity(double)).ravel(), [0, 0, -2 * 9.81])
     with pytest.raises(ConfigError, match=r"heavier@world\.fraction"):
-        system.with_effects([Heavier()])
+        system.with_effects([effect])
 
 
 WRONG = {

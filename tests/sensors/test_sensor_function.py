@@ -1,7 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
@@ -14,7 +13,7 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
+from yid_ocp.model.system import Effect, NodeState, System
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.sensors import ChannelKind, EffortSensor, PointSensor, Sensor, sensor_reading_function
 from yid_ocp.solvers.symbolic_transcription import transcribe
@@ -22,22 +21,8 @@ from yid_ocp.solvers.symbolic_transcription import transcribe
 LABEL = "drift@left"
 
 
-@dataclass(frozen=True)
-class Drift:
+class Drift(Effect):
     """Adds gain (memory + effort of the first joint) to every reading: what depends on all that a sensor may see."""
-
-    kind: str = "drift"
-    location: str = "left"
-    parameters: Parameters = field(default_factory=lambda: Parameters([Parameter(f"{LABEL}.gain", 0.2, "1")]))
-    internal_coordinates: Mapping[str, ca.SX] = field(
-        default_factory=lambda: {f"{LABEL}.memory": ca.SX.sym(f"{LABEL}.memory")}
-    )
-
-    def apply_to_system(self, system: System) -> System:
-        return system
-
-    def step_terms(self, state: MidpointState) -> StepTerms:
-        return StepTerms()
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         memory = self.internal_coordinates[f"{LABEL}.memory"]
@@ -53,7 +38,9 @@ NAMES = ("T1.length", "drift@left.gain", "camera_scale@camera.scale", "effort_ga
 def whole(system: System) -> System:
     scale = make_effect("camera_scale", "camera", system, {"scale": 1.1})
     gain = make_effect("effort_gain", "left_b", system, {"scale": 0.8})
-    return system.with_effects([scale, gain, Drift()])
+    gains = Parameters([Parameter(f"{LABEL}.gain", 0.2, "1")])
+    drift = Drift("drift", "left", gains, {f"{LABEL}.memory": ca.SX.sym(f"{LABEL}.memory")})
+    return system.with_effects([scale, gain, drift])
 
 
 @pytest.mark.parametrize("sensor", [CAMERA, EFFORT], ids=["points", "effort"])

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import casadi as ca
 import pytest
@@ -10,7 +10,7 @@ from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.mechanism import Frame, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System, floating_clamp
+from yid_ocp.model.system import Effect, Grasp, MidpointState, StepTerms, System, floating_clamp
 from yid_ocp.virtual.mjcf import mujoco_xml
 
 
@@ -28,25 +28,14 @@ def test_mechanics_equals_the_symbolic_one(system: System, values: dict[str, flo
     assert_same_mechanics(system, values)
 
 
-@dataclass(frozen=True)
-class Pull:
-    kind: str = "pull"
-    location: str = "T1"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "parameters", Parameters([Parameter("pull@T1.force", 0.0, "N m")]))
-        object.__setattr__(self, "internal_coordinates", {})
-
-    def apply_to_system(self, system: System) -> System:
-        return system
-
+class Pull(Effect):
     def step_terms(self, state: MidpointState) -> StepTerms:
-        return StepTerms(generalized_force=self.parameters["pull@T1.force"].symbol * state.v)  # type: ignore[attr-defined]
+        return StepTerms(generalized_force=self.parameters["pull@T1.force"].symbol * state.v)
 
 
 def test_what_mujoco_cannot_express_is_refused() -> None:
     system = clamped_beam()
-    with_effect = system.with_effects([Pull()])  # type: ignore[list-item]
+    with_effect = system.with_effects([Pull("pull", "T1", Parameters([Parameter("pull@T1.force", 0.0, "N m")]))])
     assert mujoco_xml(with_effect) == mujoco_xml(system)
     with pytest.raises(ModelError, match="pull@T1"):
         mujoco_xml(with_effect, {"pull@T1.force": 1.0})

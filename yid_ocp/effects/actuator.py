@@ -81,13 +81,11 @@ class _DistortedReading(EffectBase):
         return channel == f"{self.quantity}.{self.location}"
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """The recorded value: the true one plus the error."""
         if not self._is_own(channel):
             return output
         return output + self._error(state.load[state.system.mechanism.joint_index(self.location)])
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """The true value: the recorded one less the error."""
         return reading - self._error(effort) if self._is_own(channel) else reading
 
 
@@ -142,7 +140,6 @@ class Backlash(_DistortedReading):
         return ("play",) if location in system.servos else ()
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The equation of the taken-up backlash and the servo torque change that it causes; nothing without a servo."""
         if not self.internal_coordinates:
             return StepTerms()
         [name] = self.internal_coordinates
@@ -163,13 +160,11 @@ class Backlash(_DistortedReading):
         return self["width"] / 2 * ca.tanh(effort / _PLAY_TORQUE)
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """The encoder's reading: the joint angle plus the taken-up backlash."""
         for name in self.internal_coordinates if self._is_own(channel) else ():
             return output + state.z[state.internal_rows[name]]
         return super().distorted_reading(channel, output, state)
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """The joint angle: the encoder's reading minus the taken-up backlash; unchanged for a joint with a servo."""
         # a servo's coordinate follows from the motion, and its command is of the motor's side
         return reading if self.internal_coordinates else super().corrected_reading(channel, reading, effort)
 
@@ -215,11 +210,9 @@ class EffortGain(_DistortedEffort):
         return {name: 1.0 if value < 0 else -1.0}
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """The recorded effort: the true effort times scale."""
         return output / self["inverse"] if self._is_own(channel) else output
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """The true effort: the recorded effort divided by scale."""
         return reading * self["inverse"] if self._is_own(channel) else reading
 
 
@@ -272,7 +265,6 @@ class EffortDelay(_LateTorque):
     )
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        """The delay for torques that drive the arm's joints, its negative for their measured efforts, else zero [s]."""
         return self._lateness(channel, self.arm_joints, self["delay"])
 
 
@@ -295,7 +287,6 @@ class EffortLag(_LateTorque):
         return (ParameterDefinition("time_constant", "s", 0.0, least, 0.5, (0.0, 0.05), text),)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
-        """The time constant for the joint's driving torque, its negative for its measured effort, else zero [s]."""
         return self._lateness(channel, (self.location,), self["time_constant"])
 
 
@@ -311,7 +302,6 @@ class _ServoChange(EffectBase):
         return {}
 
     def apply_to_system(self, system: System) -> System:
-        """The system with the changed servo."""
         servo = system.servos[self.location]
         return replace(system, servos={**system.servos, self.location: replace(servo, **self._changes(servo))})
 
@@ -372,7 +362,6 @@ class ServoDelay(_ServoChange):
     )
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        """The added delay for the joint's command, zero for other channels [s]."""
         return self["delay"] if channel == f"torque.{self.location}" else ca.SX(0)
 
 

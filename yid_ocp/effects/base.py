@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import casadi as ca
@@ -16,7 +16,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
-from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
+from yid_ocp.model.system import Effect, System
 from yid_ocp.registry import Registry
 
 EXCITATION_DESCRIPTIONS = (
@@ -92,14 +92,10 @@ class ReportedParameter:
 
 
 @dataclass(frozen=True)
-class EffectBase:
-    """The base of all effects, which changes nothing; a kind declares itself and overrides what it does."""
+class EffectBase(Effect):
+    """The base of all kinds of effects, which changes nothing; a kind declares itself and overrides what it does."""
 
-    kind: str
-    location: str
-    definitions: tuple[ParameterDefinition, ...]  # those of `parameters`, at this location
-    parameters: Parameters  # named `kind@location.parameter`
-    internal_coordinates: Mapping[str, ca.SX] = field(default_factory=dict)  # named `kind@location.joint`
+    definitions: tuple[ParameterDefinition, ...] = ()  # those of `parameters`, at this location
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
 
     equation: ClassVar[str] = ""  # that the kind adds, as text
@@ -186,30 +182,6 @@ class EffectBase:
         """The effect with prior ranges of its parameters for the largest joint angles by segment in the data [rad]."""
         return self
 
-    def apply_to_system(self, system: System) -> System:
-        """The system with the effect's changes of masses, lengths, springs, grasps, gravity or joints."""
-        return system
-
-    def step_terms(self, state: MidpointState) -> StepTerms:
-        """Energy, forces and internal equations that the effect adds to one step."""
-        return StepTerms()
-
-    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """What the sensor reads where it would read `output` without the effect."""
-        return output
-
-    def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
-        """The true value for a recorded reading that the effect distorts, at the true `effort`."""
-        return reading
-
-    def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        """How long before its recorded time a sample was true [s]; for a driving torque, how much later it acts."""
-        return ca.SX(0)
-
-    def channel_lag_time_constant(self, channel: str) -> ca.SX:
-        """Time constant with which a torque follows its command, or a recorded effort the true one [s]."""
-        return ca.SX(0)
-
 
 EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
@@ -239,7 +211,7 @@ def build_effect(kind: str, location: str, system: System, values: Mapping[str, 
     inner = (f"{label}.{name}" for name in cls.internal_coordinate_names(location, system))
     internal = {name: ca.SX.sym(name) for name in inner}
     joints = joint_names_by_arm(system).get(location, ())
-    return cls(kind, location, definitions, Parameters(entries), internal, joints)
+    return cls(kind, location, Parameters(entries), internal, definitions, joints)
 
 
 # -- where effects can sit --------------------------------------------------------------------------------------------

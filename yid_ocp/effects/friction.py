@@ -58,7 +58,6 @@ class _JointFriction(EffectBase):
         raise NotImplementedError
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The friction of the joint."""
         v = state.v[state.system.mechanism.joint_index(self.location)]
         return StepTerms(dissipative_force=generalized_force_at_joint(state.system, self.location, -self._friction(v)))
 
@@ -126,7 +125,6 @@ class JointLoadFriction(_JointFriction):
         return system.input_force(state.u, state.q, state.v)[index] - outside
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The friction of the joint."""
         load = self._load(state)
         size = ca.sqrt(load**2 + _SMOOTHING_TORQUE**2) - _SMOOTHING_TORQUE
         v = state.v[state.system.mechanism.joint_index(self.location)]
@@ -174,7 +172,6 @@ class JointPresliding(EffectBase):
         return dict.fromkeys(self.internal_coordinates, 1.0)
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The friction force and the update equation of s."""
         [name] = self.internal_coordinates
         row, index = state.internal_rows[name], state.system.mechanism.joint_index(self.location)
         s, rate, width = state.z[row], state.z_rate[row], self["yield_angle"]
@@ -211,6 +208,5 @@ class JointSpring(EffectBase):
     )
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The energy of the spring."""
         stretch = state.q[state.system.mechanism.joint_index(self.location)] - self["rest_angle"]
         return StepTerms(lagrangian=-self["stiffness"] / 2 * stretch**2)

@@ -39,7 +39,6 @@ class AerodynamicDrag(EffectBase):
     declared_parameters = (ParameterDefinition("cd", "1", 0.0, 0.0, 20.0, (0.0, 3.0), "drag coefficient"),)
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The drag force on the links with its derivatives in closed form."""
         system, kinematics = state.system, state.kinematics
         tree, segment = system.mechanism, system.segment_layout(self.location)
         velocity = _velocities(kinematics, state.v)
@@ -81,7 +80,6 @@ class GravityScale(EffectBase):
     )
 
     def apply_to_system(self, system: System) -> System:
-        """The system with a scaled weight of the object's bodies."""
 
         def scaled(body: Inertia) -> Inertia:
             nominal = 1 if body.gravity_fraction is None else body.gravity_fraction
@@ -102,7 +100,6 @@ class GravityTilt(EffectBase):
     )
 
     def apply_to_system(self, system: System) -> System:
-        """The system with the rotated gravity vector."""
         return replace(system, gravity=symbolic_rotation_from_rpy(self["rx"], self["ry"]) @ system.gravity)
 
 

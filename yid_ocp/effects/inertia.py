@@ -73,7 +73,6 @@ class _ScaledBodies(EffectBase):
         raise NotImplementedError
 
     def apply_to_system(self, system: System) -> System:
-        """The system with the scaled bodies."""
         return with_changed_joint_bodies(
             system, self._joints(system), lambda bodies: (b.scaled_by(self["scale"]) for b in bodies)
         )
@@ -140,7 +139,6 @@ class PointMass(EffectBase):
         return (ParameterDefinition("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass of the point"),)
 
     def apply_to_system(self, system: System) -> System:
-        """The system with the added point mass."""
         frame = system.mechanism.frame(self.location)
         point = Inertia(self["mass"], frame.placement.translation, ca.SX(ca.DM.zeros(3, 3)))
         joint = system.mechanism.joints[frame.joint_index].name
@@ -210,7 +208,6 @@ class Payload(EffectBase):
         return found
 
     def apply_to_system(self, system: System) -> System:
-        """The system with the payload's mass, first and second moments added to its link."""
         frame = system.mechanism.frame(self.location)
         joint, link = system.mechanism.joints[frame.joint_index], _carried_body(system, frame.joint_index)
         mass, centre = self["mass"], ca.SX(ca.DM(link.center_of_mass))
@@ -281,7 +278,6 @@ class LengthScale(EffectBase):
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.8, 1.2, (0.97, 1.03), "factor on link lengths"),)
 
     def apply_to_system(self, system: System) -> System:
-        """The system with scaled link lengths."""
         lengths = ca.vertcat(*(system.parameters[name].symbol for name in _length_names(system, self.location)))
         return system.map_expressions(lambda expression: ca.substitute(expression, lengths, lengths * self["scale"]))
 
@@ -298,6 +294,5 @@ class RotorInertia(EffectBase):
     )
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The kinetic energy of the rotor."""
         v = state.v[state.system.mechanism.joint_index(self.location)]
         return StepTerms(lagrangian=self["armature"] / 2 * v**2)

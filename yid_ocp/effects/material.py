@@ -66,7 +66,6 @@ class _SpringChange(_SegmentEffect):
         raise NotImplementedError
 
     def apply_to_system(self, system: System) -> System:
-        """The system with the segment's changed springs."""
         springs = (self._changed(s) if s.segment_name == self.location else s for s in system.elastic_joints)
         return replace(system, elastic_joints=tuple(springs))
 
@@ -80,7 +79,6 @@ class KelvinVoigt(_SegmentEffect):
     declared_parameters = (ParameterDefinition("tau", "s", 0.0, 0.0, 1.0, (0.005, 0.2), "damping over stiffness"),)
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The damping force -tau kappa v on the segment's elastic joints."""
         force = ca.SX(state.system.n_coordinates, 1)
         for spring, index in self._springs(state):
             force[index] = -self["tau"] * spring.stiffness * state.v[index]
@@ -103,7 +101,6 @@ class StandardLinearSolid(_SegmentMemory):
     )
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The energy of the additional springs and the relaxation equations of their internal coordinates."""
         energy, equations = ca.SX(0), {}
         for spring, index in self._springs(state):
             name = f"{self.label}.{spring.joint_name}"
@@ -142,7 +139,6 @@ class Hysteresis(_SegmentMemory):
     )
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The forces of the Dahl elements and the equations of their internal coordinates."""
         force, equations, start = ca.SX(state.system.n_coordinates, 1), {}, {}
         for spring, index in self._springs(state):
             name = f"{self.label}.{spring.joint_name}"
@@ -188,7 +184,6 @@ class CubicStiffness(_SegmentEffect):
         return replace(self, definitions=(replace(k3, prior_range=(factor * low, factor * high)),))
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The energy of the cubic springs."""
         return StepTerms(lagrangian=-self["k3"] / 4 * sum((state.q[i] ** 4 for _, i in self._springs(state)), ca.SX(0)))
 
 

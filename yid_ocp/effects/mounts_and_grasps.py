@@ -96,7 +96,6 @@ class MountCompliance(_JointInsertion):
     possible_locations = _root_joints_by_base
 
     def apply_to_system(self, system: System) -> System:
-        """The system with two compliant joints before the object's first link."""
         for number, first in enumerate(_root_joints_by_base(system)[self.location]):
             system = self._sprung(system, (first,), None, f"{self.label}_{number}" if number else self.label)
         return system
@@ -114,7 +113,6 @@ class JunctionCompliance(_JointInsertion):
     possible_locations = _branch_joints_by_junction
 
     def apply_to_system(self, system: System) -> System:
-        """The system with two compliant joints before the junction's branches."""
         at = system.mechanism.frame(self.location).placement if self.location.startswith("w_") else None
         return self._sprung(system, _branch_joints_by_junction(system)[self.location], at, self.label)
 
@@ -130,7 +128,6 @@ class _GraspChange(EffectBase):
         raise NotImplementedError
 
     def apply_to_system(self, system: System) -> System:
-        """The system with the changed grasp."""
         changed = (replace(g, **self._changes(g)) if g.name == self.location else g for g in system.grasps)
         return replace(system, grasps=tuple(changed))
 
@@ -193,7 +190,6 @@ class GraspSlip(_GraspChange):
         return {"axial_slip": grasp.axial_slip - self.internal_coordinates[f"{self.label}.offset"]}
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        """The creep equation of the slipped distance."""
         [name] = self.internal_coordinates
         row, grasps = state.internal_rows[name], state.system.grasps
         at = grasp_names(state.system).index(self.location)

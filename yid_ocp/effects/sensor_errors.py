@@ -42,7 +42,6 @@ class _CameraEffect(EffectBase):
         return point
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        """The seen point for a true one."""
         return output if state.camera_pose is None else self._seen(output, state.camera_pose, state)
 
 
@@ -113,7 +112,6 @@ class CameraLatency(_CameraEffect):
     )
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        """The delay for cameras, zero for other sensors [s]."""
         return self["delay"] if camera else ca.SX(0)
 
 
@@ -128,5 +126,4 @@ class ClockScale(EffectBase):
     declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.7, 1.4, (0.9, 1.1), "recorded over true time"),)
 
     def apply_to_system(self, system: System) -> System:
-        """The system with its time step divided by scale."""
         return replace(system, recorded_time_scale=system.recorded_time_scale / self["scale"])

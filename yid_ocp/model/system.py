@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, Protocol, TypedDict, runtime_checkable
+from typing import TYPE_CHECKING, Literal, TypedDict
 
 import casadi as ca
 import numpy as np
@@ -211,59 +211,47 @@ class StepTerms:
     force_with_derivatives: ForceWithDerivatives | None = None
 
 
-@runtime_checkable
-class Effect(Protocol):
-    """Interface of an unmodelled effect or another addition to the nominal model.
+@dataclass(frozen=True)
+class Effect:
+    """An unmodelled effect or another addition to the nominal model, which changes nothing by itself.
 
-    `apply_to_system` changes the description (masses, lengths, grasps, gravity, added joints); `step_terms` adds
-    energy, force, equations of internal coordinates. At neutral parameters both must leave the nominal model unchanged.
+    Whatever a subclass overrides must leave the nominal model unchanged at neutral parameters. Recorded torques drive
+    the model, recorded angles prescribe it or are followed: there the reading is known and the true value is sought by
+    `corrected_reading`, the opposite of `distorted_reading`.
     """
 
-    @property
-    def kind(self) -> str:
-        """Name under which the effect's class is registered."""
-
-    @property
-    def location(self) -> str:
-        """Name of the place where the effect acts."""
-
-    @property
-    def parameters(self) -> Parameters:
-        """The effect's parameters, named `kind@location.quantity`."""
-
-    @property
-    def internal_coordinates(self) -> Mapping[str, ca.SX]:
-        """The effect's internal coordinates (without momentum): name to the symbol that `apply_to_system` uses."""
+    kind: str  # under which its class is registered
+    location: str  # name of the place where it acts
+    parameters: Parameters  # named `kind@location.parameter`
+    # name to the symbol that `apply_to_system` uses, `kind@location.joint`; without momentum
+    internal_coordinates: Mapping[str, ca.SX] = field(default_factory=dict)
 
     def apply_to_system(self, system: System) -> System:
-        """The system with the effect's changes of masses, lengths, grasps, gravity or joints."""
+        """The system with the effect's changes of masses, lengths, springs, grasps, gravity or joints."""
+        return system
 
     def step_terms(self, state: MidpointState) -> StepTerms:
         """Energy, forces and internal equations that the effect adds to one step."""
+        return StepTerms()
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
         """What a sensor reads instead of `output`; `channel` is `group.point` or `joints.quantity.JOINT`."""
-
-
-@runtime_checkable
-class RecordingErrorEffect(Effect, Protocol):
-    """Interface of an effect on recorded inputs and times.
-
-    Recorded torques drive the model, recorded angles prescribe it or are followed: there the reading is known and the
-    true value is sought, the opposite of `distorted_reading`.
-    """
+        return output
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         """The true value for a recorded `joints.position.JOINT` or `joints.effort.JOINT`, at the true `effort`."""
+        return reading
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
         """How long before its recorded time a sample was true [s]; `channel` as in `distorted_reading`.
 
         A recorded torque that drives the model is `torque.JOINT`: it acts so much later than it was recorded.
         """
+        return ca.SX(0)
 
     def channel_lag_time_constant(self, channel: str) -> ca.SX:
         """Time constant of a `torque.JOINT` behind its record, or of `joints.effort.JOINT` behind the true one [s]."""
+        return ca.SX(0)
 
 
 class SystemOptions(TypedDict, total=False):

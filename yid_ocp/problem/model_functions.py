@@ -15,7 +15,7 @@ from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import DrivenJointMotion, EffectMomentumShift, driven_joints_only_step
-from yid_ocp.model.system import RecordingErrorEffect, System
+from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.initial_state_fit import InitialStateFitter
 from yid_ocp.sensors import Sensor, sensor_reading_function
@@ -153,7 +153,7 @@ class InputCorrections:
     def __init__(self, system: System, names: tuple[str, ...], use_compiler: bool) -> None:
         self.system = system
         self._names = names
-        self._effects = tuple(e for e in system.effects if isinstance(e, RecordingErrorEffect))
+        self._effects = system.effects
         self.joint_names = (*system.driven, *system.prescribed)
         count = len(self.joint_names)
         angle, effort = ca.SX.sym("angle", count), ca.SX.sym("effort", count)

@@ -23,7 +23,7 @@ from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Mechanism, Placement, merge_bodies
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD
-from yid_ocp.model.system import Effect, MidpointState, RecordingErrorEffect, System
+from yid_ocp.model.system import Effect, MidpointState, System
 
 MODEL_ASPECT_DESCRIPTIONS: Mapping[str, str] = {
     "stiffness": "stiffness of joints",
@@ -193,7 +193,7 @@ def _actuation(
     It is gain x recorded - offset, late by the delay [s] and with a first-order lag [s]; the last effect is the nearest
     to the reading.
     """
-    reading, known = ca.SX.sym("reading"), [e for e in effects if isinstance(e, RecordingErrorEffect)]
+    reading, known = ca.SX.sym("reading"), list(effects)
     true, servo = reading, system.servos.get(joint)
     channel = f"joints.{'effort' if servo is None else 'position'}.{joint}"
     for effect in reversed(known):
