@@ -10,7 +10,7 @@ import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.effects.base import arm_link_end_frame_names, arm_link_frame_names, effort_limit_over_baxter
-from yid_ocp.effects.inertia import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
+from yid_ocp.effects.bodies import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merge_bodies

@@ -40,7 +40,7 @@ def test_unequal_links():
         side = mass * (length**2 / 12 + 0.01**2 / 4)
         np.testing.assert_allclose(numbers(body.center_of_mass).ravel(), [0, 0, length / 2])
         np.testing.assert_allclose(numbers(body.inertia_about_com), np.diag([side, side, mass * 0.01**2 / 2]))
-    layout = item.segment_layout("C")
+    [layout] = item.segment_layouts
     parameters = item.mechanism.parameters
     np.testing.assert_allclose([numbers(x, parameters).item() for x in layout.link_lengths], lengths)
     assert layout.link_joints == tuple(tuple(f"C_{i}_{axis}" for axis in "xyz") for i in range(3))
@@ -95,7 +95,7 @@ def test_a_flat_beam_that_bends_one_way():
     x, y, z = 0.001**2 / 12, 0.08**2 / 12, 0.2**2 / 12
     for joint in item.mechanism.with_numeric_values().joints:
         np.testing.assert_allclose(numbers(joint.bodies[0].inertia_about_com), 0.1 * np.diag([y + z, x + z, x + y]))
-    layout = item.segment_layout("B")
+    [layout] = item.segment_layouts
     assert numbers(layout.radius, item.mechanism.parameters).item() == pytest.approx(math.hypot(0.001, 0.08) / 2)
 
 

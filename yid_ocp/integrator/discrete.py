@@ -30,7 +30,6 @@ from yid_ocp.errors import ModelError
 from yid_ocp.model.kinematics import (
     Kinematics,
     RigidBodyLagrangianDerivatives,
-    cross_product,
     forward_kinematics,
     lagrangian_second_derivatives,
     rigid_body_lagrangian_derivatives,
@@ -368,7 +367,7 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
             for above, i in enumerate(chain):
                 if not turning[i]:
                     continue
-                turned = cross_product(part[:3], kinematics.joint_screws[i][:3])
+                turned = ca.cross(part[:3], kinematics.joint_screws[i][:3])
                 for j in chain[above:]:
                     add(i, j, sign * ca.dot(jacobian[:, j], turned))
         blocks.append(block)
@@ -376,14 +375,14 @@ def _constraint_derivatives(system: System, kinematics: Kinematics, q: ca.SX, la
         if not rows:
             continue
         relative = kinematics.angular_jacobian(holder) - kinematics.angular_jacobian(held)
-        blocks += [sum((cross_product(a, b).T @ relative for a, b in pairs), ca.SX(1, n)) for pairs in rows]
+        blocks += [sum((ca.cross(a, b).T @ relative for a, b in pairs), ca.SX(1, n)) for pairs in rows]
         for a, b in [(part[3 + k] * a, b) for k, pairs in enumerate(rows) for a, b in pairs]:
             turns: list[dict[int, ca.SX]] = []
             for frame, vector, other in ((holder, a, b), (held, b, a)):
                 chain = tuple(j for j in system.mechanism.ancestor_joint_indices(frame.joint_index) if turning[j])
-                turns.append({j: cross_product(kinematics.joint_screws[j][:3], vector) for j in chain})
+                turns.append({j: ca.cross(kinematics.joint_screws[j][:3], vector) for j in chain})
                 for above, i in enumerate(chain):
-                    turned = cross_product(other, kinematics.joint_screws[i][:3])
+                    turned = ca.cross(other, kinematics.joint_screws[i][:3])
                     for j in chain[above:]:
                         add(i, j, ca.dot(turns[-1][j], turned))
             for i, by_i in turns[0].items():

@@ -97,16 +97,13 @@ class ElasticJoint:
 
 @dataclass(frozen=True)
 class SegmentLayout:
-    """A segment's joint names link by link, link lengths [m], radius [m] and mass [kg] in the mechanism.
-
-    The radius of a rectangular section is half its diagonal.
-    """
+    """Where a segment is in the mechanism."""
 
     name: str
-    link_joints: tuple[tuple[str, ...], ...]
-    link_lengths: tuple[ca.SX, ...]
-    radius: ca.SX
-    mass: ca.SX
+    link_joints: tuple[tuple[str, ...], ...]  # names, link by link
+    link_lengths: tuple[ca.SX, ...]  # [m]
+    radius: ca.SX  # half the diagonal of a rectangular section [m]
+    mass: ca.SX  # [kg]
     parent_segment: str | None
 
 
@@ -127,18 +124,6 @@ class FlexibleObject(ReprMixin):
         return ReprSummary(
             f"{names}, {count_with_noun(len(tree.joints), 'joint')}", tree.parameters._summary().table_rows
         )
-
-    def segment_layout(self, name: str) -> SegmentLayout:
-        """Layout of a segment by name; `ModelError` where there is none."""
-        return find_segment_layout(self.segment_layouts, name)
-
-
-def find_segment_layout(layouts: Sequence[SegmentLayout], name: str) -> SegmentLayout:
-    """Layout of a segment by name; `ModelError` with the nearest name where there is none."""
-    found = {layout.name: layout for layout in layouts}
-    if name not in found:
-        raise ModelError(f"there is no segment '{name}'", hint=nearest_name_hint(name, found))
-    return found[name]
 
 
 def flexible_object(
@@ -217,10 +202,8 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
         share = mass * shares[i]
         body = Inertia(share, along / 2, ca.diag(squares) * share, gravity_fraction)
         turn = np.eye(3) if rotation is None else snap_near_integer_entries(np.asarray(rotation, float))
-        parent, placement = (
-            carrier.joint_index,
-            carrier.placement @ Placement(ca.SX(ca.DM(turn)), ca.SX(ca.DM.zeros(3))),
-        )
+        turned = Placement(ca.SX(ca.DM(turn)), ca.SX(ca.DM.zeros(3)))
+        parent, placement = carrier.joint_index, carrier.placement @ turned
         # rigidities are converted to stiffnesses
         factor = ca.SX(1)
         if segment.stiffness_per_curvature:
@@ -246,19 +229,9 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
 def parallel_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
     """Twist-free rotation of each edge's frame against that of the edge before, a list of one (3, 3) per edge.
 
-    They are what `Segment.rest_rotation` and `Segment.link_rest_rotations` take.
-
-    Parameters
-    ----------
-    vertices : array_like, shape (k, 3)
-        Undeformed centre line [m].
-    initial_frame : array_like, shape (3, 3), optional
-        Frame before the first edge, whose z axis is the direction it continues; the world's when absent.
-
-    Raises
-    ------
-    ModelError
-        Fewer than two vertices, not three coordinates each, or two that coincide.
+    They are what `Segment.rest_rotation` and `Segment.link_rest_rotations` take. `vertices`, shape (k, 3), are the
+    undeformed centre line [m]; `initial_frame`, shape (3, 3), is the frame before the first edge, whose z axis is the
+    direction it continues, the world's when absent. `ModelError` of vertices that are no such line.
     """
     points = np.asarray(vertices, float)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
@@ -270,17 +243,14 @@ def parallel_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike |
     rotations = []
     for edge in edges:
         local = frame.T @ (edge / np.linalg.norm(edge))
-        rotations.append(_shortest_turn(local))
+        axis, cosine = np.cross([0.0, 0.0, 1.0], local), float(local[2])
+        sine = float(np.linalg.norm(axis))
+        if sine < 1e-12:
+            rotations.append(np.diag([1.0, math.copysign(1.0, cosine), math.copysign(1.0, cosine)]))
+        else:
+            rotations.append(rotation_from_axis_sin_cos(axis / sine, sine, cosine))
         frame = frame @ rotations[-1]
     return rotations
-
-
-def _shortest_turn(direction: Array) -> Array:
-    axis = np.cross([0.0, 0.0, 1.0], direction)
-    sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
-    if sine < 1e-12:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    return rotation_from_axis_sin_cos(axis / sine, sine, cosine)
 
 
 def _length_shares(segment: Segment) -> tuple[float, ...]:

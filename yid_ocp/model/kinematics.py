@@ -18,31 +18,18 @@ from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Joint poses and screws of a mechanism at a configuration.
-
-    Attributes
-    ----------
-    joint_rotations : tuple of casadi.SX, each (3, 3)
-        Of each joint's moving frame, to the world.
-    joint_origins : tuple of casadi.SX, each (3, 1)
-        [m]
-    joint_screws : tuple of casadi.SX, each (6, 1)
-        S_j, the spatial velocity per unit rate of joint j.
-    """
+    """Joint poses and screws of a mechanism at a configuration."""
 
     mechanism: Mechanism
-    joint_rotations: tuple[ca.SX, ...]
-    joint_origins: tuple[ca.SX, ...]
-    joint_screws: tuple[ca.SX, ...]
+    joint_rotations: tuple[ca.SX, ...]  # of each joint's moving frame, to the world, each (3, 3)
+    joint_origins: tuple[ca.SX, ...]  # each (3, 1) [m]
+    joint_screws: tuple[ca.SX, ...]  # S_j, the spatial velocity per unit rate of joint j, each (6, 1)
 
     def frame_pose(self, frame: str | Frame) -> Placement:
         """Pose of a frame in the world."""
         entry = self._frame(frame)
-        if entry.joint_index < 0:
-            return entry.placement
-        return (
-            Placement(self.joint_rotations[entry.joint_index], self.joint_origins[entry.joint_index]) @ entry.placement
-        )
+        j, local = entry.joint_index, entry.placement
+        return local if j < 0 else Placement(self.joint_rotations[j], self.joint_origins[j]) @ local
 
     def frame_position(self, frame: str | Frame) -> ca.SX:
         """Position of a frame's origin in the world, shape (3, 1) [m]."""
@@ -51,7 +38,7 @@ class Kinematics:
     def position_jacobian(self, frame: str | Frame) -> ca.SX:
         """Derivative of a frame's position by the configuration, shape (3, n)."""
         point = self.frame_position(frame)
-        return self._columns(frame, lambda screw: screw[3:] + cross_product(screw[:3], point))
+        return self._columns(frame, lambda screw: screw[3:] + ca.cross(screw[:3], point))
 
     def angular_jacobian(self, frame: str | Frame) -> ca.SX:
         """Angular velocity of a frame per configuration rate, in the world, shape (3, n)."""
@@ -80,39 +67,27 @@ class RigidBodyLagrangianDerivatives:
 
         L_vv[i, j] = S_i . F_j              L_qv[j, i] = S_i . B_j   (row: q_j, column: v_i)
         L_qq[i, j] = D_i . B_j + w_i . G_j  L_qv[i, j] = D_i . F_j
-
-    Attributes
-    ----------
-    lagrangian_by_q, lagrangian_by_v : casadi.SX, shape (n, 1)
-    kinetic_energy, potential_energy : casadi.SX
-        [J]
-    S, D, F, B, G : casadi.SX, shape (6, n), G (3, n)
     """
 
-    lagrangian_by_q: ca.SX
-    lagrangian_by_v: ca.SX
-    kinetic_energy: ca.SX
-    potential_energy: ca.SX
-    S: ca.SX
+    lagrangian_by_q: ca.SX  # shape (n, 1)
+    lagrangian_by_v: ca.SX  # shape (n, 1)
+    kinetic_energy: ca.SX  # [J]
+    potential_energy: ca.SX  # [J]
+    S: ca.SX  # these four of shape (6, n)
     D: ca.SX
     F: ca.SX
     B: ca.SX
-    G: ca.SX
-
-
-def cross_product(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Cross product of two (3, 1) expressions."""
-    return ca.cross(a, b)
+    G: ca.SX  # shape (3, n)
 
 
 def motion_cross_motion_product(a: ca.SX, b: ca.SX) -> ca.SX:
     """Spatial cross product a x b of two motions (twists), shape (6, 1)."""
-    return ca.vertcat(cross_product(a[:3], b[:3]), cross_product(a[:3], b[3:]) + cross_product(a[3:], b[:3]))
+    return ca.vertcat(ca.cross(a[:3], b[:3]), ca.cross(a[:3], b[3:]) + ca.cross(a[3:], b[:3]))
 
 
 def motion_cross_force_product(a: ca.SX, f: ca.SX) -> ca.SX:
     """Spatial cross product a x* f of a motion and a wrench, shape (6, 1)."""
-    return ca.vertcat(cross_product(a[:3], f[:3]) + cross_product(a[3:], f[3:]), cross_product(a[:3], f[3:]))
+    return ca.vertcat(ca.cross(a[:3], f[:3]) + ca.cross(a[3:], f[3:]), ca.cross(a[:3], f[3:]))
 
 
 def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
@@ -128,7 +103,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
         axis = rotation @ ca.SX(ca.DM(joint.axis))
         if joint.kind == "revolute":
             rotations.append(rotation @ symbolic_rotation_from_axis_angle(joint.axis, q[j]))
-            screws.append(ca.vertcat(axis, cross_product(origin, axis)))
+            screws.append(ca.vertcat(axis, ca.cross(origin, axis)))
         else:
             origin = origin + axis * q[j]
             rotations.append(rotation)
@@ -140,10 +115,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 def rigid_body_lagrangian_derivatives(
     kinematics: Kinematics, v: ca.SX, gravity: ca.SX
 ) -> RigidBodyLagrangianDerivatives:
-    """Energies and first derivatives of the Lagrangian of a mechanism's bodies.
-
-    `v` is the velocity, shape (n, 1) [rad/s or m/s], `gravity` that of the world frame, shape (3, 1) [m/s^2].
-    """
+    """Energies and first derivatives of the Lagrangian of a mechanism's bodies at a velocity (n, 1), gravity (3, 1)."""
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
     D: list[ca.SX] = []
@@ -154,38 +126,29 @@ def rigid_body_lagrangian_derivatives(
     moved, kinetic, potential = _moved(kinematics, velocity, gravity)
     by_q, by_v, F, B, G = [], [], [], [], []
     for j, part in enumerate(moved):
-        moment, weight = cross_product(part.heavy_first, gravity), part.heavy * gravity
+        moment, weight = ca.cross(part.heavy_first, gravity), part.heavy * gravity
         axis, linear = S[j][:3], S[j][3:]
         by_v.append(ca.dot(S[j], part.momentum))
         by_q.append(ca.dot(D[j], part.momentum) + ca.dot(axis, moment) + ca.dot(linear, weight))
         F.append(part.inertia_times(S[j]))
         B.append(part.inertia_times(D[j]) + motion_cross_force_product(S[j], part.momentum))
-        G.append(
-            cross_product(axis, moment)
-            + cross_product(linear, weight)
-            + cross_product(part.heavy_first, cross_product(gravity, axis))
-        )
-
-    def columns(entries: Sequence[ca.SX], rows: int) -> ca.SX:
-        return ca.densify(ca.horzcat(ca.SX(rows, 0), *entries))
-
+        tilted = ca.cross(part.heavy_first, ca.cross(gravity, axis))
+        G.append(ca.cross(axis, moment) + ca.cross(linear, weight) + tilted)
     gradients = [ca.densify(ca.vertcat(ca.SX(0, 1), *entries)) for entries in (by_q, by_v)]
-    vectors = [columns(entries, rows) for entries, rows in ((S, 6), (D, 6), (F, 6), (B, 6), (G, 3))]
+    columns = ((S, 6), (D, 6), (F, 6), (B, 6), (G, 3))
+    vectors = [ca.densify(ca.horzcat(ca.SX(rows, 0), *entries)) for entries, rows in columns]
     return RigidBodyLagrangianDerivatives(*[*gradients, kinetic, potential, *vectors])
 
 
 @dataclass
 class _Moved:
-    """Mass moments about the world origin and momentum of all bodies that a joint moves.
-
-    `heavy` and `heavy_first` are mass and first moment as gravity pulls at them.
-    """
+    """Mass moments about the world origin and momentum of all bodies that a joint moves."""
 
     mass: ca.SX = field(default_factory=lambda: ca.SX(0))
     first: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
     second: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3, 3)))
     momentum: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(6)))
-    heavy: ca.SX = field(default_factory=lambda: ca.SX(0))
+    heavy: ca.SX = field(default_factory=lambda: ca.SX(0))  # this and the next as gravity pulls at them
     heavy_first: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
 
     def add(self, other: _Moved) -> None:
@@ -193,8 +156,8 @@ class _Moved:
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
     def inertia_times(self, motion: ca.SX) -> ca.SX:
-        force = self.mass * motion[3:] + cross_product(motion[:3], self.first)
-        return ca.vertcat(self.second @ motion[:3] + cross_product(self.first, motion[3:]), force)
+        force = self.mass * motion[3:] + ca.cross(motion[:3], self.first)
+        return ca.vertcat(self.second @ motion[:3] + ca.cross(self.first, motion[3:]), force)
 
 
 def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) -> tuple[list[_Moved], ca.SX, ca.SX]:
@@ -208,14 +171,14 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
         for body in joint.bodies:
             com = kinematics.joint_rotations[j] @ body.center_of_mass + kinematics.joint_origins[j]
             about_com = _rotated_tensor(body, kinematics.joint_rotations[j])
-            angular, linear = velocity[j][:3], velocity[j][3:] + cross_product(velocity[j][:3], com)
+            angular, linear = velocity[j][:3], velocity[j][3:] + ca.cross(velocity[j][:3], com)
             impulse = body.mass * linear
             spin = about_com @ angular
             kinetic += 0.5 * (ca.dot(impulse, linear) + ca.dot(spin, angular))
             heavy = body.mass if body.gravity_fraction is None else body.mass * body.gravity_fraction
             potential -= heavy * ca.dot(gravity, com)
             second = about_com + body.mass * (ca.dot(com, com) * ca.SX.eye(3) - com @ com.T)
-            momentum = ca.vertcat(spin + cross_product(com, impulse), impulse)
+            momentum = ca.vertcat(spin + ca.cross(com, impulse), impulse)
             moved[j].add(_Moved(body.mass, body.mass * com, second, momentum, heavy, heavy * com))
     for j in reversed(range(len(joints))):
         if joints[j].parent_index >= 0:

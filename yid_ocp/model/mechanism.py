@@ -58,11 +58,11 @@ class Inertia:
 
     @staticmethod
     def from_values(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
-        """Inertia from a numeric mass [kg], centre of mass [m] and inertia about it [kg m^2]."""
+        """Inertia from numbers."""
         return Inertia(ca.SX(mass), ca.SX(ca.DM(np.asarray(com, float))), ca.SX(ca.DM(np.asarray(about_com, float))))
 
     def scaled_by(self, factor: ca.SX) -> Inertia:
-        """The inertia with mass and tensor multiplied by `factor`; the centre of mass is unchanged."""
+        """The inertia with mass and tensor multiplied by `factor`."""
         return replace(self, mass=self.mass * factor, inertia_about_com=self.inertia_about_com * factor)
 
     def transformed_by(self, placement: Placement) -> Inertia:
@@ -74,32 +74,18 @@ class Inertia:
 
 @dataclass(frozen=True)
 class Joint:
-    """One degree of freedom and the bodies on its moving side.
-
-    Attributes
-    ----------
-    parent_index : int
-        Index of the parent joint, -1 for the world.
-    placement : Placement
-        From the parent's joint frame to this joint's frame at zero.
-    axis : tuple of float
-        Unit vector in the joint frame.
-    bodies : tuple of Inertia
-        Everything rigidly attached to the moving side.
-    lower_limit, upper_limit, effort_limit, velocity_limit : float
-        [rad or m], [N m or N], [rad/s or m/s]
-    """
+    """One degree of freedom and the bodies that are rigidly attached to its moving side."""
 
     name: str
     kind: Literal["revolute", "prismatic"]
-    parent_index: int
-    placement: Placement
-    axis: tuple[float, float, float]
+    parent_index: int  # of the parent joint, -1 for the world
+    placement: Placement  # from the parent's joint frame to this joint's frame at zero
+    axis: tuple[float, float, float]  # unit vector in the joint frame
     bodies: tuple[Inertia, ...] = ()
-    lower_limit: float = -math.inf
+    lower_limit: float = -math.inf  # [rad or m]
     upper_limit: float = math.inf
-    effort_limit: float = math.inf
-    velocity_limit: float = math.inf
+    effort_limit: float = math.inf  # [N m or N]
+    velocity_limit: float = math.inf  # [rad/s or m/s]
 
     @property
     def coordinate_unit(self) -> str:
@@ -117,18 +103,10 @@ class Frame:
 
 @dataclass(frozen=True)
 class LinkChain:
-    """A chain of straight links along which points are located by arc length.
+    """A chain of straight links along which points are located by arc length."""
 
-    Attributes
-    ----------
-    tip_frames : tuple of str
-        Frame at the far end of every link, base to tip; its translation is the link, whose base is the joint's origin.
-    length_fractions : tuple of float
-        Part of the nominal arc length that each link has; they sum to one.
-    """
-
-    tip_frames: tuple[str, ...]
-    length_fractions: tuple[float, ...]
+    tip_frames: tuple[str, ...]  # at the far end of every link, which is its translation, base to tip
+    length_fractions: tuple[float, ...]  # part of the nominal arc length that each link has; they sum to one
 
     def _locate(self, length_fraction: float) -> tuple[str, float]:
         """Tip frame of the link that contains a fraction of the arc length (0 to 1), and the fraction of that link."""
@@ -145,12 +123,7 @@ class LinkChain:
 class Mechanism(ReprMixin):
     """A tree of joints, parents before children.
 
-    Attributes
-    ----------
-    parameters : Parameters
-        Those on which placements and inertias depend.
-    link_chains : mapping of str to LinkChain
-        Along which `NAME:40%` names a point by arc length.
+    Placements and inertias depend on its `parameters`; along its `link_chains` `NAME:40%` names a point by arc length.
     """
 
     name: str
@@ -187,10 +160,9 @@ class Mechanism(ReprMixin):
         return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)
 
     def frame(self, name: str) -> Frame:
-        """A frame by name, or a point of a line by its arc length from the base, such as `T1:40%`.
+        """A frame by name, or a point of a line by its nominal arc length from the base, such as `T1:40%`.
 
-        Such a point lies on the straight link that reaches there and turns with it, so that it stays where it is on the
-        object however many links that has; where links have length parameters of their own, by their nominal lengths.
+        Such a point lies on the straight link that reaches there and turns with it, however many links there are.
         `ModelError` where there is no such frame (with the nearest name) or no percentage from 0 to 100.
         """
         if name in self.frames:
@@ -214,10 +186,7 @@ class Mechanism(ReprMixin):
     def with_attached_mechanism(
         self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None
     ) -> Mechanism:
-        """This mechanism with another one, of other joint and frame names, attached to one of its frames.
-
-        `frame` is where its root goes (the world when absent), `placement` the root's pose in it, shape (4, 4).
-        """
+        """This mechanism with another one, its root at a pose (4, 4) in a frame of this one (the world when absent)."""
         root = Placement.identity() if placement is None else Placement.from_matrix(placement)
         at = -1
         if frame is not None:
@@ -269,9 +238,8 @@ class Mechanism(ReprMixin):
             return joint + count if joint >= index else joint
 
         joints = [replace(joint, parent_index=moved(joint.parent_index)) for joint in self.joints]
-        joints[index:index] = [
-            joint if i == 0 else replace(joint, parent_index=index + i - 1) for i, joint in enumerate(chain)
-        ]
+        later = [replace(joint, parent_index=i) for i, joint in enumerate(chain[1:], index)]
+        joints[index:index] = [*chain[:1], *later]
         frames = {name: Frame(moved(frame.joint_index), frame.placement) for name, frame in self.frames.items()}
         return replace(self, joints=tuple(joints), frames=frames)
 

@@ -17,25 +17,15 @@ from yid_ocp.errors import ConfigError, nearest_name_hint
 
 @dataclass(frozen=True)
 class Parameter:
-    """One physical number of the model.
+    """One physical number of the model: nominal value and physical bounds, in the SI `unit`."""
 
-    Attributes
-    ----------
-    name : str
-        `owner.quantity`, for example `T1.bend`; for an effect `kind@location.quantity`.
-    value, lower, upper : float
-        Nominal value and physical bounds, in the SI `unit` (`1` for a pure number).
-    symbol : casadi.SX
-        The scalar that stands for it in symbolic expressions.
-    """
-
-    name: str
+    name: str  # `owner.quantity`, for example `T1.bend`; for an effect `kind@location.quantity`
     value: float
-    unit: str
+    unit: str  # `1` for a pure number
     lower: float = -math.inf
     upper: float = math.inf
     description: str = ""
-    symbol: ca.SX = field(default_factory=ca.SX, compare=False, repr=False)
+    symbol: ca.SX = field(default_factory=ca.SX, compare=False, repr=False)  # its scalar in expressions
 
     def __post_init__(self) -> None:
         if self.symbol.is_empty():
@@ -97,10 +87,7 @@ class Parameters(ReprMixin):
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> Array:
-        """The vector theta of nominal values, some of them replaced, shape (ntheta,).
-
-        `ConfigError` for an unknown name or a value that is not finite.
-        """
+        """Theta, shape (ntheta,), some nominal values replaced; `ConfigError` of an unknown name or no finite value."""
         theta = np.array([entry.value for entry in self._entries], dtype=float)
         for name, value in (values or {}).items():
             if not math.isfinite(value):

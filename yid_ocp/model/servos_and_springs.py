@@ -35,42 +35,20 @@ MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]
 
 @dataclass(frozen=True)
 class MotorFrictionData:
-    """Constants that were identified together with one friction law; those of another law do not go with them.
+    """Constants at the output shaft, identified with one friction law; those of another do not go with them."""
 
-    Attributes
-    ----------
-    torque_constant, resistance : float
-        kt [N m/A] and R [ohm] at the output shaft.
-    coulomb, viscous : float
-        [N m] and [N m s/rad]
-    load_share, stribeck, stribeck_speed : float
-        Friction per torque through the gear, friction at low speed [N m], and the speed beyond which it is gone
-        [rad/s]; zero where the law has none.
-    """
-
-    torque_constant: float
-    resistance: float
-    coulomb: float
-    viscous: float
-    load_share: float = 0.0
-    stribeck: float = 0.0
-    stribeck_speed: float = 0.0
+    torque_constant: float  # kt [N m/A]
+    resistance: float  # R [ohm]
+    coulomb: float  # [N m]
+    viscous: float  # [N m s/rad]
+    load_share: float = 0.0  # friction per torque through the gear; zero, as the next two, where the law has none
+    stribeck: float = 0.0  # friction at low speed [N m]
+    stribeck_speed: float = 0.0  # beyond which that is gone [rad/s]
 
 
 @dataclass(frozen=True)
 class DcMotorData:
     """Published figures of a geared direct-current servo, starting values of what is estimated.
-
-    Attributes
-    ----------
-    supply_voltage : float
-        [V]
-    duty_per_gain : float
-        Duty per unit of the firmware's proportional gain and per error of the angle [1/rad].
-    duty_limit, armature : float
-        Largest duty [-]; inertia of rotor and gear at the output shaft [kg m^2].
-    plain, load_dependent : MotorFrictionData
-        With Coulomb and viscous friction; with friction that grows with the load, None where nobody published it.
 
     References
     ----------
@@ -78,12 +56,12 @@ class DcMotorData:
     and the figures published with it (Rhoban/bam, Apache-2.0).
     """
 
-    supply_voltage: float
-    duty_per_gain: float
-    duty_limit: float
-    armature: float
-    plain: MotorFrictionData
-    load_dependent: MotorFrictionData | None = None
+    supply_voltage: float  # [V]
+    duty_per_gain: float  # duty per unit of the firmware's proportional gain and per error of the angle [1/rad]
+    duty_limit: float  # largest duty [-]
+    armature: float  # inertia of rotor and gear at the output shaft [kg m^2]
+    plain: MotorFrictionData  # with Coulomb and viscous friction
+    load_dependent: MotorFrictionData | None = None  # with friction that grows with the load, where published
 
     def servo_values(self, constants: MotorFrictionData) -> dict[str, float]:
         """Values of a servo's parameters by name: torque = kt/R (duty V - kt speed) [N m/rad, N m s/rad, N m]."""
@@ -189,17 +167,12 @@ class PositionServo:
     with clip(x) = x / (1 + tightness x^p)^(1/p), p = `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, to which
     further limits add. Of a direct-current motor the limit is that of its duty, and the damping is its counter-voltage
     (torque = kt/R (duty V - kt dq/dt)). At `MOTOR_OFF_COMMAND` there is no torque at all.
-
-    Attributes
-    ----------
-    gain, damping, command_delay, torque_limit_tightness : casadi.SX
-        [N m/rad or N/m], [N m s/rad or N s/m], [s], [(N m)^-p]; gain includes the firmware's where that is known.
     """
 
-    gain: ca.SX
-    damping: ca.SX
-    command_delay: ca.SX
-    torque_limit_tightness: ca.SX
+    gain: ca.SX  # includes the firmware's where that is known [N m/rad or N/m]
+    damping: ca.SX  # [N m s/rad or N s/m]
+    command_delay: ca.SX  # [s]
+    torque_limit_tightness: ca.SX  # [(N m)^-p]
     command_interpolation: CommandInterpolation = "held"
     motor_kind: MotorKind = "ideal"
 
@@ -228,10 +201,8 @@ def joint_damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> di
     """Parameters `JOINT.damping` of the named joints, by joint."""
     for joint in wanted:
         tree.joint_index(joint)
-    return {
-        joint: Parameter(f"{joint}.damping", value, "N m s/rad", 0.0, math.inf, f"viscous damping of {joint}")
-        for joint, value in wanted.items()
-    }
+    per, text = "N m s/rad", "viscous damping of"
+    return {n: Parameter(f"{n}.damping", value, per, 0.0, math.inf, f"{text} {n}") for n, value in wanted.items()}
 
 
 def joint_spring_parameters(tree: Mechanism, joint: str, spring: RobotJointSpring) -> tuple[Parameter, Parameter]:
@@ -249,8 +220,8 @@ def build_joint_servos(
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
     """A servo on every named joint, and their parameters `JOINT.servo_gain`, `servo_damping`, ...
 
-    Values are those of a servo that gives its joint's effort limit at an error of `_DEFAULT_FULL_TORQUE_ERROR`. Of a
-    direct-current motor `JOINT.servo_gain_factor` multiplies the gain: the firmware's, which recordings may state.
+    They give the joint's effort limit at an error of `_DEFAULT_FULL_TORQUE_ERROR`. Of a direct-current motor
+    `JOINT.servo_gain_factor` multiplies the gain: the firmware's, which recordings may state.
     """
     servos, entries = {}, []
     for joint in joints:

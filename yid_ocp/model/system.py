@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
-from yid_ocp.errors import ModelError
-from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout, find_segment_layout
+from yid_ocp.errors import ModelError, nearest_name_hint
+from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, map_expressions
 from yid_ocp.model.parameters import Parameters
@@ -31,12 +31,11 @@ if TYPE_CHECKING:
     from typing import Unpack  # Python 3.11
 
 _GraspKind = Literal["point", "axis", "weld"]
-_GRASP_EQUATION_NAMES: dict[str, tuple[str, ...]] = {
+_GRASP_EQUATION_NAMES = {
     "point": ("x", "y", "z"),
     "axis": ("x", "y", "z", "tilt_x", "tilt_y"),
     "weld": ("x", "y", "z", "turn_x", "turn_y", "turn_z"),
 }
-"""Names of a grasp's constraint equations, by its kind."""
 
 
 @dataclass(frozen=True)
@@ -92,10 +91,7 @@ class Grasp:
         return ca.vertcat(*rows)
 
     def aligned_axis_differences(self, kinematics: Kinematics) -> ca.SX:
-        """Differences between the axes that the grasp aligns, shape (0, 3 or 9; 1).
-
-        Beside `constraint_residual` redundant, but not zero where axes are opposite: for a search that starts far off.
-        """
+        """Differences between aligned axes, shape (0, 3 or 9; 1): not zero where axes are opposite, for a far start."""
         if self.kind == "point":
             return ca.SX(0, 1)
         holder, held = (kinematics.frame_pose(name).rotation for name in (self.holder_frame, self.held_frame))
@@ -107,68 +103,41 @@ class Grasp:
 class MidpointState:
     """Symbols of one step's midpoint, on which energies and forces may depend.
 
-    Attributes
-    ----------
-    q, v : casadi.SX, shape (n, 1)
-        (q_k + q_{k+1})/2, where `kinematics` is, and (q_{k+1} - q_k)/h.
-    z, z_rate : casadi.SX, shape (nz, 1)
-        The same of all internal coordinates; `internal_rows` has the row of each by name.
-    u : casadi.SX, shape (nu, 1)
-        Motor torques held over the step [N m], or what servos are commanded [rad or m].
-    constraint_force : casadi.SX, shape (m, 1)
-        lam_k / h [N or N m].
-    h : casadi.SX
-        Length of the step [s].
+    q, v and z, z_rate are the mean and the difference over h of coordinates and internal coordinates at both nodes.
     """
 
     system: System
-    kinematics: Kinematics
-    q: ca.SX
-    v: ca.SX
-    z: ca.SX
-    z_rate: ca.SX
-    u: ca.SX
-    constraint_force: ca.SX
-    internal_rows: Mapping[str, int]
-    h: ca.SX
+    kinematics: Kinematics  # at q
+    q: ca.SX  # (q_k + q_{k+1})/2, shape (n, 1)
+    v: ca.SX  # (q_{k+1} - q_k)/h, shape (n, 1)
+    z: ca.SX  # shape (nz, 1)
+    z_rate: ca.SX  # shape (nz, 1)
+    u: ca.SX  # motor torques held over the step [N m], or what servos are commanded [rad or m], shape (nu, 1)
+    constraint_force: ca.SX  # lam_k/h, shape (m, 1) [N or N m]
+    internal_rows: Mapping[str, int]  # row of each internal coordinate in z, by name
+    h: ca.SX  # length of the step [s]
 
 
 @dataclass(frozen=True)
 class NodeState:
     """Symbols of one trajectory node, on which measurements may depend.
 
-    Attributes
-    ----------
-    q, z : casadi.SX, shape (n, 1) and (nz, 1)
-        `kinematics` is at q; `internal_rows` has the row of each internal coordinate in z by name.
-    v : casadi.SX, shape (n, 1)
-        Velocity, the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node; at the
-        first and the last node that of the one step there, half a step off [rad/s or m/s].
-    a : casadi.SX, shape (n, 1)
-        Acceleration, the difference of these two midpoint velocities over h, of order two in h; the first and the last
-        node have that of their neighbour, of order one [rad/s^2 or m/s^2].
-    load : casadi.SX, shape (n, 1)
-        Torque at every joint that has one: the motor torque where driven, the predicted effort where prescribed, of
-        the step that begins at the node, at the last node of the step before [N m or N].
-    lam : casadi.SX, shape (m, 1)
-        Constraint forces lam_k/h of the same step [N or N m].
-    camera_pose : Placement or None
-        Pose in the world of the camera that measures; None for any other sensor.
-    marked_frame : str or None
-        Frame of the mechanism that the channel marks; None for a joint.
+    `v` is the mean of the midpoint velocities (q_{k+1} - q_k)/h of the steps before and after the node, at both ends
+    that of the one step there, half a step off; `a` their difference over h, of order two in h, at both ends that of
+    the neighbour, of order one. `load` and `lam` are of the step that begins at the node, or ends at the last one.
     """
 
     system: System
-    kinematics: Kinematics
-    q: ca.SX
-    v: ca.SX
-    a: ca.SX
-    z: ca.SX
-    load: ca.SX
-    lam: ca.SX
-    internal_rows: Mapping[str, int]
-    camera_pose: Placement | None = None
-    marked_frame: str | None = None
+    kinematics: Kinematics  # at q
+    q: ca.SX  # shape (n, 1)
+    v: ca.SX  # shape (n, 1) [rad/s or m/s]
+    a: ca.SX  # shape (n, 1) [rad/s^2 or m/s^2]
+    z: ca.SX  # internal coordinates, shape (nz, 1)
+    load: ca.SX  # motor torque where driven, predicted effort where prescribed, shape (n, 1) [N m or N]
+    lam: ca.SX  # constraint forces lam_k/h, shape (m, 1) [N or N m]
+    internal_rows: Mapping[str, int]  # row of each internal coordinate in z, by name
+    camera_pose: Placement | None = None  # in the world, of the camera that measures; None for any other sensor
+    marked_frame: str | None = None  # frame of the mechanism that the channel marks; None for a joint
 
 
 @dataclass(frozen=True)
@@ -188,26 +157,16 @@ class ForceWithDerivatives:
 
 @dataclass(frozen=True)
 class StepTerms:
-    """Energy, forces and equations that one effect adds to a step.
+    """Energy, forces and equations that one effect adds to a step; forces have shape (n, 1) [N m or N]."""
 
-    Attributes
-    ----------
-    lagrangian : casadi.SX
-        Scalar added to L(q, v) [J].
-    generalized_force, dissipative_force : casadi.SX, optional, shape (n, 1)
-        F(q, v, u, z), and its part that only takes energy out, in proportion to velocity [N m or N].
-    internal_equations, static_equations : mapping of str to casadi.SX
-        Equation (= 0) of each of the effect's internal coordinates at the midpoint, and what takes its place in a
-        static equilibrium where its own says nothing or cannot hold.
-    force_with_derivatives : ForceWithDerivatives, optional
-        A dissipative force on bodies whose slopes are given, because differentiating it would cost too much.
-    """
-
-    lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))
-    generalized_force: ca.SX | None = None
-    dissipative_force: ca.SX | None = None
+    lagrangian: ca.SX = field(default_factory=lambda: ca.SX(0))  # scalar added to L(q, v) [J]
+    generalized_force: ca.SX | None = None  # F(q, v, u, z)
+    dissipative_force: ca.SX | None = None  # its part that only takes energy out, in proportion to velocity
+    # equation (= 0) of each internal coordinate at the midpoint, and what takes its place in a static equilibrium where
+    # its own says nothing or cannot hold
     internal_equations: Mapping[str, ca.SX] = field(default_factory=dict)
     static_equations: Mapping[str, ca.SX] = field(default_factory=dict)
+    # a dissipative force on bodies whose slopes are given, because differentiating it would cost too much
     force_with_derivatives: ForceWithDerivatives | None = None
 
 
@@ -255,36 +214,24 @@ class Effect:
 
 
 class SystemOptions(TypedDict, total=False):
-    """What `System.build` takes beside mechanism and effects.
-
-    Attributes
-    ----------
-    objects : sequence of (FlexibleObject, frame, placement)
-        Each hung on a frame of what came before (None: the world) at a 4x4 placement (None: identity).
-    driven, prescribed : sequence of str
-        Joint names; no joint may be both.
-    damping : float or mapping
-        Viscous damping of the robot's joints [N m s/rad]; becomes the parameters `JOINT.damping`.
-    gravity : array_like, shape (3,)
-        [m/s^2]; 9.81 along -z when absent.
-    point_frames : sequence of str
-        Frames that sensors may see, points along a segment as `T1:40%`; the segments' tips `w_*` when absent.
-    springs : mapping of str to RobotJointSpring
-        By joint of the robot; become the parameters `JOINT.stiffness` and `JOINT.rest`.
-    servos : PositionServoOptions
-        What the inputs of driven joints command; adds `JOINT.servo_gain`, `servo_damping`, `servo_delay` and
-        `servo_torque_limit`.
-    """
+    """What `System.build` takes beside mechanism and effects."""
 
     objects: Sequence[tuple[FlexibleObject, str | None, ArrayLike | None]]
+    """Each with the frame of what came before on which it hangs (None: the world), and a 4x4 placement there."""
     grasps: Sequence[Grasp]
     driven: Sequence[str]
     prescribed: Sequence[str]
+    """Names of joints; none may be both."""
     damping: float | Mapping[str, float]
+    """Viscous damping of the robot's joints [N m s/rad]; becomes the parameters `JOINT.damping`."""
     gravity: ArrayLike
+    """Shape (3,) [m/s^2]; 9.81 along -z when absent."""
     point_frames: Sequence[str] | None
+    """Frames that sensors may see, points along a segment as `T1:40%`; the segments' tips `w_*` when absent."""
     springs: Mapping[str, RobotJointSpring]
+    """By joint of the robot; become the parameters `JOINT.stiffness` and `JOINT.rest`."""
     servos: PositionServoOptions | None
+    """What the inputs of driven joints command; adds `JOINT.servo_gain`, `servo_damping`, `servo_delay`, ..."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -393,7 +340,7 @@ class System(ReprMixin):
 
     def _summary(self) -> ReprSummary:
         kinds = {"driven": len(self.driven), "prescribed": len(self.prescribed)}
-        kinds["passive"] = self.n_coordinates - sum(kinds.values())
+        kinds |= {"passive": self.n_coordinates - sum(kinds.values())}
         moved = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
         counts = f"{count_with_noun(self.n_coordinates, 'coordinate')} ({moved})"
         parts = [self.mechanism.name, counts, count_with_noun(self.n_constraints, "constraint")]
@@ -432,7 +379,10 @@ class System(ReprMixin):
 
     def segment_layout(self, name: str) -> SegmentLayout:
         """Layout of a segment by name; `ModelError` with the nearest name where there is none."""
-        return find_segment_layout(self.segment_layouts, name)
+        found = {layout.name: layout for layout in self.segment_layouts}
+        if name not in found:
+            raise ModelError(f"there is no segment '{name}'", hint=nearest_name_hint(name, found))
+        return found[name]
 
     def map_expressions(self, change: Callable[[ca.SX], ca.SX]) -> System:
         """The system with `change` applied to every expression of its description, effects left as they are."""
@@ -492,9 +442,7 @@ class System(ReprMixin):
 
     def constraint_compliance_diagonal(self) -> ca.SX:
         """Compliance of every constraint, the diagonal of C in phi(q_{k+1}) = C lam_k / h, shape (m, 1)."""
-        return ca.vertcat(
-            ca.SX(0, 1), *(grasp.compliance for grasp in self.grasps for _ in range(grasp.n_constraint_equations))
-        )
+        return ca.vertcat(ca.SX(0, 1), *(g.compliance for g in self.grasps for _ in range(g.n_constraint_equations)))
 
 
 def _check_names(

@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -33,9 +33,7 @@ from yid_ocp.model.rotations import (
 _UNLIMITED_VALUE = 1e9  # stands for no limit where URDF asks for a number
 _MIN_MASS = 1e-9  # [kg]; dividing by less would not be finite for long
 _MAX_NUMBER = 1e12  # of m, rad, kg and kg m^2; squares of more would not be finite for long
-_PRINCIPAL_MOMENT_RTOL = (
-    1e-2  # how far, for want of digits in the file, principal moments may miss what they have to be
-)
+_PRINCIPAL_MOMENT_RTOL = 1e-2  # how far, for want of digits in the file, they may miss what they have to be
 _MOVABLE_JOINT_TYPES = {"revolute", "continuous", "prismatic"}
 _TENSOR_KEYS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
 
@@ -99,23 +97,19 @@ def read_urdf(
 ) -> Mechanism:
     """A mechanism from a URDF file with the chosen joints kept and the others locked.
 
+    Each kept joint's bodies have the parameter `JOINT.mass` [kg] (inertia in proportion). Links without a kept joint
+    above them are fixed to the world. Every link is a frame of its name.
+
     Parameters
     ----------
     path : str or Path
         As `resolve_urdf_path` takes it.
     joints : sequence of str, optional
-        Names of the joints to keep as degrees of freedom, which are then ordered as given as far as parents come
-        first; all movable ones when absent.
+        To keep as degrees of freedom, in this order as far as parents come first; all movable ones when absent.
     locked : mapping of str to float, optional
         Value at which a joint that is not kept is locked [rad or m]; zero, or the nearest bound, when absent.
     exclude_links : sequence of str
         Links to leave out with all that hangs on them, such as a tool that is not mounted.
-
-    Returns
-    -------
-    Mechanism
-        Each kept joint's bodies have the parameter `JOINT.mass` [kg] (inertia in proportion). Links without a kept
-        joint above them are fixed to the world. Every link is a frame of its name.
 
     Raises
     ------
@@ -329,25 +323,17 @@ def _origin(element: Any) -> Array:
 
 def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia, ...]) -> Joint:
     """The file's joint with its limits, infinite where there are none."""
-    limit = source.limit
-    axis = snap_near_integer_entries(_unit_axis(source))
-    continuous = source.type == "continuous" or limit is None
+    x, y, z = map(float, snap_near_integer_entries(_unit_axis(source)))
 
-    def bound(value: float | None, otherwise: float) -> float:
+    def bound(key: str, otherwise: float) -> float:
+        value = getattr(source.limit, key, None)
         return otherwise if value is None or abs(value) >= _UNLIMITED_VALUE else float(value)
 
-    return Joint(
-        source.name,
-        "prismatic" if source.type == "prismatic" else "revolute",
-        parent,
-        placement,
-        (float(axis[0]), float(axis[1]), float(axis[2])),
-        bodies,
-        -math.inf if continuous else bound(limit.lower, -math.inf),
-        math.inf if continuous else bound(limit.upper, math.inf),
-        math.inf if limit is None else bound(limit.effort, math.inf),
-        math.inf if limit is None else bound(limit.velocity, math.inf),
-    )
+    limits = bound("lower", -math.inf), bound("upper", math.inf)
+    limits = (-math.inf, math.inf) if source.type == "continuous" else limits
+    kind: Literal["revolute", "prismatic"] = "prismatic" if source.type == "prismatic" else "revolute"
+    efforts = bound("effort", math.inf), bound("velocity", math.inf)
+    return Joint(source.name, kind, parent, placement, (x, y, z), bodies, *limits, *efforts)
 
 
 def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Array:
@@ -388,10 +374,9 @@ def _unit_axis(joint: Any) -> Array:
 
 
 def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
-    """URDF text of a mechanism: one link per joint, named frames as links on fixed joints.
+    """URDF text of a mechanism: one link per joint with its bodies merged, named frames as links on fixed joints.
 
-    Bodies are merged into one inertial per link. Placements keep full precision. Reading the text back with
-    `read_urdf` gives the same numbers to 1e-12.
+    Reading the text back with `read_urdf` gives the same numbers to 1e-12.
     """
     mechanism = mechanism.with_numeric_values(values)
     robot = ElementTree.Element("robot", name=mechanism.name)

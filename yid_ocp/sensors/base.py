@@ -74,23 +74,13 @@ class ChannelKind:
     """Kind of recorded quantity: where a recording holds it, its unit, and which constants settings may give.
 
     The noise stands in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`, of points in the dataset `std`.
-
-    Attributes
-    ----------
-    group : str
-        Group of the recording; there may be several, `GROUP` and `GROUP_NAME`, each with its own clock.
-    quantity : str
-        Dataset of the group, with one column for every name of the group.
-    components : tuple of str
-        Names of the components of each value; none for a number.
-    constants : mapping of str to unit
-        Constants that `sensors.GROUP.QUANTITY.constants` may give.
     """
 
-    group: str
-    quantity: str
+    group: str  # of the recording; there may be several, `GROUP` and `GROUP_NAME`, each with its own clock
+    quantity: str  # dataset of the group, with one column for every name of the group
     unit: str
-    components: tuple[str, ...] = ()
+    components: tuple[str, ...] = ()  # names of the components of each value; none for a number
+    # units of the constants that `sensors.GROUP.QUANTITY.constants` may give, by name
     constants: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -113,59 +103,56 @@ def declared_channel_kinds(group: str) -> tuple[ChannelKind, ...]:
     return tuple(c for c in found if c.group not in ("joints", "points") and c.is_in_group(group))
 
 
-class RecordedPointGroup(Protocol):
+class _RecordedGroup(Protocol):
+    @property
+    def name(self) -> str: ...
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def t(self) -> Array: ...
+
+
+class RecordedPointGroup(_RecordedGroup, Protocol):
     """A recorded group of points, as in `data.recording.PointGroup`."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102
+    def sensor(self) -> str: ...
     @property
-    def names(self) -> tuple[str, ...]: ...  # noqa: D102
+    def position(self) -> Array: ...
     @property
-    def sensor(self) -> str: ...  # noqa: D102
+    def std(self) -> Array | None: ...
     @property
-    def t(self) -> Array: ...  # noqa: D102
-    @property
-    def position(self) -> Array: ...  # noqa: D102
-    @property
-    def std(self) -> Array | None: ...  # noqa: D102
-    @property
-    def pose(self) -> Array | None: ...  # noqa: D102
+    def pose(self) -> Array | None: ...
 
 
 class RecordedJoints(Protocol):
     """Recorded joints, as in `data.recording.JointGroup`."""
 
     @property
-    def names(self) -> tuple[str, ...]: ...  # noqa: D102
+    def names(self) -> tuple[str, ...]: ...
     @property
-    def t(self) -> Array: ...  # noqa: D102
+    def t(self) -> Array: ...
     @property
-    def position(self) -> Array: ...  # noqa: D102
+    def position(self) -> Array: ...
     @property
-    def effort(self) -> Array | None: ...  # noqa: D102
+    def effort(self) -> Array | None: ...
     @property
-    def effort_std(self) -> float | Array | None: ...  # noqa: D102
+    def effort_std(self) -> float | Array | None: ...
     @property
-    def effort_bias_std(self) -> float | Array | None: ...  # noqa: D102
+    def effort_bias_std(self) -> float | Array | None: ...
     @property
-    def effort_kind_or_default(self) -> str: ...  # noqa: D102
+    def effort_kind_or_default(self) -> str: ...
     @property
-    def position_std(self) -> float | Array | None: ...  # noqa: D102
+    def position_std(self) -> float | Array | None: ...
 
 
-class RecordedChannelGroup(Protocol):
+class RecordedChannelGroup(_RecordedGroup, Protocol):
     """A recorded group of declared channels, as in `data.recording.ChannelGroup`."""
 
     @property
-    def name(self) -> str: ...  # noqa: D102
+    def values(self) -> Mapping[str, Array]: ...
     @property
-    def names(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def t(self) -> Array: ...  # noqa: D102
-    @property
-    def values(self) -> Mapping[str, Array]: ...  # noqa: D102
-    @property
-    def stds(self) -> Mapping[str, float | Array]: ...  # noqa: D102
+    def stds(self) -> Mapping[str, float | Array]: ...
 
 
 class _RecordingData(Protocol):
@@ -185,11 +172,8 @@ def recorded_joint_columns(joints: RecordedJoints, names: tuple[str, ...], where
     """Column indices of the named joints in a recording; `DataError` for a joint that is not recorded."""
     for name in names:
         if name not in joints.names:
-            raise DataError(
-                f"joint '{name}' of the model is not recorded",
-                where=f"{where}: joints",
-                hint=nearest_name_hint(name, joints.names),
-            )
+            what, hint = f"joint '{name}' of the model is not recorded", nearest_name_hint(name, joints.names)
+            raise DataError(what, where=f"{where}: joints", hint=hint)
     return [joints.names.index(name) for name in names]
 
 
@@ -213,27 +197,15 @@ class Sensor(ABC):
     """A group of measured channels with one clock; hashable, as subclasses are frozen dataclasses.
 
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
-
-    Attributes
-    ----------
-    channel : ChannelKind
-        What a recording holds of it.
-    group_name : str
-        Key of its settings: a group of points, such as `points_camera`, or `joints.effort`.
-    naive_prediction : "zero" or "stays"
-        What a trivial prediction without a model is: zero, or the first measured value.
-    has_paper_weight : bool
-        Whether the source paper's cost, in square metres, counts it.
-    frame_names, point_names : tuple of str
-        The mechanism's frame that each channel marks and its recorded name; none for joints.
     """
 
-    channel: ClassVar[ChannelKind]
-    group_name: str
+    channel: ClassVar[ChannelKind]  # what a recording holds of it
+    group_name: str  # key of its settings: a group of points, such as `points_camera`, or `joints.effort`
+    # what a trivial prediction without a model is: zero, or the first measured value
     naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
-    has_paper_weight: ClassVar[bool] = True
-    frame_names: tuple[str, ...]
-    point_names: tuple[str, ...]
+    has_paper_weight: ClassVar[bool] = True  # whether the source paper's cost, in square metres, counts it
+    frame_names: tuple[str, ...]  # the mechanism's frame that each channel marks; none for joints
+    point_names: tuple[str, ...]  # recorded names of the points; none for joints
 
     @property
     def unit(self) -> str:
@@ -285,16 +257,9 @@ class Sensor(ABC):
 def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
     """A CasADi function for readings y(q, v, a, z, load, lam; theta), effects included, with their derivatives.
 
-    Parameters
-    ----------
-    names : tuple of str
-        Parameters by which to differentiate.
-
-    Returns
-    -------
-    casadi.Function
-        (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), as in
-        `NodeState`; v, a and lam by the recorded clock. Slopes by these have no columns where nothing reads them.
+    It maps (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), as in
+    `NodeState`, the last one by the parameters `names`; v, a and lam by the recorded clock. Slopes by these have no
+    columns where nothing reads them.
     """
     rows = {name: i for i, name in enumerate(system.internal_coordinates)}
     n = system.n_coordinates
@@ -341,55 +306,30 @@ class _SmoothingFilter(Protocol):
 class SensorReadingContext:
     """What is needed to read a sensor's measurements from a recording.
 
-    Attributes
-    ----------
-    sensor_usage : callable
-        From the key of a sensor's settings to these.
-    node_times : ndarray, shape (N + 1,)
-        Of the rollout's nodes [s].
-    time_step : float
-        Between them [s].
-    effort_filter : _SmoothingFilter
-        That of efforts of prescribed joints.
-    joint_mass_matrices : callable
-        From joint names and some of their configurations, shape (K, k), to their part of the mass matrix in each of
-        them, shape (K, k, k) [kg m^2 or kg].
+    `joint_mass_matrices` maps joint names and some of their configurations, shape (K, k), to their part of the mass
+    matrix in each of them, shape (K, k, k) [kg m^2 or kg].
     """
 
     system: System
     recording: _RecordingData
-    sensor_usage: Callable[[str], SensorOptions]
-    node_times: Array
-    time_step: float
-    effort_filter: _SmoothingFilter
+    sensor_usage: Callable[[str], SensorOptions]  # by the key of a sensor's settings
+    node_times: Array  # of the rollout, shape (N + 1,) [s]
+    time_step: float  # between them [s]
+    effort_filter: _SmoothingFilter  # of efforts of prescribed joints
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
 
 
 @dataclass(frozen=True)
 class SensorData:
-    """The measurements of one sensor in one recording.
-
-    Attributes
-    ----------
-    t : ndarray, shape (M,)
-        [s]
-    value, std : ndarray, shape (M, k)
-        Outputs, NaN where there is none, and the standard deviations of their noise, in the sensor's unit.
-    predictable_nodes : (int, int), optional
-        First and last node at which the sensor can be predicted; all of them when absent.
-    bias_std : ndarray, optional, shape (k,)
-        Standard deviations of an error of every output that is constant in one recording; none when absent.
-    noise_correlation : ndarray, optional, shape (M, k, k)
-        Of the noise of the outputs of one sample; none when absent.
-    """
+    """The measurements of one sensor in one recording."""
 
     sensor: Sensor
-    t: Array
-    value: Array
-    std: Array
-    predictable_nodes: tuple[int, int] | None = None
-    bias_std: Array | None = None
-    noise_correlation: Array | None = None
+    t: Array  # shape (M,) [s]
+    value: Array  # outputs in the sensor's unit, NaN where there is none, shape (M, k)
+    std: Array  # standard deviations of their noise, shape (M, k)
+    predictable_nodes: tuple[int, int] | None = None  # the first and the last one; all when absent
+    bias_std: Array | None = None  # of an error of every output that is constant in one recording, shape (k,)
+    noise_correlation: Array | None = None  # of the outputs of one sample, shape (M, k, k)
 
 
 SENSOR_READERS: Registry[Callable[[SensorReadingContext], list[SensorData]]] = Registry("kind of sensor")

@@ -1,22 +1,24 @@
-"""Sensors of the robot's joints: encoders of driven joints, efforts of prescribed ones, and their noise."""
+"""Sensors of the robot's joints: encoders of driven ones, efforts and motor currents of prescribed ones, and noise."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 import numpy as np
 import scipy.special
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError
+from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
     ChannelKind,
+    RecordedChannelGroup,
     RecordedJoints,
     RecordedPointGroup,
     Sensor,
@@ -31,6 +33,10 @@ JOINT_EFFORT_GROUP_NAME = "joints.effort"
 JOINT_POSITION_GROUP_NAME = "joints.position"
 _EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(ChannelKind("joints", "effort", "N m"))
 _POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(ChannelKind("joints", "position", "rad"))
+_TORQUE_CONSTANT = "torque_constant"
+_CURRENT = CHANNEL_KINDS.register("motors.current")(
+    ChannelKind("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
+)
 NOISE_DIFFERENCE_ORDER = 6
 """Order of the differences that estimate a noise level; they remove any motion that is slow against the sampling."""
 
@@ -46,7 +52,6 @@ class JointSensor(Sensor):
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """`group.quantity.JOINT` for every joint."""
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
     def select_sensor_joint_rows(self, values: ca.SX, state: NodeState) -> ca.SX:
@@ -63,7 +68,6 @@ class PositionSensor(JointSensor):
     group_name: str = JOINT_POSITION_GROUP_NAME
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
-        """Angles of the joints, shape (nj, 1) [rad]."""
         return self.select_sensor_joint_rows(state.q, state)
 
 
@@ -77,12 +81,31 @@ class EffortSensor(JointSensor):
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
-        """Names of all joints of the sensor: it reads the effort of each."""
         return self.joint_names
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
-        """Efforts of the joints, shape (nj, 1) [N m]."""
         return self.select_sensor_joint_rows(state.load, state)
+
+
+@dataclass(frozen=True)
+class _MotorCurrentSensor(JointSensor):
+    """Motor currents of named prescribed joints, current = joint effort / torque constant."""
+
+    channel = _CURRENT
+    naive_prediction = "zero"
+    has_paper_weight = False
+    torque_constants: tuple[float, ...]  # joint torque per current, gears included, of each joint [N m/A]
+
+    @property
+    def effort_joints(self) -> tuple[str, ...]:
+        return self.joint_names
+
+    @property
+    def effort_per_output(self) -> Array:
+        return np.array(self.torque_constants)
+
+    def ideal_reading(self, state: NodeState) -> ca.SX:
+        return self.select_sensor_joint_rows(state.load, state) / ca.DM(self.torque_constants)
 
 
 def is_measured_by_arm(group: RecordedPointGroup) -> bool:
@@ -100,11 +123,9 @@ def _read_joint_angles(around: SensorReadingContext) -> list[SensorData]:
     if joints is None or not names or choice.use is False or (choice.use is None and arm):
         return []
     if arm:
-        raise ConfigError(
-            f"the encoders and the arm's points '{arm[0]}' are both to be measurements: one follows from the other",
-            where="sensors.joints.position.use",
-            hint=f"set sensors.{arm[0]}.use: false, or leave the encoders out",
-        )
+        what = f"the encoders and the arm's points '{arm[0]}' are both to be measurements: one follows from the other"
+        hint = f"set sensors.{arm[0]}.use: false, or leave the encoders out"
+        raise ConfigError(what, where="sensors.joints.position.use", hint=hint)
     where = around.recording.name
     later = joints.t > around.node_times[0] + 1e-9
     later &= joints.t <= around.node_times[-1] + 1e-9
@@ -125,11 +146,9 @@ def _read_joint_efforts(around: SensorReadingContext) -> list[SensorData]:
     effort = joints.effort[:, recorded_joint_columns(joints, names, around.recording.name)]
     given = choice.std if choice.std is not None else joints.effort_std
     if given is None:
-        raise DataError(
-            "the noise level of the joint efforts is neither recorded nor given",
-            where=around.recording.name,
-            hint=f"set sensors.{JOINT_EFFORT_GROUP_NAME}.std [N m], from a stretch at rest or the data sheet",
-        )
+        what = "the noise level of the joint efforts is neither recorded nor given"
+        hint = f"set sensors.{JOINT_EFFORT_GROUP_NAME}.std [N m], from a stretch at rest or the data sheet"
+        raise DataError(what, where=around.recording.name, hint=hint)
     std = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
     is_sample = joints.effort_kind_or_default == "sample"
     bias = joint_torque_bias_std(joints, names, choice)
@@ -148,20 +167,9 @@ def smoothed_effort_data(
 ) -> SensorData:
     """Measurements of a sensor of efforts, low-pass filtered and thinned out to independent samples.
 
-    Parameters
-    ----------
-    t : ndarray, shape (M,)
-    values : ndarray, shape (M, k)
-        In the sensor's unit.
-    std, bias : ndarray, shape (k,)
-        Of their white noise and of an error that is constant in the recording.
-    is_sample : bool
-        Whether a value is that at its time, not of the interval until the next.
-
-    Raises
-    ------
-    DataError
-        A recording too short for the filter.
+    `values`, shape (M, k), are in the sensor's unit, `std` and `bias`, shape (k,), those of their white noise and of an
+    error that is constant in the recording; `is_sample` says whether a value is that at its time, not of the interval
+    until the next. `DataError` of a recording too short for the filter.
     """
     times, low_pass = around.node_times, around.effort_filter
     smooth = low_pass(t, values)
@@ -169,26 +177,61 @@ def smoothed_effort_data(
     period = float(np.median(np.diff(t)))
     late = 0.0 if is_sample else 0.5 * period
     measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)
-    # Smoothed values repeat their neighbours: only as many are kept as count as independent. Both ends are left out:
-    # the filter sees one side alone there, the impulse at node 0 depends on the motion before the recording and that at
-    # the last node on the motion after it.
-    # Steps shorter than the recording's period have nodes between its samples, where nothing was measured.
+    # Smoothed values repeat their neighbours: only as many are kept as count as independent, none between the samples.
+    # Both ends are left out: the filter sees one side alone there, the impulse at node 0 depends on the motion before
+    # the recording and that at the last node on the motion after it.
     step, steps = around.time_step, len(times) - 1
     apart = max(1, round(period / step))
     ends = apart * math.ceil(max(1, math.ceil(low_pass.settling_time / step)) / apart)
     kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.decorrelation_stride(step) / apart))
     if not len(kept):
-        raise DataError(
-            f"{steps * step:.3g} s of efforts are too short for a filter of {low_pass.cutoff:g} Hz",
-            where=around.recording.name,
-            allowed=f"more than {2 * ends * step:.3g} s",
-            hint="use a longer recording, or raise problem.path_cutoff",
-        )
+        what = f"{steps * step:.3g} s of efforts are too short for a filter of {low_pass.cutoff:g} Hz"
+        allowed, hint = f"more than {2 * ends * step:.3g} s", "use a longer recording, or raise problem.path_cutoff"
+        raise DataError(what, where=around.recording.name, allowed=allowed, hint=hint)
     unit = sensor.effort_per_output
     total, correlation = _smoothed_effort_noise(around, sensor.joint_names, std * np.abs(unit), period, times[kept])
     if correlation is not None:
         correlation = correlation * np.outer(np.sign(unit), np.sign(unit))
     return SensorData(sensor, times[kept], measured[kept], total / np.abs(unit), (1, steps - 1), bias, correlation)
+
+
+@SENSOR_READERS.register("motors.current")
+def _read_motor_currents(around: SensorReadingContext) -> list[SensorData]:
+    """Measurements of prescribed joints' motor currents, filtered like joint efforts."""
+    return [
+        found
+        for group in around.recording.channel_groups
+        if _CURRENT.is_in_group(group.name) and (found := _currents(around, group)) is not None
+    ]
+
+
+def _currents(around: SensorReadingContext, group: RecordedChannelGroup) -> SensorData | None:
+    key, where = f"{group.name}.{_CURRENT.quantity}", f"{around.recording.name}: {group.name}"
+    choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
+    if choice.use is False or not names or around.recording.joints is None:
+        return None
+    for name in group.names:
+        if name not in around.system.mechanism.joint_names:
+            hint = nearest_name_hint(name, around.system.mechanism.joint_names)
+            raise DataError(f"the model has no joint '{name}'", where=where, hint=hint)
+    stated = [group.stds.get(attribute) for attribute in _CURRENT.std_attribute_names]
+    constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
+    bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
+    if constants is None:
+        what, hint = "the motors' torque constants are not given", "[N m/A], torque at the joint over current"
+        raise DataError(what, where=where, hint=f"set sensors.{key}.constants: {{{_TORQUE_CONSTANT}: ...}} {hint}")
+    if std is None:
+        what = "the noise level of the motor currents is neither recorded nor given"
+        raise DataError(what, where=where, hint=f"set sensors.{key}.std [A]")
+    by_joint = [
+        expand_to_joint_values(given, group.names, names, f"sensors.{key}.{setting}")
+        for given, setting in ((constants, "constants"), (std, "std"), (bias, "bias_std"))
+    ]
+    if not np.all(by_joint[0] != 0):
+        raise DataError("a torque constant is zero", where=where, allowed="a number that is not zero [N m/A]")
+    sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
+    values = group.values[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
+    return smoothed_effort_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)
 
 
 # -- noise levels -----------------------------------------------------------------------------------------------------
@@ -199,18 +242,8 @@ def is_noise_std_stated(joints: RecordedJoints, group: str, choice: SensorOption
     return choice.std is not None or getattr(joints, CHANNEL_KINDS[group].std_attribute_names[0]) is not None
 
 
-def joint_angle_noise_std(joints: RecordedJoints, names: Sequence[str], choice: SensorOptions, where: str) -> Array:
-    """Noise standard deviation of driven joints' encoders, stated or estimated, shape (len(names),) [rad]."""
-    return _joint_noise_std(joints, names, choice, where, JOINT_POSITION_GROUP_NAME)
-
-
-def joint_torque_noise_std(joints: RecordedJoints, names: Sequence[str], choice: SensorOptions, where: str) -> Array:
-    """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
-    return _joint_noise_std(joints, names, choice, where, JOINT_EFFORT_GROUP_NAME)
-
-
 def _joint_noise_std(
-    joints: RecordedJoints, names: Sequence[str], choice: SensorOptions, where: str, group: str
+    joints: RecordedJoints, names: Sequence[str], choice: SensorOptions, where: str, *, group: str
 ) -> Array:
     channel = CHANNEL_KINDS[group]
     given = choice.std if choice.std is not None else getattr(joints, channel.std_attribute_names[0])
@@ -220,12 +253,17 @@ def _joint_noise_std(
     return expand_to_joint_values(given, joints.names, names, f"sensors.{group}.std")
 
 
+joint_angle_noise_std = partial(_joint_noise_std, group=JOINT_POSITION_GROUP_NAME)
+"""Noise standard deviation of driven joints' encoders, stated or estimated, shape (len(names),) [rad]."""
+joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_GROUP_NAME)
+"""Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
+
+
 def joint_torque_bias_std(joints: RecordedJoints, names: Sequence[str], choice: SensorOptions) -> Array:
     """Standard deviation of a constant error of recorded torques, zero if unknown, shape (len(names),) [N m]."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
-    return expand_to_joint_values(
-        0.0 if given is None else given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.bias_std"
-    )
+    key = f"sensors.{JOINT_EFFORT_GROUP_NAME}.bias_std"
+    return expand_to_joint_values(0.0 if given is None else given, joints.names, names, key)
 
 
 def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
@@ -233,16 +271,12 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
 
     Whatever else is as fast as the sampling counts as noise, so that this is rather too much than too little.
     """
-    if len(values) <= NOISE_DIFFERENCE_ORDER:
-        raise DataError(
-            f"{len(values)} samples are too few to see the noise of {group}",
-            where=where,
-            allowed=f"more than {NOISE_DIFFERENCE_ORDER}",
-            hint=f"set sensors.{group}.std [{unit}]",
-        )
-    size = math.sqrt(scipy.special.comb(2 * NOISE_DIFFERENCE_ORDER, NOISE_DIFFERENCE_ORDER))
-    found = np.sqrt(np.mean(np.diff(values, NOISE_DIFFERENCE_ORDER, axis=0) ** 2, axis=0)) / size
-    return np.asarray(found)
+    order = NOISE_DIFFERENCE_ORDER
+    if len(values) <= order:
+        what, allowed = f"{len(values)} samples are too few to see the noise of {group}", f"more than {order}"
+        raise DataError(what, where=where, allowed=allowed, hint=f"set sensors.{group}.std [{unit}]")
+    mean_square = np.mean(np.diff(values, order, axis=0) ** 2, axis=0)
+    return np.asarray(np.sqrt(mean_square / scipy.special.comb(2 * order, order)))
 
 
 def _smoothed_effort_noise(
@@ -260,9 +294,8 @@ def _smoothed_effort_noise(
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     assert joints is not None
     known = encoders.std if encoders.std is not None else joints.position_std
-    angle = expand_to_joint_values(
-        0.0 if known is None else known, joints.names, names, f"sensors.{JOINT_POSITION_GROUP_NAME}.std"
-    )
+    key = f"sensors.{JOINT_POSITION_GROUP_NAME}.std"
+    angle = expand_to_joint_values(0.0 if known is None else known, joints.names, names, key)
     own = (std * value_gain) ** 2
     if not np.any(angle > 0):
         return np.broadcast_to(np.sqrt(own), (len(times), len(names))), None

@@ -27,38 +27,23 @@ _POINTS = CHANNEL_KINDS.register("points")(ChannelKind("points", "position", "m"
 
 @dataclass(frozen=True)
 class PointSensor(Sensor):
-    """Measured positions of named frames in the world.
-
-    Attributes
-    ----------
-    group_name : str
-        The recording's group, `points_camera` for example.
-    point_names : tuple of str
-        Names in the recording.
-    frame_names : tuple of str
-        Frames of the mechanism that they mark.
-    camera_pose_matrix : tuple of tuple of float, optional
-        4x4 pose of the camera in the world; None for a sensor that is no camera.
-    """
+    """Measured positions of named frames in the world."""
 
     channel = _POINTS
     group_name: str
     point_names: tuple[str, ...]
     frame_names: tuple[str, ...]
-    camera_pose_matrix: tuple[tuple[float, ...], ...] | None = None
+    camera_pose_matrix: tuple[tuple[float, ...], ...] | None = None  # 4x4, in the world; None for no camera
 
     @property
     def channel_names(self) -> tuple[str, ...]:
-        """`group.point` for every point."""
         return tuple(f"{self.group_name}.{point}" for point in self.point_names)
 
     @property
     def camera_pose(self) -> Placement | None:
-        """Pose of the camera; None where no camera measures."""
         return None if self.camera_pose_matrix is None else Placement.from_matrix(self.camera_pose_matrix)
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
-        """Positions of all points, stacked, shape (3 np, 1) [m]."""
         return ca.vertcat(*(state.kinematics.frame_position(frame) for frame in self.frame_names))
 
 
@@ -81,25 +66,20 @@ def _points(around: SensorReadingContext, group: RecordedPointGroup, choice: Sen
     for point in wanted:
         # what is listed by name is meant
         if point not in known and (choice.points is not None or point in choice.frames):
-            raise DataError(
-                f"point '{point}' of '{group.name}' marks the frame '{frames[point]}', which the model does not have",
-                where=where,
-                hint=f"{nearest_name_hint(frames[point], mechanism.frames)} (see sensors.{group.name})",
-            )
+            what = f"point '{point}' of '{group.name}' marks the frame '{frames[point]}', which the model does not have"
+            hint = f"{nearest_name_hint(frames[point], mechanism.frames)} (see sensors.{group.name})"
+            raise DataError(what, where=where, hint=hint)
     if not known:
-        raise DataError(
+        what, allowed = (
             f"none of the points of group '{group.name}' is a frame of the model",
-            where=where,
-            allowed=", ".join(around.system.point_frames),
-            hint=f"name their frames (or T1:40%) under sensors.{group.name}.frames, or switch the group off",
+            around.system.point_frames,
         )
+        hint = f"name their frames (or T1:40%) under sensors.{group.name}.frames, or switch the group off"
+        raise DataError(what, where=where, allowed=", ".join(allowed), hint=hint)
     for point in known:
         if point not in group.names:
-            raise DataError(
-                f"point '{point}' is not in group '{group.name}'",
-                where=where,
-                hint=nearest_name_hint(point, group.names),
-            )
+            hint = nearest_name_hint(point, group.names)
+            raise DataError(f"point '{point}' is not in group '{group.name}'", where=where, hint=hint)
     columns = [group.names.index(point) for point in known]
     inside = (group.t >= around.node_times[0] - 1e-9) & (group.t <= around.node_times[-1] + 1e-9)
     value = group.position[inside][:, columns].reshape(int(inside.sum()), 3 * len(columns))
@@ -110,11 +90,8 @@ def _points(around: SensorReadingContext, group: RecordedPointGroup, choice: Sen
     elif group.std is not None:
         std = group.std[inside][:, columns].reshape(value.shape)
     else:
-        raise DataError(
-            f"the noise level of group '{group.name}' is neither recorded nor given",
-            where=where,
-            hint=f"set sensors.{group.name}.std [m]",
-        )
+        what = f"the noise level of group '{group.name}' is neither recorded nor given"
+        raise DataError(what, where=where, hint=f"set sensors.{group.name}.std [m]")
     sensor = PointSensor(group.name, known, tuple(frames[p] for p in known), recorded_camera_pose(group))
     return SensorData(sensor, group.t[inside], value, std)
 

@@ -50,8 +50,8 @@ class MountSettings:
 class ClampPoseDefinition:
     """How a clamp's pose follows from two measured points: its origin is at one, its z axis points to the other.
 
-    What the points do not tell is the turn about z: with `level` the third angle stays zero (x axis across world y);
-    with `transported` the clamp never turns about its own z axis, from `level` at the first node on.
+    With `level` the third angle is zero (x axis across world y); with `transported` the clamp never turns about its own
+    z axis, from `level` at the first node on.
     """
 
     clamp_name: str
@@ -62,22 +62,11 @@ class ClampPoseDefinition:
 
 @dataclass(frozen=True)
 class CableTopology:
-    """Vertices and branches of a cable with their undeformed positions.
+    """Vertices and branches of a cable with their undeformed positions; branches by the name of their segment."""
 
-    Attributes
-    ----------
-    parent_vertices : tuple of str
-        Vertices of the parent, the segment `parent_segment`, from one clamp to the other; the first two and the last
-        two are held.
-    child_vertices : mapping of str to tuple of str
-        Name of each child to its vertices, the first one that of the parent at which it leaves.
-    undeformed_positions : mapping of str to array_like, shape (3,)
-        Every vertex of the cable at rest without load [m], in any frame.
-    """
-
-    parent_vertices: tuple[str, ...]
-    child_vertices: Mapping[str, tuple[str, ...]]
-    undeformed_positions: Mapping[str, ArrayLike]
+    parent_vertices: tuple[str, ...]  # from one clamp to the other; the first two and the last two are held
+    child_vertices: Mapping[str, tuple[str, ...]]  # the first one is that of the parent at which the child leaves
+    undeformed_positions: Mapping[str, ArrayLike]  # of every vertex at rest without load, in any frame, shape (3,) [m]
     parent_segment: str = "parent"
 
     def __post_init__(self) -> None:
@@ -124,14 +113,13 @@ class CableTopology:
     @property
     def clamp_paths(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
         """Points that define the poses of the two clamps, start and end."""
-        p = self.parent_vertices
-        return ClampPoseDefinition(START_CLAMP, p[0], p[1], "transported"), ClampPoseDefinition(
-            END_CLAMP, p[-2], p[-1], "transported"
-        )
+        a, b, *_, y, z = self.parent_vertices
+        start = ClampPoseDefinition(START_CLAMP, a, b, "transported")
+        return start, ClampPoseDefinition(END_CLAMP, y, z, "transported")
 
     def undeformed_polyline(self, chain: Sequence[str]) -> Array:
         """Undeformed positions of some vertices, shape (len(chain), 3) [m]."""
-        return np.array([np.asarray(self.undeformed_positions[vertex], float) for vertex in chain])
+        return np.array([self.undeformed_positions[vertex] for vertex in chain], float)
 
 
 # -- what `init` asks for and writes ----------------------------------------------------------------------------------
@@ -139,21 +127,12 @@ class CableTopology:
 
 @dataclass(frozen=True)
 class InitCommandObject:
-    """An object described on the command line of `init`.
+    """An object described on the command line of `init`."""
 
-    Attributes
-    ----------
-    settings : ObjectKind
-        Without its mount.
-    start_values : mapping of parameter to (float, str)
-        Where the search for each free parameter starts, with a comment.
-    stands_in_world : bool
-        Whether it stands where the settings say, and arms hold its ends; or else a frame of the robot carries its root.
-    """
-
-    settings: ObjectKind
-    start_values: Mapping[str, tuple[float, str]]
+    settings: ObjectKind  # without its mount
+    start_values: Mapping[str, tuple[float, str]]  # where the search for each free parameter starts, with a comment
     parameters_comment: str = "`yid-ocp inspect` lists all that there are"
+    # whether it stands where the settings say, and arms hold its ends; or else a frame of the robot carries its root
     stands_in_world: bool = False
 
 
@@ -161,19 +140,13 @@ class InitCommandObject:
 class InitCommandObjectTemplate:
     """What one word of `init --object` stands for: how the object is built and which numbers it needs.
 
-    Attributes
-    ----------
-    default_links : int
-        Per segment.
-    build : callable
-        The object from what was given by name (flags of `init`, and `--number`) and the number of links per segment;
-        `ConfigError` where something is missing.
-    further_numbers : mapping of str to str
-        Names beside length, mass and radius that `--number NAME=VALUE` takes, with their meanings.
+    `build` makes it of what was given by name (flags of `init`, and `--number`) and the number of links per segment;
+    `ConfigError` where something is missing.
     """
 
-    default_links: int
+    default_links: int  # per segment
     build: Callable[[Mapping[str, Any], int], InitCommandObject]
+    # names beside length, mass and radius that `--number NAME=VALUE` takes, with their meanings
     further_numbers: Mapping[str, str] = field(default_factory=dict)
     has_branches: bool = False
 
@@ -218,20 +191,12 @@ class ObjectKind:
 
     A class overrides `kind`, and `model_segments` or `build`, and what else differs; one that is a system of its own is
     a `ClampedObject` as well.
-
-    Attributes
-    ----------
-    default_link_refinement : bool
-        Whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition.
-    init_templates : mapping of str to InitCommandObjectTemplate
-        Words of `init --object`.
-    settings_examples : mapping of section to str
-        YAML for the page of settings.
     """
 
+    # whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition
     default_link_refinement: ClassVar[bool] = False
-    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {}
-    settings_examples: ClassVar[Mapping[str, str]] = {}
+    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {}  # words of `init --object`
+    settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
     kind: Annotated[str, OptionInfo("what the object is")]
 
@@ -240,10 +205,7 @@ class ObjectKind:
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The object, to be placed by `placement`, each link divided.
-
-        `damping` is that of every coordinate [N m s/rad], or per curvature rate [N m^2 s] where the segments say so.
-        """
+        """The object, to be placed by `placement`, with the damping of every coordinate and each link divided."""
         return flexible_object(self.model_segments(damping, link_division))
 
     @property
@@ -307,17 +269,14 @@ class MountedObject(ObjectKind):
     mount: Annotated[MountSettings | None, OptionInfo("where its root sits; the world's origin when absent")] = None
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The flexible object, each of its links divided into `link_division` links."""
         return flexible_object(self.model_segments(damping, link_division), gravity_fraction=self.gravity_fraction)
 
     @property
     def placement(self) -> tuple[str | None, Array | None]:
-        """Frame that carries the root, and the root's pose in it, shape (4, 4)."""
         return (None, None) if self.mount is None else (self.mount.parent_frame, self.mount.pose)
 
     @property
     def is_root_fixed_in_world(self) -> bool:
-        """Whether the object's root is fixed to the world: no robot frame or clamp moves it."""
         return self.mount is None or not self.mount.parent_frame
 
 

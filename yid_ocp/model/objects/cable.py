@@ -38,20 +38,16 @@ from yid_ocp.model.flexible import (
     parallel_transport_rotations,
 )
 from yid_ocp.model.mechanism import Frame, LinkChain, Mechanism, Placement
-from yid_ocp.model.objects.base import END_CLAMP as _END_CLAMP
-from yid_ocp.model.objects.base import OBJECT_KINDS, CableTopology, ObjectKind
-from yid_ocp.model.objects.base import START_CLAMP as _START_CLAMP
+from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectKind
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
 from yid_ocp.model.system import Grasp, System, floating_clamp
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
-_START_ROLL_PARAMETER, _END_ROLL_PARAMETER = f"{_START_CLAMP}.roll", f"{_END_CLAMP}.roll"
-_REST_ANGLE_SUFFIX = ".rest"
 START_SPEED_SCALE_PARAMETER_NAME = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
-_START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{_START_CLAMP}_edge", "last_edge"
+_START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{START_CLAMP}_edge", "last_edge"
 # Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
 START_ANGLE_AND_LOAD_SUFFIXES = ("start", "load")
 # Parameter that is told the root mean square speed of the measured points at the start [m/s].
@@ -128,7 +124,7 @@ def read_vertex_positions(path: str | Path) -> dict[str, Array]:
 
 def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of the edge length parameters by name, from the edges' lengths [m]."""
-    values = {f"{_START_CLAMP}.length": lengths[cable.parent_vertices[0], cable.parent_vertices[1]]}
+    values = {f"{START_CLAMP}.length": lengths[cable.parent_vertices[0], cable.parent_vertices[1]]}
     for name, chain in cable.branch_vertex_names.items():
         first = 1 if name == cable.parent_segment else 0
         for i, edge in enumerate(pairwise(chain[first:])):
@@ -151,7 +147,7 @@ def estimable_parameter_names(cable: CableTopology, options: CableOptions | None
     if options.has_rest_angle_parameters:
         for name, chain in cable.branch_vertex_names.items():
             links = len(chain) - (2 if name == cable.parent_segment else 1)
-            names += [f"{name}_{i}_{axis}{_REST_ANGLE_SUFFIX}" for i in range(links) for axis in "xy"]
+            names += [f"{name}_{i}_{axis}.rest" for i in range(links) for axis in "xy"]
     return tuple(names)
 
 
@@ -171,17 +167,17 @@ def cable_system(
     if options.shape_memory is not None:
         item = _with_memory(item, options.shape_memory)
     clamps = _start_clamp(lengths[cable.parent_vertices[0], cable.parent_vertices[1]], cable)
-    clamps = clamps.with_attached_mechanism(floating_clamp(_END_CLAMP))
+    clamps = clamps.with_attached_mechanism(floating_clamp(END_CLAMP))
     rotation = ca.SX(ca.DM.eye(3))
     if options.end_clamp == "weld":
         text = "roll of the end clamp about the last edge"
-        end_roll = Parameter(_END_ROLL_PARAMETER, 0.0, "rad", -np.pi, np.pi, text)
+        end_roll = Parameter(f"{END_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, text)
         clamps = replace(clamps, parameters=clamps.parameters.with_added([end_roll]))
         rotation = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], end_roll.symbol)
     return System.build(
         clamps,
         objects=((_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None),),
-        grasps=(Grasp(_END_CLAMP, _END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp, rotation),),
+        grasps=(Grasp(END_CLAMP, END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp, rotation),),
         prescribed=clamps.joint_names,
         damping={},
         gravity=options.gravity,
@@ -192,7 +188,7 @@ def cable_system(
 def _with_rest_angles(item: FlexibleObject) -> FlexibleObject:
     text = "rest angle beside the undeformed shape's"
     bends = (spring.joint_name for spring in item.elastic_joints if spring.deformation == "bend")
-    rest = {name: Parameter(f"{name}{_REST_ANGLE_SUFFIX}", 0.0, "rad", -np.pi, np.pi, text) for name in bends}
+    rest = {name: Parameter(f"{name}.rest", 0.0, "rad", -np.pi, np.pi, text) for name in bends}
     elastic = (
         replace(s, rest_angle=s.rest_angle + (rest[s.joint_name].symbol if s.joint_name in rest else 0))
         for s in item.elastic_joints
@@ -210,9 +206,8 @@ def _with_parameters(
 def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
     text = "share of the start's shape in the rest shape"
     shares = {s.name: Parameter(f"{s.name}.memory", memory, "1", 0.0, 1.0, text) for s in item.segment_layouts}
-    speed = Parameter(
-        START_SPEED_PARAMETER_NAME, 0.0, "m/s", 0.0, np.inf, "speed of the vertices at the recording's start"
-    )
+    text = "speed of the vertices at the recording's start"
+    speed = Parameter(START_SPEED_PARAMETER_NAME, 0.0, "m/s", 0.0, np.inf, text)
     text = "start speed at which the memory counts half"
     scale = Parameter(START_SPEED_SCALE_PARAMETER_NAME, 0.3, "m/s", 1e-3, np.inf, text)
     trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
@@ -241,7 +236,7 @@ def _with_vertices(
         frames |= {vertex: frames[f"{name}_{i}_tip"] for i, vertex in enumerate(chain[first:])}
         if name != cable.parent_segment:
             frames[f"junction_{name}"] = frames[chain[0]]
-    last = tree.joint_index(item.segment_layout(cable.parent_segment).link_joints[-1][-1])
+    last = tree.joint_index(item.segment_layouts[0].link_joints[-1][-1])
     frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
     parent = tree.link_chains[cable.parent_segment]
     edges = np.array([lengths[edge] for edge in pairwise(cable.parent_vertices)])
@@ -251,14 +246,15 @@ def _with_vertices(
 
 
 def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
-    clamp = floating_clamp(_START_CLAMP)
-    roll = Parameter(_START_ROLL_PARAMETER, 0.0, "rad", -np.pi, np.pi, "roll of the start clamp about the first edge")
-    edge = Parameter(f"{_START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
-    carrier = clamp.frame(_START_CLAMP)
+    clamp = floating_clamp(START_CLAMP)
+    text = "roll of the start clamp about the first edge"
+    roll = Parameter(f"{START_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, text)
+    edge = Parameter(f"{START_CLAMP}.length", length, "m", 1e-9, np.inf, "length of the first edge")
+    carrier = clamp.frame(START_CLAMP)
     turn = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], roll.symbol)
     tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
     frames = {**clamp.frames, cable.parent_vertices[0]: carrier, cable.parent_vertices[1]: tip, _START_EDGE_FRAME: tip}
-    return Mechanism(_START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
+    return Mechanism(START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
 
 
 def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
@@ -344,7 +340,6 @@ model:
     ]
 
     def topology(self) -> CableTopology:
-        """Measured vertices and clamps; `DataError` or `ModelError` where they do not fit together."""
         found = CableTopology(
             self.parent_vertices, dict(self.child_vertices), read_vertex_positions(self.undeformed_shape_file)
         )
@@ -355,9 +350,7 @@ model:
         return found
 
     def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
-        """The whole system, from the measured edge lengths [m]."""
         return cable_system(edge_lengths, self.topology(), replace(self, gravity=gravity))
 
     def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        """Values of the edge length parameters of one recording by name; empty where all recordings share them."""
         return edge_length_parameter_values(self.topology(), edge_lengths) if self.lengths_per_recording else {}

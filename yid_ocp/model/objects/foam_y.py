@@ -77,6 +77,5 @@ model:
         ]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The object, its foot at (0.85, 0, -0.93) m without a mount."""
         root = _FOOT_POSE if self.mount is None else None
         return flexible_object(self.model_segments(damping, link_division), root, "y_object", self.gravity_fraction)

@@ -94,16 +94,8 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
     """A segment as `init` writes it; a flat one bends across its thinner side alone, about the other axis."""
     section = more.get("cross_section")
     axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
-    return SegmentSettings(
-        length=length,
-        mass=mass,
-        radius=radius,
-        links=links,
-        joint_axes=axes,
-        stiffness_per_curvature=True,
-        clamped_at_base=more.get("parent") is None,
-        **more,
-    )
+    more |= {"length": length, "mass": mass, "radius": radius, "links": links, "joint_axes": axes}
+    return SegmentSettings(stiffness_per_curvature=True, clamped_at_base=more.get("parent") is None, **more)
 
 
 def _init_object(word: str, segments: Mapping[str, SegmentSettings]) -> InitCommandObject:
@@ -114,14 +106,13 @@ def _init_object(word: str, segments: Mapping[str, SegmentSettings]) -> InitComm
 def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
     length, mass, radius = required_object_numbers("a cable", numbers, SIZE_DESCRIPTIONS)
     section = _section(numbers)
-    given = None if section else radius
-    return _init_object("cable", {"cable": _init_segment(links, length, mass, given, cross_section=section)})
+    segment = _init_segment(links, length, mass, None if section else radius, cross_section=section)
+    return _init_object("cable", {"cable": segment})
 
 
 def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
-    length, mass = required_object_numbers(
-        "a beam", numbers, {name: SIZE_DESCRIPTIONS[name] for name in ("length", "mass")}
-    )
+    sizes = {name: SIZE_DESCRIPTIONS[name] for name in ("length", "mass")}
+    length, mass = required_object_numbers("a beam", numbers, sizes)
     section = _section(numbers)
     if section is None and "radius" not in numbers:
         what, hint = "a beam needs a radius or a section", "add --radius NUMBER, or --section WIDTH,HEIGHT"
@@ -143,9 +134,8 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
         raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="1 to 16")
     # across the z axis of what holds them, the first one along its x axis
     turns = [(0.0, quarter, round(4 * quarter * i / count, 7)) for i in range(count)]
-    return _init_object(
-        "tree", {f"b{i + 1}": _init_segment(links, length, mass, radius, rpy=turn) for i, turn in enumerate(turns)}
-    )
+    branches = enumerate((_init_segment(links, length, mass, radius, rpy=turn) for turn in turns), 1)
+    return _init_object("tree", {f"b{i}": branch for i, branch in branches})
 
 
 def _section(numbers: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -222,5 +212,4 @@ stiffness_per_curvature: true, clamped_at_base: true}
     )
 
     def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Segments, parents first, with the damping of every joint and each link divided, their stiffness kept."""
         return [s.segment(name, damping, link_division) for name, s in self.segments.items()]

@@ -65,19 +65,17 @@ parameters:
     joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
 
     def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """The rod as a segment without taper."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
         rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_per_curvature=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The flexible object, each of its links divided into `link_division` links."""
         return _tapered(super().build(damping, link_division), self.tip_radius / self.base_radius)
 
 
 def _tapered(plain: FlexibleObject, ratio: float) -> FlexibleObject:
     """The object with a parameter for its taper, on which masses, inertias, springs and dampers depend."""
-    tree, layout = plain.mechanism, plain.segment_layout(_SEGMENT)
+    tree, [layout] = plain.mechanism, plain.segment_layouts
     text = "radius of the tip over that of the base"
     taper = Parameter(f"{_SEGMENT}.taper", ratio, "1", 1e-3, math.inf, text)
     n, links = len(layout.link_joints), layout.link_joints
