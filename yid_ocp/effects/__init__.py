@@ -17,8 +17,8 @@ from yid_ocp.effects.base import ReportedParameter as ReportedParameter
 from yid_ocp.errors import ModelError, unknown_name_details
 from yid_ocp.model.system import System
 
+# kinds of recorded signals on which candidates depend; `nominal_clock` is a sample index times a nominal period
 _SENSOR_KINDS = ("joints.position", "joints.effort", "camera", "nominal_clock")
-"""Kinds of recorded signals on which candidates depend; `nominal_clock` is a sample index times a nominal period."""
 
 # every file of this folder registers its kinds when it is imported
 for _family in iter_modules(__path__):
@@ -29,14 +29,8 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     """An effect of a kind at a location, to be added with `System.with_effects`; see `candidate_kinds_and_locations`.
 
     Its parameters are named `kind@location.parameter`. `values` holds what is not neutral, by parameter; a compliance
-    may be given as its `stiffness`.
-
-    Raises
-    ------
-    ConfigError
-        No such kind or parameter, or a value outside its bounds.
-    ModelError
-        The system has no such place for it.
+    may be given as its `stiffness`. `ConfigError` of no such kind or parameter or a value outside its bounds,
+    `ModelError` where the system has no such place for it.
     """
     places = EFFECTS[kind].possible_locations(system)
     if location not in places:
@@ -55,12 +49,7 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
     """Every pair (effect kind, location) possible in a system and visible in its recorded signals, ordered by kind.
 
     The system is without the effects in question, the signals are among `sensor_kinds`. What works only on prescribed
-    joints is left out where no effort was recorded, for there nothing would show it.
-
-    Raises
-    ------
-    ModelError
-        An entry that is not in `sensor_kinds`.
+    joints is left out where no effort was recorded, for there nothing would show it. `ModelError` of another signal.
     """
     present, known = set(recorded_sensors), sensor_kinds()
     for name in sorted(present - known):

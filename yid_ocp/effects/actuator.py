@@ -26,12 +26,9 @@ from yid_ocp.effects.base import (
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD, PositionServo
 from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 
-_PLAY_TORQUE = 0.2
-"""Torque at which three quarters of the backlash are taken up [N m]."""
-_DEFAULT_EFFORT_LIMIT = 10.0
-"""Assumed effort limit of a joint that has none [N m or N]."""
-_MIN_LIMIT_FRACTION = 0.1
-"""Smallest torque limit that is searched, as a fraction of the joint's effort limit."""
+_PLAY_TORQUE = 0.2  # at which three quarters of the backlash are taken up [N m]
+_DEFAULT_EFFORT_LIMIT = 10.0  # of a joint that has none [N m or N]
+_MIN_LIMIT_FRACTION = 0.1  # smallest torque limit that is searched, over the joint's effort limit
 
 
 def _recorded_joints(system: System) -> tuple[str, ...]:
@@ -186,14 +183,8 @@ class EffortGain(_DistortedEffort):
 
     equation = "measured effort = scale x true"
     declared_parameters = (
-        ParameterDefinition(
-            "inverse",
-            "1",
-            1.0,
-            -1.5,
-            3.0,
-            (1 / 1.2, 1 / 0.8),
-            "true over measured effort",
+        replace(
+            ParameterDefinition("inverse", "1", 1.0, -1.5, 3.0, (1 / 1.2, 1 / 0.8), "true over measured effort"),
             reported_reciprocal="scale 1",
         ),
     )
@@ -222,14 +213,8 @@ class EffortOffset(_DistortedEffort):
 
     equation = "measured effort = true + offset"
     declared_parameters = (
-        ParameterDefinition(
-            "offset",
-            "N m",
-            0.0,
-            -10.0,
-            10.0,
-            (-1.5, 1.5),
-            "measured less true effort",
+        replace(
+            ParameterDefinition("offset", "N m", 0.0, -10.0, 10.0, (-1.5, 1.5), "measured less true effort"),
             range_scale=effort_limit_over_baxter,
         ),
     )
@@ -381,20 +366,10 @@ class ServoSaturation(_ServoChange):
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
         known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD else _DEFAULT_EFFORT_LIMIT
         torque = "N m" if joint.coordinate_unit == "rad" else "N"
-        highest = (_MIN_LIMIT_FRACTION * known) ** -TORQUE_SATURATION_EXPONENT
-        return (
-            ParameterDefinition(
-                "tightness",
-                f"({torque})^-16",
-                0.0,
-                0.0,
-                highest,
-                (0.0, highest),
-                "largest torque of the servo, to the power -16",
-                reported_reciprocal=f"limit {torque}",
-                reciprocal_power=TORQUE_SATURATION_EXPONENT,
-            ),
-        )
+        highest, text = (_MIN_LIMIT_FRACTION * known) ** -TORQUE_SATURATION_EXPONENT, "largest torque of the servo"
+        unit, text = f"({torque})^-16", f"{text}, to the power -16"
+        tightness = ParameterDefinition("tightness", unit, 0.0, 0.0, highest, (0.0, highest), text)
+        return (replace(tightness, reported_reciprocal=f"limit {torque}", reciprocal_power=TORQUE_SATURATION_EXPONENT),)
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         return {"torque_limit_tightness": servo.torque_limit_tightness + self["tightness"]}

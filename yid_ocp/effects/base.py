@@ -20,21 +20,13 @@ from yid_ocp.model.system import Effect, System
 from yid_ocp.registry import Registry
 
 EXCITATION_DESCRIPTIONS = (
-    "how fast it moves",
-    "how long it is held",
-    "how hard it accelerates",
-    "how far it bends",
-    "how it stands against gravity",
-    "how hard it pulls at its ends",
-    "when it is read",
-    "where the camera stands",
+    *("how fast it moves", "how long it is held", "how hard it accelerates", "how far it bends"),
+    *("how it stands against gravity", "how hard it pulls at its ends", "when it is read", "where the camera stands"),
     "how long it is",
 )
 """What a motion has to vary to excite an effect of the library, in the order in which messages list it."""
-_BAXTER_EFFORT_LIMIT = 50.0
-"""Effort limit of Baxter's joints [N m], on which the ranges of arm effects are based; they scale with the limit."""
-_SAME_POINT_DISTANCE = 1e-6
-"""Points of arms that stay nearer to each other than this in all configurations count as one point [m]."""
+_BAXTER_EFFORT_LIMIT = 50.0  # on which the ranges of arm effects are based; they scale with the limit [N m]
+_SAME_POINT_DISTANCE = 1e-6  # nearer points of arms, in all configurations, count as one [m]
 _CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -70,12 +62,6 @@ class ParameterDefinition:
         """Name and unit under which the parameter is reported."""
         name, _, unit = self.reported_reciprocal.partition(" ")
         return (name, unit) if self.reported_reciprocal else (self.name, self.unit)
-
-    def _to_reported(self, value: float) -> float:
-        """The reported value for a nonzero internal value; the internal value itself where there is no reciprocal."""
-        if not self.reported_reciprocal:
-            return value
-        return 1 / value if self.reciprocal_power == 1 else value ** (-1 / self.reciprocal_power)
 
     def to_internal(self, value: float) -> float:
         """The internal value for a nonzero reported value; the reported value itself where there is no reciprocal."""
@@ -163,8 +149,7 @@ class EffectBase(Effect):
     ) -> dict[str, ReportedParameter]:
         """The parameters as reported to users, by reported name; a compliance is reported as stiffness.
 
-        Values and standard deviations are nominal and NaN where absent; entries of other effects are skipped. The
-        standard deviation of C^(-1/p) is C^(-1/p) std(C)/(p C) (delta method).
+        Values and standard deviations are nominal and NaN where absent; that of C^(-1/p) is C^(-1/p) std(C)/(p C).
         """
         result = {}
         for definition, entry in zip(self.definitions, self.parameters, strict=True):
@@ -172,9 +157,9 @@ class EffectBase(Effect):
             std = float((stds or {}).get(entry.name, math.nan))
             name, unit = definition.reported_name_and_unit
             if definition.reported_reciprocal:
-                reported = definition._to_reported(value) if value else math.inf
-                std = abs(reported * std / (definition.reciprocal_power * value)) if value else math.nan
-                value = reported
+                power, internal = definition.reciprocal_power, value
+                value = math.inf if not value else 1 / value if power == 1 else value ** (-1 / power)
+                std = abs(value * std / (power * internal)) if internal else math.nan
             result[name] = ReportedParameter(value, std, unit)
         return result
 
@@ -197,10 +182,9 @@ def build_effect(kind: str, location: str, system: System, values: Mapping[str, 
             raise ConfigError(f"{kind} has no quantity '{name}'", where=label, hint=nearest_name_hint(name, names))
         definition = names[name]
         if name != definition.name:
-            signed = definition.lower < 0
+            signed, unit = definition.lower < 0, definition.reported_name_and_unit[1]
             if not (value > 0 or (signed and value < 0)):
-                allowed = f"{'a number other than zero' if signed else 'a positive number'} "
-                allowed += definition.reported_name_and_unit[1]
+                allowed = f"{'a number other than zero' if signed else 'a positive number'} {unit}"
                 raise ConfigError(f"{name} = {value}", where=label, allowed=allowed)
             value = definition.to_internal(value)
         given[definition.name] = float(value)
@@ -287,10 +271,7 @@ def effort_limit_over_baxter(system: System, joint: str) -> float:
 
 
 def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
-    """Names of frames at the ends of the arms' links: at the next joint or at the tip, each point once.
-
-    A point on an axis that no other joint moves is left out.
-    """
+    """Names of frames at the ends of the arms' links: at the next joint or the tip, each point that moves once."""
     tree = system.mechanism
     own = {tree.joint_index(name) for name in arm_joint_names(system)}
     if not own:
@@ -314,7 +295,7 @@ def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
 def arm_link_frame_names(system: System) -> tuple[str, ...]:
     """Names of one frame on every arm link with mass: the grasp's, else a gripper's, else the first.
 
-    What slides on a link and carries nothing else, a finger for example, counts as part of that link.
+    A finger, what slides on a link and carries nothing else, counts as part of that link.
     """
     tree = system.mechanism
     preferred = [*(grasp.holder_frame for grasp in system.grasps), *_arm_tip_frames(system)]

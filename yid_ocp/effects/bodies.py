@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -29,33 +30,21 @@ from yid_ocp.model.mechanism import Inertia, merge_bodies
 from yid_ocp.model.rotations import symbolic_rotation_from_rpy
 from yid_ocp.model.system import ForceWithDerivatives, MidpointState, StepTerms, System
 
-_MAX_PAYLOAD_DISTANCE = 0.5
-"""Largest distance of a payload's mass from its frame [m]."""
-_MAX_COM_SHIFT = 0.05
-"""Largest shift of a link's centre of mass without added mass [m]."""
-_MAX_REMOVED_MASS_FRACTION = 0.9
-"""Largest fraction of a link's mass that a negative payload may remove."""
-_POINT_INERTIA_DISTANCE = 2.0
-"""Distance beyond which a payload's own inertia is no longer that of a point [m]."""
-_POINT_INERTIA_MIN_MASS = 1e-2
-"""Mass below which a payload has no inertia of its own [kg]."""
-_UNLIMITED_MOMENT_FRACTION = 0.95
-"""Reported fraction of a payload's moments above which the limit of its position is negligible."""
-_MIN_LINK_EXTENT = 1e-3
-"""Smallest root mean square extent of a link [m]."""
-_AIR_DENSITY = 1.2
-"""Density of air [kg/m^3]."""
-_ABS_SMOOTHING_SPEED = 1e-3
-"""Speed below which |v_n| in the drag is smoothed [m/s]."""
+_MAX_PAYLOAD_DISTANCE = 0.5  # of a payload's mass from its frame [m]
+_MAX_COM_SHIFT = 0.05  # of a link's centre of mass without added mass [m]
+_MAX_REMOVED_MASS_FRACTION = 0.9  # of a link's mass, by a negative payload
+_POINT_INERTIA_DISTANCE = 2.0  # beyond which a payload's own inertia is no longer that of a point [m]
+_POINT_INERTIA_MIN_MASS = 1e-2  # below which a payload has no inertia of its own [kg]
+_UNLIMITED_MOMENT_FRACTION = 0.95  # of a payload's moments that acts, above which the limit of its place is negligible
+_MIN_LINK_EXTENT = 1e-3  # root mean square [m]
+_AIR_DENSITY = 1.2  # [kg/m^3]
+_ABS_SMOOTHING_SPEED = 1e-3  # below which |v_n| in the drag is smoothed [m/s]
 
 
-@dataclass(frozen=True)
-class _CarriedBody:
-    """Nominal mass [kg], centre of mass [m] and integral of r r' dm about it [kg m^2] of a joint's child bodies."""
-
-    mass: float
-    center_of_mass: np.ndarray
-    second_moment: np.ndarray
+class _CarriedBody(NamedTuple):
+    mass: float  # [kg]
+    center_of_mass: np.ndarray  # [m]
+    second_moment: np.ndarray  # integral of r r' dm about it [kg m^2]
 
 
 def _carried_body(system: System, joint: int) -> _CarriedBody:

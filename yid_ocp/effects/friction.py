@@ -18,17 +18,11 @@ from yid_ocp.effects.base import (
 )
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
-_SIGN_SMOOTHING_SPEED = 0.02
-"""Smoothing speed v_s in sgn(v) = tanh(v/v_s) [rad/s]."""
-_LOAD_SIGN_SMOOTHING_SPEED = 0.005
-"""The same for friction that grows with the load, which also holds what the load would move [rad/s]."""
-_SMOOTHING_TORQUE = 1e-3
-"""Torque below which |torque| is smoothed [N m]."""
-_ABS_SMOOTHING_ANGLE = 1e-7
-"""Angle turned in a step below which |d| in Dahl's law is smoothed [rad]."""
-_SERIES_MAX_ANGLE_RATIO = 1e-2
-"""Ratio of step angle to yield angle below which a power series replaces the exponential, which loses digits there."""
-
+_SIGN_SMOOTHING_SPEED = 0.02  # v_s in sgn(v) = tanh(v/v_s) [rad/s]
+_LOAD_SIGN_SMOOTHING_SPEED = 0.005  # of friction that grows with the load and holds what that would move [rad/s]
+_SMOOTHING_TORQUE = 1e-3  # below which |torque| is smoothed [N m]
+_ABS_SMOOTHING_ANGLE = 1e-7  # turned in a step, below which |d| in Dahl's law is smoothed [rad]
+_SERIES_MAX_ANGLE_RATIO = 1e-2  # of step angle to yield angle, below which the exponential loses digits to a series
 
 FrictionLaw = Literal["viscous", "coulomb", "stribeck", "presliding", "load", "load_stribeck"]
 FRICTION_LAWS: Mapping[FrictionLaw, tuple[str, ...]] = {

@@ -12,12 +12,9 @@ from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, segme
 from yid_ocp.model.flexible import ElasticJoint
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
-_ABS_SMOOTHING_SPEED = 1e-3
-"""Speed below which |v| in Dahl's law is smoothed [rad/s]."""
-_REFERENCE_ANGLE = 0.5
-"""Default for the largest angle in the data, on which the range of k3 depends [rad]."""
-_MIN_LARGEST_ANGLE = 0.02
-"""Lower limit of the largest angle from which the range of k3 is computed [rad]."""
+_ABS_SMOOTHING_SPEED = 1e-3  # below which |v| in Dahl's law is smoothed [rad/s]
+_REFERENCE_ANGLE = 0.5  # taken for the largest angle in the data, on which the range of k3 depends, until told [rad]
+_MIN_LARGEST_ANGLE = 0.02  # taken for a smaller one [rad]
 
 
 def _bending_stiffness(system: System, segment: str) -> float:
@@ -162,14 +159,8 @@ class CubicStiffness(_SegmentEffect):
     equation = "V += 1/4 k3 q^4"
     required_excitation = "how far it bends"
     declared_parameters = (
-        ParameterDefinition(
-            "k3",
-            "N m/rad^3",
-            0.0,
-            -10.0,
-            50.0,
-            (-0.5, 1.0),
-            "cubic stiffness of every joint",
+        replace(
+            ParameterDefinition("k3", "N m/rad^3", 0.0, -10.0, 50.0, (-0.5, 1.0), "cubic stiffness of every joint"),
             range_scale=_reference_cubic_stiffness,
         ),
     )

@@ -19,8 +19,7 @@ from yid_ocp.model.flexible import AXIS_UNIT_VECTORS
 from yid_ocp.model.mechanism import Joint, Placement
 from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System
 
-_SPRING_RELAXATION_TIME = 5e-3
-"""Relaxation time of mount and junction springs [s]: too short to damp any visible motion."""
+_SPRING_RELAXATION_TIME = 5e-3  # of mount and junction springs: too short to damp any visible motion [s]
 
 
 def _root_joints_by_base(system: System) -> dict[str, tuple[str, ...]]:
@@ -28,10 +27,8 @@ def _root_joints_by_base(system: System) -> dict[str, tuple[str, ...]]:
     tree, clamps = system.mechanism, clamp_names(system)
     found: dict[str, tuple[str, ...]] = {}
     for first in (s.link_joints[0][0] for s in system.segment_layouts if s.parent_segment is None):
-        below = {
-            tree.joints[i].name for i in tree.ancestor_joint_indices(tree.joints[tree.joint_index(first)].parent_index)
-        }
-        place = next((clamp for clamp in clamps if f"{clamp}_rz" in below), "base")
+        above = tree.ancestor_joint_indices(tree.joint_index(first))[:-1]
+        place = next((clamp for clamp in clamps if tree.joint_index(f"{clamp}_rz") in above), "base")
         found[place] = (*found.get(place, ()), first)
     return found
 
@@ -77,10 +74,7 @@ class _JointInsertion(EffectBase):
         return replace(
             system,
             mechanism=replace(tree, joints=tuple(joints)),
-            joint_compliances={
-                **system.joint_compliances,
-                **dict.fromkeys(names, self["compliance"]),
-            },
+            joint_compliances={**system.joint_compliances, **dict.fromkeys(names, self["compliance"])},
             joint_relaxation_times={**system.joint_relaxation_times, **dict.fromkeys(names, _SPRING_RELAXATION_TIME)},
         )
 

@@ -78,24 +78,13 @@ class ArmSensorNoise:
 class PointCamera:
     """A slow camera that measures positions of the object's points that no arm holds.
 
-    Attributes
-    ----------
-    point_std : float
-        Standard deviation of the white noise on each coordinate of a point [m].
-    frame_rate : float
-        Mean rate of frames [Hz]; periods vary by a quarter either way.
-    has_dropouts : bool
-        Whether frames are lost for 1 to 1.5 s about once every 2.5 s of recording.
-    hidden_probability : float
-        Probability that a point is hidden in a frame (NaN).
-    pose : array_like, shape (4, 4), optional
-        Camera (x right, y down, z ahead) in the world; 2 m from the object, opposite the robot, where absent.
+    Its pose (4, 4) in the world (x right, y down, z ahead) is 2 m from the object, opposite the robot, where absent.
     """
 
-    point_std: float = 5e-3
-    frame_rate: float = 3.0
-    has_dropouts: bool = True
-    hidden_probability: float = 0.1
+    point_std: float = 5e-3  # of the white noise on each coordinate of a point [m]
+    frame_rate: float = 3.0  # on average; periods vary by a quarter either way [Hz]
+    has_dropouts: bool = True  # whether frames are lost for 1 to 1.5 s about once every 2.5 s of recording
+    hidden_probability: float = 0.1  # that a point is hidden in a frame (NaN)
     pose: ArrayLike | None = None
 
 
@@ -103,34 +92,19 @@ class PointCamera:
 class VirtualExperiment:
     """Settings of a virtual experiment: motion, simulation, sensors and noise.
 
-    Attributes
-    ----------
-    motion : MultisineMotion, optional
-        `random_multisine_motion` with `seed` where absent.
-    initial_joint_angles : mapping of str to float, optional
-        Initial angles [rad or m]; `grasping_joint_angles` where absent.
-    camera : PointCamera, optional
-        None for no camera.
-    injected_terms : InjectedSimulatorTerms, optional
-        Forces and model changes that are not in the system's description.
-    seed : int
-        Seed of all noise; each sensor has its own stream, so that leaving one out changes no other.
-    description : str
-        Of the recording; how it was made is appended.
-    gear_play : mapping of joint to float
-        Backlash of gears behind servos, full width [rad].
+    Each sensor's noise has its own stream of the `seed`, so that leaving one out changes no other.
     """
 
-    motion: MultisineMotion | None = None
-    initial_joint_angles: Mapping[str, float] | None = None
+    motion: MultisineMotion | None = None  # `random_multisine_motion` with `seed` where absent
+    initial_joint_angles: Mapping[str, float] | None = None  # [rad or m]; `grasping_joint_angles` where absent
     simulation: SimulationOptions = field(default_factory=SimulationOptions)
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
     camera: PointCamera | None = field(default_factory=PointCamera)
     injected_terms: InjectedSimulatorTerms | None = None
     seed: int = 0
     recording_name: str = "virtual"
-    description: str = ""
-    gear_play: Mapping[str, float] = field(default_factory=dict)
+    description: str = ""  # how the recording was made is appended
+    gear_play: Mapping[str, float] = field(default_factory=dict)  # of gears behind servos, full width [rad], by joint
 
 
 def run_virtual_experiment(
@@ -138,30 +112,18 @@ def run_virtual_experiment(
 ) -> Recording:
     """Simulate a robot moving the object and return the recording of encoders, torques, points and camera.
 
-    Returns
-    -------
-    Recording
-        `joints`: index k is node k, `effort[k]` is what `effort_kind` says. `points_arm` at the same times, for the
-        grasped points; `points_camera` with its own clock. `true_parameters` holds all stiffness, damping and mass
-        parameters: `values`, nominal where absent.
-
-    Raises
-    ------
-    ConfigError
-        The torques' noise is that of other joints.
-    ModelError, DataError
-        As `simulate_in_mujoco`.
+    `points_arm` has the grasped points at the times of the joints, `points_camera` its own clock, `true_parameters` all
+    stiffness, damping and mass parameters: `values`, nominal where absent. `ConfigError` of noise of other joints'
+    torques, else as `simulate_in_mujoco`.
     """
     chosen = experiment or VirtualExperiment()
     duration = chosen.simulation.duration
-    posture, motion = chosen.initial_joint_angles, chosen.motion
-    if posture is None:
-        posture = grasping_joint_angles(system, values)
-    if motion is None:
-        excitation = MultisineOptions(duration=duration)
-        motion = random_multisine_motion(
-            system, values, seed=chosen.seed, initial_joint_angles=posture, excitation=excitation
-        )
+    posture = chosen.initial_joint_angles
+    posture = grasping_joint_angles(system, values) if posture is None else posture
+    excitation = MultisineOptions(duration=duration)
+    motion = chosen.motion or random_multisine_motion(
+        system, values, seed=chosen.seed, initial_joint_angles=posture, excitation=excitation
+    )
     times = np.empty(0)
     if chosen.camera is not None and _held_and_visible_points(system)[1]:
         times = _frame_times(_random_generators(chosen.seed)["frames"], duration, chosen.camera)
@@ -204,14 +166,10 @@ def _joints(system: System, run: SimulationResult, experiment: VirtualExperiment
     names = ("effort_std", "effort_bias_std")
     white, bias = (_by_joint(getattr(noise, name), len(driven), f"ArmSensorNoise.{name}") for name in names)
     offset = bias * streams["effort_bias"].standard_normal(len(driven))
-    joints = JointGroup(
-        names=tuple(system.driven),
-        t=run.t,
-        position=_noisy(run.q[:, driven], noise.position_std, streams["position"]),
-        velocity=_noisy(run.v[:, driven], noise.velocity_std, streams["velocity"]),
-        position_std=noise.position_std,
-        velocity_std=noise.velocity_std,
-    )
+    position = _noisy(run.q[:, driven], noise.position_std, streams["position"])
+    velocity = _noisy(run.v[:, driven], noise.velocity_std, streams["velocity"])
+    joints = JointGroup(tuple(system.driven), run.t, position, velocity=velocity)
+    joints = replace(joints, position_std=noise.position_std, velocity_std=noise.velocity_std)
     if system.servos:
         return replace(joints, position_command=run.effort)
     stds = (white, bias) if noise.records_effort_std else (None, None)
@@ -251,26 +209,24 @@ def _how_it_was_made(experiment: VirtualExperiment, system: System, seen: bool) 
     simulation, noise, camera = experiment.simulation, experiment.arm_noise, experiment.camera
     sampled = 1e3 / simulation.sample_rate
     held = 1e3 / (simulation.sample_rate * simulation.controller_periods_per_sample)
-    input_, efforts = f"commands of position servos held over each {held:g} ms, recorded every {sampled:g} ms", ""
+    input_ = f"commands of position servos held over each {held:g} ms, recorded every {sampled:g} ms"
+    efforts = offset = ""
     if not system.servos:
         input_ = f"torque held over each {held:g} ms and recorded as {simulation.effort_kind} every {sampled:g} ms"
-        efforts = f"effort {_listed(noise.effort_std)} N m, "
+        white, constant = (
+            ", ".join(f"{value:g}" for value in np.atleast_1d(std)) for std in (noise.effort_std, noise.effort_bias_std)
+        )
+        efforts, offset = f"effort {white} N m, ", f"; constant offset of the effort {constant} N m"
     made = (
         f"Virtual experiment in MuJoCo {import_mujoco().__version__} (implicitfast, "
         f"{1e3 * simulation.time_step:g} ms inner step): multi-sine motion of {len(system.driven)} joints "
         f"from static equilibrium, {input_}, seed {experiment.seed}. White noise: "
         f"joint position {noise.position_std:g} rad, velocity {noise.velocity_std:g} rad/s, "
-        f"{efforts}arm points {1e3 * noise.point_std:g} mm"
+        f"{efforts}arm points {1e3 * noise.point_std:g} mm{offset}"
     )
-    if not system.servos:
-        made += f"; constant offset of the effort {_listed(noise.effort_bias_std)} N m"
     if camera is None or not seen:
         return made + "; no camera."
     return made + f", camera {1e3 * camera.point_std:g} mm at about {camera.frame_rate:g} Hz."
-
-
-def _listed(std: float | tuple[float, ...]) -> str:
-    return ", ".join(f"{value:g}" for value in np.atleast_1d(std))
 
 
 def _noisy(clean: Array, std: float | Array, rng: np.random.Generator) -> Array:

@@ -45,23 +45,16 @@ class MultisineMotion:
 
     offset_j(t) = r(t) sum_i amplitude_ji sin(2 pi frequency_ji t + phase_ji), with the ramp
     r = 10 s^3 - 15 s^4 + 6 s^5, s = min(t / ramp, 1), twice continuously differentiable.
-
-    Attributes
-    ----------
-    amplitude, frequency, phase : ndarray, shape (nj, nf)
-        [rad or m], [Hz], [rad]
-    ramp_time : float
-        [s]
     """
 
     joints: tuple[str, ...]
-    amplitude: Array
-    frequency: Array
-    phase: Array
-    ramp_time: float = 1.0
+    amplitude: Array  # shape (nj, nf) [rad or m]
+    frequency: Array  # shape (nj, nf) [Hz]
+    phase: Array  # shape (nj, nf) [rad]
+    ramp_time: float = 1.0  # [s]
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
+        """As `JointMotion` has it."""
         omega = 2 * math.pi * self.frequency
         angle = omega * t + self.phase
         sine, cosine = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)
@@ -77,32 +70,21 @@ class MultisineMotion:
 class MultisineOptions:
     """Amplitude, speed and frequency limits of a random multisine motion.
 
-    Attributes
-    ----------
-    gripper_travel : float
-        Largest distance of a gripper from its start [m]; every arm is scaled to it by itself. Much more than the
-        default, on two arms, lets the foam Y snap from one shape to another.
-    max_joint_speed : float
-        Largest joint speed [rad/s]; an arm that would exceed it travels less.
-    sines_per_joint, frequency_band, shake_frequency_band : int, (float, float)
-        One sine in each of as many equal parts (in log frequency) of the band [Hz], and as many in that of those that
-        shake, which is well below half the rate of what records the torque.
-    ramp_time, duration : float
-        [s]
-    shake_torque_rms, max_shake_speed : float
-        Root mean square of the torque that each joint's own inertia takes beside its travel [N m], in sines of equal
-        torque, none faster than this [rad/s], which light wrists reach first. Zero leaves torques gentle.
+    Every arm is scaled to the gripper's travel by itself; much more than the default, on two arms, lets the foam Y snap
+    from one shape to another. One sine is in each of as many equal parts (in log frequency) of each band, that of those
+    that shake being well below half the rate of what records the torque.
     """
 
-    gripper_travel: float = 0.11
-    max_joint_speed: float = 1.4
+    gripper_travel: float = 0.11  # largest distance of a gripper from its start [m]
+    max_joint_speed: float = 1.4  # an arm that would exceed it travels less [rad/s]
     sines_per_joint: int = 3
-    frequency_band: tuple[float, float] = (0.2, 2.0)
-    ramp_time: float = 1.0
-    duration: float = 5.0
+    frequency_band: tuple[float, float] = (0.2, 2.0)  # [Hz]
+    ramp_time: float = 1.0  # [s]
+    duration: float = 5.0  # [s]
+    # torque that each joint's own inertia takes beside its travel, in sines of equal torque; none at zero [N m]
     shake_torque_rms: float = 0.0
-    shake_frequency_band: tuple[float, float] = (4.0, 9.0)
-    max_shake_speed: float = 0.15
+    shake_frequency_band: tuple[float, float] = (4.0, 9.0)  # [Hz]
+    max_shake_speed: float = 0.15  # of each of these sines, which light wrists reach first [rad/s]
 
 
 def random_multisine_motion(
@@ -206,30 +188,20 @@ def grasping_joint_angles(
 ) -> dict[str, float]:
     """Arm joint angles at which every gripper meets the end of the undeformed object, or a point beside it.
 
-    Only positions are matched; of several solutions one near the initial guess is returned.
-
-    Sought are the joints that carry a grasp's holder and are not elastic.
+    They are those of every driven joint and of all that carry a grasp's holder and are not elastic, which are sought,
+    in configuration order [rad or m]. Only positions are matched, by the solution near the start. `ModelError` where
+    the grasped points cannot be reached within the joint limits.
 
     Parameters
     ----------
     values : mapping of str to float, optional
         Parameter values; nominal where absent.
     start_angles : mapping of str to float, optional
-        Start of the search by joint name [rad or m]. Where absent: elbow up for Baxter, else the middle of the joint's
-        range (zero when it has none).
+        Start of the search by joint [rad or m]; where absent elbow up for Baxter, else the middle of the joint's range
+        (zero when it has none).
     offsets : mapping of grasp to array_like, shape (3,), optional
         Where each gripper stands beside the undeformed tube end, in the world [m]. Two arms that hold a straight Y are
         at its full stretch, a singular posture: moving them towards it makes the start well defined.
-
-    Returns
-    -------
-    dict of str to float
-        Angle of every driven joint and every joint sought [rad or m], in configuration order.
-
-    Raises
-    ------
-    ModelError
-        The grasped points cannot be reached within the joint limits.
     """
     tree = system.numeric_mechanism(values)
     value = ParameterEvaluator(system, values)

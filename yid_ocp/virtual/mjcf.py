@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
@@ -51,8 +51,7 @@ MODEL_ASPECT_DESCRIPTIONS: Mapping[str, str] = {
 }
 """Aspects of a model that an engine may or may not represent, with their descriptions."""
 
-# kinds that are smoothed dry friction, and the parameter with their friction torque [N m]
-_DRY_FRICTION_PARAMETERS: Mapping[str, str] = {"joint_coulomb": "tau_c", "joint_presliding": "tau_c"}
+_DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of friction torque tau_c [N m]
 
 _POINTS = 3  # at which equations are compared
 _ROUNDING = 1e-9
@@ -134,21 +133,19 @@ def effect_joint_terms_and_changed_aspects(
     """Terms that a system's effect adds at single joints, and the `MODEL_ASPECT_DESCRIPTIONS` it changes."""
     aspects = model_aspects_of_parameters(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
-    if effect.kind in _DRY_FRICTION_PARAMETERS:
-        size = effect.parameters[f"{effect.kind}@{effect.location}.{_DRY_FRICTION_PARAMETERS[effect.kind]}"].symbol
+    if effect.kind in _DRY_FRICTION_KINDS:
+        size = effect.parameters[f"{effect.kind}@{effect.location}.tau_c"].symbol
         terms = {effect.location: JointDynamicsTerms(dry_friction=float(value(size)[0]))}
         aspects.add("dry_friction")
     elif effect.internal_coordinates:
         aspects.add("memory")
+    elif (found := _joint_terms(system, effect, value)) is None:
+        aspects.add("force")
     else:
-        found = _joint_terms(system, effect, value)
-        if found is None:
-            aspects.add("force")
-        else:
-            terms = found
-            # an aspect is called as the term is, but for the angle at which a spring is relaxed
-            sizes = ((name, size) for entry in terms.values() for name, size in vars(entry).items())
-            aspects |= {"rest" if name == "constant_force" else name for name, size in sizes if size}
+        terms = found
+        # an aspect is called as the term is, but for the angle at which a spring is relaxed
+        sizes = ((name, size) for entry in terms.values() for name, size in vars(entry).items())
+        aspects |= {"rest" if name == "constant_force" else name for name, size in sizes if size}
     for joint in system.driven:
         gain, offset, delay, lag = _actuation(system, (effect,), joint, value)
         changed = {"torque_gain": gain != 1, "torque_offset": offset != 0, "torque_lag": lag != 0}
@@ -158,10 +155,7 @@ def effect_joint_terms_and_changed_aspects(
 
 
 def joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms]:
-    """Springs, dampers, rotor inertia and friction by joint, from the description and from effects.
-
-    Of other effects only these parts; aspects of `effect_joint_terms_and_changed_aspects` show what is missing.
-    """
+    """Springs, dampers, rotor inertia and friction by joint, from the description and from such effects."""
     found: dict[str, JointDynamicsTerms] = {}
 
     def add(joint: str, own: JointDynamicsTerms) -> None:
@@ -186,24 +180,22 @@ def joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str,
 
 
 def _actuation(
-    system: System, effects: Iterable[Effect], joint: str, value: ParameterEvaluator
+    system: System, effects: Sequence[Effect], joint: str, value: ParameterEvaluator
 ) -> tuple[float, float, float, float]:
     """A joint's torque (or a servo's command) from its record, as the estimation has it: gain, offset, delay, lag.
 
     It is gain x recorded - offset, late by the delay [s] and with a first-order lag [s]; the last effect is the nearest
     to the reading.
     """
-    reading, known = ca.SX.sym("reading"), list(effects)
-    true, servo = reading, system.servos.get(joint)
-    channel = f"joints.{'effort' if servo is None else 'position'}.{joint}"
-    for effect in reversed(known):
+    true = reading = ca.SX.sym("reading")
+    channel = f"joints.{'position' if joint in system.servos else 'effort'}.{joint}"
+    for effect in reversed(effects):
         true = effect.corrected_reading(channel, true, true)
-    late = sum((effect.added_channel_delay(f"torque.{joint}", False) for effect in known), ca.SX(0))
-    lag = sum((effect.channel_lag_time_constant(f"torque.{joint}") for effect in known), ca.SX(0))
-    gain = ca.jacobian(true, reading)
-    numbers = [ca.substitute(part, reading, 0) for part in (gain, true)] + [late, lag]
-    one, none, delay, constant = (float(value(number)[0]) for number in numbers)
-    return one, -none, delay, constant
+    late = sum((effect.added_channel_delay(f"torque.{joint}", False) for effect in effects), ca.SX(0))
+    lag = sum((effect.channel_lag_time_constant(f"torque.{joint}") for effect in effects), ca.SX(0))
+    numbers = [ca.substitute(part, reading, 0) for part in (ca.jacobian(true, reading), -true)]
+    gain, offset, delay, time_constant = (float(value(number)[0]) for number in (*numbers, late, lag))
+    return gain, offset, delay, time_constant
 
 
 def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms] | None:
@@ -272,9 +264,6 @@ def mujoco_xml(
 
     Parameters
     ----------
-    system : System
-    values : mapping of str to float, optional
-        Parameter values by name; nominal where absent.
     time_step : float
         Of the simulator [s]; grasps are held with a time constant of two steps.
     emulate : bool
@@ -387,26 +376,21 @@ def _weighed(tree: Mechanism) -> tuple[Mechanism, dict[str, float]]:
 
 
 def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]:
-    attributes = {
-        "name": joint.name,
-        "axis": format_xml_numbers(joint.axis),
-        "damping": format_xml_numbers([terms.damping]),
-    }
+    axis, damping = format_xml_numbers(joint.axis), format_xml_numbers([terms.damping])
+    attributes = {"name": joint.name, "axis": axis, "damping": damping}
     attributes["type"] = "hinge" if joint.kind == "revolute" else "slide"
+    numbers: dict[str, list[float]] = {}
     if terms.stiffness > 0:
-        attributes["stiffness"] = format_xml_numbers([terms.stiffness])
-        attributes["springref"] = format_xml_numbers([terms.constant_force / terms.stiffness])
+        numbers |= {"stiffness": [terms.stiffness], "springref": [terms.constant_force / terms.stiffness]}
     if terms.cubic_stiffness:
         if terms.constant_force or not hasattr(import_mujoco().MjModel, "jnt_stiffnesspoly"):
             what = f"the spring at '{joint.name}' has a cubic part"
             allowed = "none beside a rest angle, and MuJoCo with polynomial stiffness (3.6 or newer)"
             raise ModelError(what, where="mujoco_xml", allowed=allowed)
-        attributes["stiffness"] = format_xml_numbers([terms.stiffness, 0.0, terms.cubic_stiffness])
-    if terms.armature:
-        attributes["armature"] = format_xml_numbers([terms.armature])
-    if terms.dry_friction:
-        attributes["frictionloss"] = format_xml_numbers([terms.dry_friction])
-    return attributes
+        numbers["stiffness"] = [terms.stiffness, 0.0, terms.cubic_stiffness]
+    others = {"armature": [terms.armature], "frictionloss": [terms.dry_friction]}
+    numbers |= {name: size for name, size in others.items() if any(size)}
+    return attributes | {name: format_xml_numbers(values) for name, values in numbers.items()}
 
 
 def _play_attributes(width: float, time_step: float) -> dict[str, str]:
@@ -424,14 +408,11 @@ def _add_grasps(system: System, value: ParameterEvaluator, root: Element, time_s
         if compliance > 0:
             # a tendon of no length pulls with its stiffness, and damps, along the line between both ends
             relaxation = 0.0 if grasp.relaxation_time is None else float(value(grasp.relaxation_time)[0])
-            sizes = {
-                "stiffness": format_xml_numbers([1 / compliance]),
-                "damping": format_xml_numbers([relaxation / compliance]),
-            }
             tendons = root.find("tendon")
             tendons = SubElement(root, "tendon") if tendons is None else tendons
-            attributes = {"name": f"grasp_{grasp.name}", "springlength": "0", **sizes}
-            spring = SubElement(tendons, "spatial", attributes)
+            spring = SubElement(tendons, "spatial", name=f"grasp_{grasp.name}", springlength="0")
+            for key, size in (("stiffness", 1 / compliance), ("damping", relaxation / compliance)):
+                spring.set(key, format_xml_numbers([size]))
             for end in ends:
                 SubElement(spring, "site", site=end)
             continue
@@ -490,10 +471,9 @@ def compile_mjcf(text: str) -> Any:
 def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bool) -> None:
     able = _NATIVE_ASPECTS | MUJOCO_APPROXIMATED_ASPECTS if emulate else _NATIVE_ASPECTS
     for effect in system.effects:
-        for aspect in sorted(
-            effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
-        ):
-            changed = MODEL_ASPECT_DESCRIPTIONS[aspect]
+        aspects = effect_joint_terms_and_changed_aspects(system, effect, value)[1] - able - _IGNORED_ASPECTS
+        if aspects:
+            changed = MODEL_ASPECT_DESCRIPTIONS[min(aspects)]
             what = f"effect '{effect.kind}@{effect.location}' has what MuJoCo cannot express: {changed}"
             allowed = ", ".join(words for name, words in MODEL_ASPECT_DESCRIPTIONS.items() if name in able)
             raise ModelError(what, where="mujoco_xml", allowed=f"effects that change {allowed}")
@@ -541,21 +521,16 @@ def _along(z: float) -> Placement:
 
 def _pose(placement: Placement) -> dict[str, str]:
     x, y, z, w = Rotation.from_matrix(np.array(ca.DM(placement.rotation))).as_quat()
-    return {
-        "pos": format_xml_numbers(np.array(ca.DM(placement.translation)).ravel()),
-        "quat": format_xml_numbers([w, x, y, z]),
-    }
+    place = np.array(ca.DM(placement.translation)).ravel()
+    return {"pos": format_xml_numbers(place), "quat": format_xml_numbers([w, x, y, z])}
 
 
 def _inertial(body: Inertia) -> dict[str, str]:
     tensor = np.array(ca.DM(body.inertia_about_com))
     full = [tensor[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-    com = np.array(ca.DM(body.center_of_mass)).ravel()
-    return {
-        "pos": format_xml_numbers(com),
-        "mass": format_xml_numbers([float(body.mass)]),
-        "fullinertia": format_xml_numbers(full),
-    }
+    com = np.array(ca.DM(body.center_of_mass)).ravel().tolist()
+    numbers = {"pos": com, "mass": [float(body.mass)], "fullinertia": full}
+    return {name: format_xml_numbers(values) for name, values in numbers.items()}
 
 
 def format_xml_numbers(numbers: Iterable[float]) -> str:

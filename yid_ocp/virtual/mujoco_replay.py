@@ -57,14 +57,8 @@ def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[st
     takes is compared with the recorded one.
 
     Returns `joints.position` of driven joints [rad] or `joints.effort` of prescribed ones [N m], all joints together,
-    and `GROUP.POINT` of every point of the model [m].
-
-    Raises
-    ------
-    ModelError
-        Nothing moves the model as recorded, it does not come to rest, or it diverges.
-    DataError
-        MuJoCo is not installed.
+    and `GROUP.POINT` of every point of the model [m]. `ModelError` where nothing moves the model as recorded, it does
+    not come to rest, or it diverges; `DataError` where MuJoCo is not installed.
     """
     mujoco, model = import_mujoco(), compile_mjcf(text)
     moved = system.driven or system.prescribed
@@ -102,7 +96,6 @@ class _Path:
         self._values = [spline, spline.derivative(1), spline.derivative(2)]
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """Offset from the start, velocity and acceleration at a time [s]."""
         angle, velocity, acceleration = (np.asarray(value(min(t, self._last))) for value in self._values)
         return angle - self._start, velocity, acceleration
 
@@ -196,21 +189,18 @@ def _errors(
     inside = t <= played.t[-1] + 1e-9
     if not system.driven:
         inside &= (t >= _AT_ENDS) & (t <= t[-1] - _AT_ENDS)
-    said = joints.position if system.driven else joints.effort
-    noise = joints.position_std if system.driven else joints.effort_std
+    name, unit = ("joints.position", "rad") if system.driven else ("joints.effort", "N m")
+    said, noise = (getattr(joints, name.removeprefix("joints.") + part) for part in ("", "_std"))
     if said is not None and inside.any():
         model = _at(t[inside], played.t, played.values)
         error = float(np.sqrt(np.mean((model - said[inside][:, columns]) ** 2)))
         level = np.zeros(1) if noise is None else np.broadcast_to(noise, (len(joints.names),))[columns]
-        unit = "rad" if system.driven else "N m"
-        name = "joints.position" if system.driven else "joints.effort"
         found[name] = ReplayMismatch(error, float(np.sqrt(np.mean(level**2))), unit)
     for group in recording.points:
         for i, point in enumerate(group.names):
-            known = point in system.point_frames
-            own = _point_error(group, i, joints.t[0], played, system.point_frames.index(point)) if known else None
-            if own is not None:
-                found[f"{group.name}.{point}"] = own
+            if point in system.point_frames:
+                own = _point_error(group, i, joints.t[0], played, system.point_frames.index(point))
+                found |= {} if own is None else {f"{group.name}.{point}": own}
     return found
 
 

@@ -53,23 +53,14 @@ class InjectedSimulatorTerms(Protocol):
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """Duration [s], rates [Hz] and time step [s] of a simulation.
-
-    Attributes
-    ----------
-    time_step : float
-        Of the simulator; must divide the controller's period.
-    controller_rate : float, optional
-        At which torques are computed, held in between, a multiple of `sample_rate`, which it is where absent.
-    effort_kind : {'sample', 'mean', 'command'}
-        What is recorded of the torque: a `command` needs a controller that is no faster than the recording.
-    """
+    """Duration [s], rates [Hz] and time step [s] of a simulation."""
 
     duration: float = 5.0
     sample_rate: float = 100.0
-    time_step: float = DEFAULT_SIMULATOR_TIME_STEP
+    time_step: float = DEFAULT_SIMULATOR_TIME_STEP  # must divide the controller's period
+    # at which torques are computed, held in between, a multiple of `sample_rate`, which it is where absent
     controller_rate: float | None = None
-    effort_kind: EffortKind = "command"
+    effort_kind: EffortKind = "command"  # what is recorded; `command` needs a controller no faster than the recording
 
     def __post_init__(self) -> None:
         controller, periods = self._controller_rate, self.controller_periods_per_sample
@@ -104,26 +95,19 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """Noise-free trajectories of a simulation at the times t, shape (N + 1,) [s].
+    """Noise-free trajectories of a simulation.
 
-    Attributes
-    ----------
-    q, v : ndarray, shape (N + 1, n)
-    effort : ndarray, shape (N + 1, nu)
-        Torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were commanded at
-        t_k; the last row was computed and not applied.
-    point_positions, frame_point_positions : ndarray, shape (N + 1, np, 3) and (M, np, 3)
-        Positions of `system.point_frames` in the world, at `t` and at `frame_times`, the camera's (M,) rounded to the
-        simulator's step [m].
+    `effort` is the torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were
+    commanded at t_k; its last row was computed and not applied. Points are `system.point_frames` in the world.
     """
 
-    t: Array
-    q: Array
-    v: Array
-    effort: Array
-    point_positions: Array
-    frame_times: Array
-    frame_point_positions: Array
+    t: Array  # shape (N + 1,) [s]
+    q: Array  # shape (N + 1, n)
+    v: Array  # shape (N + 1, n)
+    effort: Array  # shape (N + 1, nu)
+    point_positions: Array  # shape (N + 1, np, 3) [m]
+    frame_times: Array  # the camera's, rounded to the simulator's step, shape (M,) [s]
+    frame_point_positions: Array  # at these, shape (M, np, 3) [m]
 
 
 def simulate_in_mujoco(
@@ -143,12 +127,10 @@ def simulate_in_mujoco(
 
     Parameters
     ----------
-    values : mapping of str to float or None
-        Nominal where absent.
     motion : JointMotion
         Of exactly the driven joints.
     initial_joint_angles : mapping of str to float, optional
-        Initial angles [rad or m]; `grasping_joint_angles` where absent.
+        [rad or m]; `grasping_joint_angles` where absent.
     frame_times : array_like, shape (M,)
         When a camera looks [s], increasing, in [0, duration].
     injected : InjectedSimulatorTerms, optional
@@ -160,8 +142,7 @@ def simulate_in_mujoco(
     Raises
     ------
     ModelError
-        The system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not come to rest, or
-        diverges.
+        The system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not rest, or diverges.
     DataError
         MuJoCo is not installed.
     """
@@ -234,12 +215,8 @@ def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
 
     `damping` replaces the joints' own damping meanwhile, which could decide which of several equilibria is found.
     """
-    model, data, driven = scene.model, scene.data, scene.moved_joint_ids
-    held = copy.copy(model)
+    data, driven, held = scene.data, scene.moved_joint_ids, _settling_model(scene, damping)
     target = data.qpos[driven].copy()
-    others = np.setdiff1d(np.arange(model.nv), driven)
-    held.dof_damping[:] = damping
-    held.dof_damping[others] *= _SETTLING_FACTOR
     held.dof_damping[driven] += _HOLD_DAMPING
     held.jnt_stiffness[driven] += _HOLD_STIFFNESS
     held.qpos_spring[driven] = target
@@ -252,6 +229,14 @@ def settle_to_equilibrium(scene: MujocoScene, damping: Array) -> Array:
     balance = _HOLD_STIFFNESS * (held.qpos_spring[driven] - data.qpos[driven])
     data.qvel[:], data.qacc_warmstart[:], data.time = 0.0, 0.0, 0.0
     return balance
+
+
+def _settling_model(scene: MujocoScene, damping: Array) -> Any:
+    """A copy of the model with more damping of what is not driven."""
+    held = copy.copy(scene.model)
+    held.dof_damping[:] = damping
+    held.dof_damping[np.setdiff1d(np.arange(held.nv), scene.moved_joint_ids)] *= _SETTLING_FACTOR
+    return held
 
 
 def _lost(scene: MujocoScene) -> bool:
@@ -322,15 +307,10 @@ def settle_under_servo_commands(scene: MujocoScene, damping: Array, commands: Ar
     """Bring the scene to rest under constant servo commands, with `damping` increased meanwhile."""
     model, data = scene.model, scene.data
     data.ctrl[:] = commands
-    held = copy.copy(model)
-    held.dof_damping[:] = damping
-    others = np.setdiff1d(np.arange(model.nv), scene.moved_joint_ids)
-    held.dof_damping[others] *= _SETTLING_FACTOR
+    held = _settling_model(scene, damping)
     if hasattr(held, "actuator_delay"):
         held.actuator_delay[:] = 0.0
-    for calm in _calming(scene, held):
-        if calm < _REST:
-            break
+    next(calm for calm in _calming(scene, held) if calm < _REST)
     posture = data.qpos.copy()
     scene.mujoco.mj_resetData(model, data)
     data.qpos[:] = posture
@@ -395,12 +375,9 @@ def _play(
     effort = np.array(torques[::periods])
     if simulation.effort_kind == "mean":
         effort[:-1] = np.array(torques[:-1]).reshape(steps, periods, -1).mean(1)
-    return SimulationResult(
+    t, frame_times = (
         np.arange(steps + 1) / simulation.sample_rate,
-        np.array(q),
-        np.array(v),
-        effort,
-        np.array(points),
-        np.asarray(frames[: len(seen)] * simulation.time_step),
-        np.array(seen).reshape(len(seen), len(scene.point_site_ids), 3),
+        simulation.time_step * frames[: len(seen)].astype(float),
     )
+    frame_points = np.array(seen).reshape(len(seen), len(scene.point_site_ids), 3)
+    return SimulationResult(t, np.array(q), np.array(v), effort, np.array(points), frame_times, frame_points)
