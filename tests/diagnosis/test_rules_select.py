@@ -13,13 +13,12 @@ from heard import Heard
 
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext
-from yid_ocp.diagnosis.screening import CandidatePairScore, ScreeningResult, score_candidates_jointly
+from yid_ocp.diagnosis.screening import ScreeningResult, score_candidates_jointly
 from yid_ocp.diagnosis.select import (
     _is_amplitude_outside_prior,
     _is_rmse_reduced,
     _is_shape_outside_prior,
     _is_significant,
-    _lr_decisive,
     _near_best_models,
     _pairs_to_refit,
     _refit_shortlist,
@@ -324,11 +323,8 @@ class Rounds:
 
     def promised(self, among):
         kinds = {of.kind: of for of in (A, B, C) if of.label in among}
-        return [
-            CandidatePairScore((kinds[one], kinds[other]), {}, 7.0)
-            for one, other in self.ranked_pairs
-            if {one, other} <= set(kinds)
-        ]
+        pairs = [(one, other) for one, other in self.ranked_pairs if {one, other} <= set(kinds)]
+        return [((kinds[one], kinds[other]), {}, 7.0) for one, other in pairs]
 
     def screen(self, problem, base, values, limits):
         if not values and self.before is None:
@@ -482,9 +478,8 @@ def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best,
     },
 )
 def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(before, after, sure):
-    assert _lr_decisive(loss(*before), loss(*after)) is sure
     assert held_out_gap_closure(loss(*before), loss(*after)).is_decisive is sure
-    assert not _lr_decisive(loss(*before), loss(*after), Thresholds(min_log_bayes_factor=20.0))
+    assert not held_out_gap_closure(loss(*before), loss(*after), Thresholds(min_log_bayes_factor=20.0)).is_decisive
 
 
 def test_all_recordings_tell_which_effects_are_within_reach():
@@ -621,7 +616,7 @@ def test_both_of_a_pair_have_to_be_there(monkeypatch, absent):
 
 def test_pairs_that_others_can_stand_in_for_are_not_refitted():
     kinds = {name: effect(f"{name}@x", amplitude()) for name in "abcdef"}
-    promised = [CandidatePairScore((kinds[one], kinds[other]), {}, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
+    promised = [((kinds[one], kinds[other]), {}, 7.0 - i) for i, (one, other) in enumerate(PROMISED)]
     table = np.eye(6)
     table[3, 1] = 0.9  # d's signature is b's, not the other way round
     found = ScreeningResult(

@@ -15,11 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from yid_ocp.analysis.estimate_history import (
-    RunEstimates,
-    nearby_positive_definite_covariance,
-    pool_estimates,
-)
+from yid_ocp.analysis.estimate_history import RunEstimates, nearby_positive_definite_covariance, pool_estimates
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis.hypotheses import neutral_effect_parameter_values
 from yid_ocp.diagnosis.refit import REFIT_SOLVER, RefittedModel, held_out_channel_errors
@@ -74,12 +70,7 @@ class BaselineComparison:
 def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
     """Return the problem with a baseline's estimates as a joint prior and its parameters free.
 
-    The problem is of the same model, with the effects that the earlier run had.
-
-    Raises
-    ------
-    ConfigError
-        Parameters or effects that the model does not have, or that differ from recording to recording here.
+    `ConfigError`: parameters or effects that the model does not have, or that differ from recording to recording here.
     """
     names, parameters = baseline.parameter_names, problem.system.parameters
     for name in names:
@@ -93,11 +84,8 @@ def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
                 hint="add it under model.effects" if "@" in effect else nearest_name_hint(name, parameters.names),
             )
         if name in problem.options.local_parameters:
-            raise ConfigError(
-                f"'{name}' has a value of its own in every recording, so a baseline says nothing of it",
-                where=f"parameters.{name}.local",
-                hint="leave `local` out",
-            )
+            what = f"'{name}' has a value of its own in every recording, so a baseline says nothing of it"
+            raise ConfigError(what, where=f"parameters.{name}.local", hint="leave `local` out")
     values = dict(zip(parameters.names, map(float, problem.theta), strict=True))
     values |= dict(zip(names, map(float, baseline.values), strict=True))
     prior = MultivariateGaussianPrior(names, nearby_positive_definite_covariance(baseline.covariance))
@@ -162,8 +150,8 @@ class BaselineData:
     ) -> CounterfactualTest | None:
         """Predict reference recordings with the effects of `last` removed, and the diagnosed ones with them added.
 
-        A message stands for what cannot be predicted; None without effects or reference recordings. Without earlier
-        runs what is known of the world without the effects is estimated on the reference recordings.
+        None without effects or reference recordings. Without earlier runs what is known of the world without the
+        effects is estimated on the reference recordings.
         """
         without, known = self.reference_recordings, self.combined_estimates
         if not last.effects or not without:
@@ -175,12 +163,9 @@ class BaselineData:
         held = [e.recording for e in (*last.problem.episodes, *last.problem.held_out)]
         present = list({id(recording): recording for recording in held}.values())
         removed = _predicted(last, without, {name: nominal.values[name] for name in shared}, now)
+        then = {} if known is None else dict(zip(known.parameter_names, known.values, strict=True))
         try:
-            then = (
-                _estimated_without(last, without, shared)
-                if known is None
-                else dict(zip(known.parameter_names, known.values, strict=True))
-            )
+            then = then or _estimated_without(last, without, shared)
         except YidError as error:
             return CounterfactualTest(removed, _nothing(present, error.what))
         return CounterfactualTest(removed, _predicted(last, present, then, {**then, **effects}))
@@ -210,14 +195,12 @@ class _PredictionErrors:
     @property
     def rmse_by_unit(self) -> dict[str, tuple[float, float]]:
         """Root mean square over the channels of each unit: (without a diagnosis, counterfactual)."""
-        found = {}
-        for unit in dict.fromkeys(unit for _, unit in self.without_diagnosis.values()):
-            before, after = (
-                float(np.sqrt(np.mean([e**2 for e, of in errors.values() if of == unit])))
-                for errors in (self.without_diagnosis, self.counterfactual)
-            )
-            found[unit] = (before, after)
-        return found
+
+        def rms(errors: _ChannelErrors, unit: str) -> float:
+            return float(np.sqrt(np.mean([e**2 for e, of in errors.values() if of == unit])))
+
+        units = dict.fromkeys(unit for _, unit in self.without_diagnosis.values())
+        return {unit: (rms(self.without_diagnosis, unit), rms(self.counterfactual, unit)) for unit in units}
 
     @property
     def is_improved_by_counterfactual(self) -> bool:
@@ -238,11 +221,9 @@ class _PredictionErrors:
 class CounterfactualTest:
     """Prediction errors with the effects removed, and with the effects added."""
 
-    # recordings made without the effects: by the diagnosed model with its effects taken out, against the
-    # nominal model as it was fitted to the recordings with them
+    # made without the effects: by the diagnosed model less its effects, against the nominal model as it was fitted
     effects_removed: _PredictionErrors
-    # recordings made with the effects: by the model of the world without them with the effects put in, against
-    # that model alone
+    # made with them: by the model of the world without them with the effects put in, against that model alone
     effects_added: _PredictionErrors
 
     def to_dict(self) -> dict[str, Any]:
@@ -289,7 +270,6 @@ def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared
     problem = _on(last, without).with_free_subset(shared)
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
     if outcome.status == Status.FAILED:
-        raise SolverError(
-            f"the nominal model cannot be fitted to the recordings without the effects: {outcome.message}"
-        )
+        what = "the nominal model cannot be fitted to the recordings without the effects"
+        raise SolverError(f"{what}: {outcome.message}")
     return {name: problem.named_values(outcome.x)[name] for name in shared}

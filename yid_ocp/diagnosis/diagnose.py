@@ -99,28 +99,22 @@ def diagnose(
     ----------
     problem : EstimationProblem
         Of the nominal model, with the stiffnesses free.
-    candidates : "all" or sequence of str
-        `kind` or `kind@location`.
+    candidates, exclude : "all" or sequence of str
+        Effects that are tried, and of these some that are not: `kind` or `kind@location`.
     held_out : sequence of Recording
         Never touched by a fit; the problem's own where absent. Where there are none, alternate blocks are held out.
     progress : Progress, optional
         The package's log when absent.
-    known_fits : PrecomputedFits, optional
     baseline : RunEstimates or sequence of RunEstimates, or BaselineData, optional
         What earlier runs of the same model say of its parameters (`read_estimates`): priors, so that the question is
         what differs now. A problem that has them already (`with_baseline_prior`) is taken as it is. A `BaselineData`
         may have reference recordings too, made without what is looked for; the effects found are taken out for them.
-    exclude : sequence of str, optional
-        Candidates that are not tried, `kind` or `kind@location`.
 
     Raises
     ------
-    ConfigError, ModelError
-        Candidates that do not fit the system.
-    DataError
-        Held-out recordings that are estimated on, no noise level.
-    SolverError
-        The nominal model cannot be rolled out, or is not whitened.
+    ConfigError, ModelError, DataError, SolverError
+        Candidates that do not fit the system; held-out recordings that are estimated on, no noise level; a nominal
+        model that cannot be rolled out, or is not whitened.
     """
     # the matrices are small: threads of the linear algebra library cost more than they give
     with threadpoolctl.threadpool_limits(1):
@@ -272,16 +266,17 @@ def _happened(
         residual = judged.evaluate(x, False, guesses)
         if not residual.ok:
             return NO_EVENTS, None
-        is_flagged = any(window.is_flagged for window in _null_test(judged, residual.residual, fit, limits).windows)
+        test = _null_test(judged, residual.residual, len(fit.values), limits)
+        is_flagged = any(window.is_flagged for window in test.windows)
     evaluation = own.evaluate(x, is_flagged, guesses)
     if is_flagged:
         smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits)
     if not evaluation.ok:
         return NO_EVENTS, None
     found = find_disturbance_events(own, x, evaluation, smoothed, limits)
-    pushed, share = found.only_force_events, 1 - limits.min_event_chi2_fraction
+    (pushed, others), share = found.split_by_force(), 1 - limits.min_event_chi2_fraction
     if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
-        found = found.without_force_events
+        found = others
     return found, smoothed
 
 
@@ -412,12 +407,9 @@ def _composed(
 ) -> AllCandidatesProblem:
     """The problem with all candidates; see `diagnose` for what is refused."""
     if problem.options.weighting != "whitened":
-        raise SolverError(
-            "a diagnosis needs residuals in units of their noise",
-            where="problem.weighting",
-            allowed="whitened",
-            hint="set problem.weighting: whitened and the noise levels under `sensors`",
-        )
+        what = "a diagnosis needs residuals in units of their noise"
+        hint = "set problem.weighting: whitened and the noise levels under `sensors`"
+        raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
     exclude_candidates(effects, leave_out)  # refused before anything is compiled
     progress.begin_stage(f"composing {len(effects)} candidates into one step")
@@ -453,11 +445,9 @@ def _after(
 
 def _changes(before: RefittedModel, after: RefittedModel) -> tuple[NominalParameterChange, ...]:
     """How each nominal parameter changes from one model to another."""
-    parameters = before.problem.system.parameters
-    return tuple(
-        NominalParameterChange(name, parameters[name].unit, before.values[name], after.values[name], after.std[name])
-        for name in before.problem.shared_parameters
-    )
+    names, parameters = before.problem.shared_parameters, before.problem.system.parameters
+    pairs = ((name, (before.values[name], after.values[name], after.std[name])) for name in names)
+    return tuple(NominalParameterChange(name, parameters[name].unit, *values) for name, values in pairs)
 
 
 def fit_nominal_model(
@@ -467,13 +457,7 @@ def fit_nominal_model(
     store: RefitStore | None = None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
-    """Return the fit of the nominal model within the problem with all candidates.
-
-    Raises
-    ------
-    SolverError
-        The nominal model cannot be rolled out.
-    """
+    """Return the fit of the nominal model within the problem with all candidates; `SolverError` if it cannot move."""
     known = load_stored_refit(composed, (), store)
     if known is not None and composed.problem.has_process_noise:
         known = load_stored_refit(composed.whitened_at(known.values), (), store)
@@ -506,18 +490,14 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
     return found
 
 
-def _null_test(
-    problem: EstimationProblem, residual: Array, fit: RefittedModel | None, limits: Thresholds
-) -> NullTestResult:
-    """The null test of a residual from which a fit's parameters took their part."""
-    count = 0 if fit is None else len(fit.values)
-    return run_null_test(
-        residual_channel_samples(problem), residual, count, limits.significance_level, limits.residual_window
-    )
+def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits: Thresholds) -> NullTestResult:
+    """The null test of a residual from which so many fitted parameters took their part."""
+    samples = residual_channel_samples(problem)
+    return run_null_test(samples, residual, fitted, limits.significance_level, limits.residual_window)
 
 
-def _estimation_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
-    return _null_test(fit.problem, fit.evaluation.residual, fit, limits)
+def _estimation_null_test(fit: RefittedModel, limits: Thresholds) -> NullTestResult:
+    return _null_test(fit.problem, fit.evaluation.residual, len(fit.values), limits)
 
 
 def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHOLDS) -> NullTestResult:
@@ -526,18 +506,15 @@ def _held_out_null_test(fit: RefittedModel, limits: Thresholds = DEFAULT_THRESHO
     residuals, slopes = [], []
     for i, (episode, result) in enumerate(problem.predict_held_out(problem.vector(fit.values), True)):
         if isinstance(result, str):
-            raise DataError(
-                f"the held-out recording cannot be predicted: {result}",
-                where=episode.name,
-                hint="hold out a recording that the nominal model can follow",
-            )
+            what = f"the held-out recording cannot be predicted: {result}"
+            raise DataError(what, where=episode.name, hint="hold out a recording that the nominal model can follow")
         rows = problem.whitened_held_out_residual(i, episode, result)
         assert rows.jacobian is not None
         residuals.append(rows.residual)
         slopes.append(rows.jacobian[:, :shared])
     spread = np.vstack(slopes) @ unknowns_covariance_factor(problem, fit.evaluation)[:shared]
     residual = whiten_with_extra_errors(np.concatenate(residuals), spread)
-    return _null_test(problem.with_episodes(problem.held_out, ()), residual, None, limits)
+    return _null_test(problem.with_episodes(problem.held_out, ()), residual, 0, limits)
 
 
 def _smooth_about_model(fit: RefittedModel, limits: Thresholds) -> SmootherResult:

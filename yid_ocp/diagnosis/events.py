@@ -52,8 +52,7 @@ _STENCIL_STEPS = (4, 7, 10)  # distances of the samples through which a smooth c
 _NEIGHBOUR_COUNT = 20  # samples on either side with which one is compared
 _MIN_NEIGHBOUR_RATIO = 3.0  # times the largest deviation among its neighbours by which a wrong sample stands out
 _MIN_RECURRENCE_OVERLAP = 0.5  # part of the longer of two windows by which they overlap where they are the same time
-_MAX_RECURRING_FRACTION = 0.5
-"""Part of all forces that recur from which those that do are the motion's, which a model has to have."""
+_MAX_RECURRING_FRACTION = 0.5  # part of all forces that recur from which those that do are the motion's own
 _WRONG_SAMPLE_Z = 8.0  # standard deviations of noise, and robust ones of its neighbours, by which it does
 
 
@@ -75,7 +74,7 @@ class DisturbanceEvent:
     unit: str
     detected_pulse: DetectedForcePulse | None = None  # shape of a force
 
-    def overlap_duration(self, other: DisturbanceEvent) -> float:
+    def _overlap(self, other: DisturbanceEvent) -> float:
         """Time for which both last, of whatever recording [s]; negative where one begins after the other."""
         return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
 
@@ -107,20 +106,14 @@ class EventSet:
 
     def has_same_disturbances(self, other: EventSet) -> bool:
         """Whether both hold events of the same channels at overlapping times."""
-        return len(self.disturbances) == len(other.disturbances) and all(
-            (a.recording, a.channel) == (b.recording, b.channel) and a.overlap_duration(b) > 0
-            for a, b in zip(self.disturbances, other.disturbances, strict=True)
-        )
+        pairs = list(zip(self.disturbances, other.disturbances, strict=False))
+        same = [(a.recording, a.channel) == (b.recording, b.channel) and a._overlap(b) > 0 for a, b in pairs]
+        return len(self.disturbances) == len(other.disturbances) and all(same)
 
-    @property
-    def only_force_events(self) -> EventSet:
-        """Only the force events."""
-        return EventSet(tuple(event for event in self.disturbances if event.kind == "force"))
-
-    @property
-    def without_force_events(self) -> EventSet:
-        """The events that are not forces, and the overspeeds."""
-        return EventSet(tuple(event for event in self.disturbances if event.kind != "force"), self.overspeeds)
+    def split_by_force(self) -> tuple[EventSet, EventSet]:
+        """The force events alone, and the other events with the overspeeds."""
+        forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
+        return EventSet(forces), EventSet(others, self.overspeeds)
 
     def for_recording(self, recording: str) -> tuple[DisturbanceEvent, ...]:
         """Return the events of one recording."""
@@ -144,8 +137,7 @@ def find_disturbance_events(
     """Find events in all recordings of a problem that are more than chance, by the false-discovery rate of all windows.
 
     The problem is whitened by the sensors' noise and has all samples; `x` (nx,) is its fit, at which `evaluation` has a
-    Jacobian where there is `smoothed`, what the smoother found about it. Forces that move the model are sought where it
-    found some, in the recordings that were estimated on.
+    Jacobian where there is `smoothed`. Forces that move the model are sought where the smoother found some.
     """
     runs: list[_RecordingRollout] = []
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
@@ -170,9 +162,7 @@ def find_disturbance_events(
     real = benjamini_hochberg_mask([pulse.p_value for _, pulse in found], tries, limits.significance_level)
     forces = _one_each([entry for entry, sure in zip(found, real, strict=True) if sure], problem)
     times = {(e.recording, 0.5 * (e.start_time + e.end_time)) for e in wrong}
-    forces = [
-        f for f in forces if not any(f.recording == name and f.start_time <= t <= f.end_time for name, t in times)
-    ]
+    forces = [f for f in forces if not any(f.recording == n and f.start_time <= t <= f.end_time for n, t in times)]
     single = [f for f in forces if not any(_recurs(f, other) for other in forces)]
     if len(single) < _MAX_RECURRING_FRACTION * len(forces):
         forces = single
@@ -278,16 +268,9 @@ def _driving_forces(
             for name in sought[model.recording]:
                 index, at = model.unknown_names.index(name), problem.system.mechanism.joint_index(name)
                 source, size = model.unknown_groups[index], model.reference_std[index]
-                score, information = force_log_likelihood_coefficients(
-                    model, smoothed.group_variance | {source: 0.0}, index
-                )
-                what = (
-                    model.recording,
-                    source.location,
-                    name,
-                    generalised_force_unit(problem.system, name),
-                    middle[full],
-                )
+                variance, unit = smoothed.group_variance | {source: 0.0}, generalised_force_unit(problem.system, name)
+                score, information = force_log_likelihood_coefficients(model, variance, index)
+                what = (model.recording, source.location, name, unit, middle[full])
                 known = (score[full] / size, information[full, full] / size**2)
                 found.append(ForceEstimate(*what, *known, error[full, at], held[full, at]))
     return found
@@ -316,7 +299,7 @@ def _one_each(
         size = (pulse.peak_value, pulse.impulse, pulse.peak_std * pulse.impulse_per_unit_peak, history.unit)
         event = DisturbanceEvent(*what, *size, pulse)
         same = [e for e in kept if e.recording == event.recording and not {e.channel, event.channel} <= prescribed]
-        if all(event.overlap_duration(other) <= 0 for other in same):
+        if all(event._overlap(other) <= 0 for other in same):
             kept.append(event)
     return kept
 
@@ -326,7 +309,7 @@ def _recurs(one: DisturbanceEvent, other: DisturbanceEvent) -> bool:
     if one.recording == other.recording or one.channel != other.channel or one.peak_value * other.peak_value < 0:
         return False
     longer = max(one.end_time - one.start_time, other.end_time - other.start_time)
-    return one.overlap_duration(other) > _MIN_RECURRENCE_OVERLAP * longer
+    return one._overlap(other) > _MIN_RECURRENCE_OVERLAP * longer
 
 
 # -- wrong samples ----------------------------------------------------------------------------------------------------
@@ -370,11 +353,9 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
     group = f"joints.{quantity}"
     choice = options.sensors.get(group, SensorOptions())
     given = choice.std if choice.std is not None else getattr(joints, CHANNEL_KINDS[group].std_attribute_names[0])
-    std = (
-        0.0
-        if given is None
-        else float(expand_to_joint_values(given, joints.names, (joint,), f"sensors.{group}.std")[0])
-    )
+    std = 0.0
+    if given is not None:
+        std = float(expand_to_joint_values(given, joints.names, (joint,), f"sensors.{group}.std")[0])
     if quantity == "effort" and joint in system.prescribed and math.isfinite(options.path_cutoff):
         # of one sample that much is left: its share of the filter's time
         share = 2 * options.path_cutoff * float(np.median(np.diff(joints.t)))
@@ -436,8 +417,8 @@ def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -
     """Return the problem with force events compensated and affected samples excluded.
 
     Forces at joints that recorded torques drive act beside these. Samples of prescribed joints' efforts in the window
-    of an event of that joint, samples that are wrong themselves, and all that follows an overspeed do not count. Forces
-    on an object and at servos stay in.
+    of an event there, wrong samples, and all that follows an overspeed do not count. Forces on an object and at servos
+    stay in.
     """
     system, cutoff = problem.system, problem.options.path_cutoff
 

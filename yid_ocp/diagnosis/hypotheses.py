@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 from weakref import WeakKeyDictionary
 
@@ -40,22 +41,14 @@ def make_candidate_effects(
 ) -> list[EffectBase]:
     """Return the candidate effects, excluding those of the nominal model `system`.
 
-    Parameters
-    ----------
-    choice : "all" or sequence of str
-        `kind` (wherever a diagnosis tries it) or `kind@location`.
-
-    Raises
-    ------
-    ConfigError
-        No such kind, a kind that has no place here, an effect of the nominal model, an empty list.
-    ModelError
-        A location that does not exist.
+    The choice is "all", or names of the form `kind` (wherever a diagnosis tries it) or `kind@location`. `ConfigError`:
+    no such kind, one that has no place here, an effect of the nominal model, an empty list; `ModelError`: no such
+    location.
     """
     where, sensors = "diagnosis.candidates", recorded_sensor_kinds(recordings)
     present = {f"{effect.kind}@{effect.location}" for effect in system.effects}
     possible = [pair for pair in candidate_kinds_and_locations(system, sensors) if "@".join(pair) not in present]
-    if isinstance(choice, str) and choice == "all":
+    if choice == "all":
         return [make_effect(kind, place, system) for kind, place in possible]
     if isinstance(choice, str) or not choice:
         what = f"candidates = '{choice}'" if choice else "there is no candidate to try"
@@ -82,12 +75,8 @@ def make_candidate_effects(
 def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> list[EffectBase]:
     """Return the candidates without those named, as `kind` or `kind@location`.
 
-    Excluded candidates stay in the compiled step at their neutral values, so that no recompilation is needed.
-
-    Raises
-    ------
-    ConfigError
-        A name that is no candidate, or none is left.
+    They stay in the compiled step at their neutral values, so that no recompilation is needed. `ConfigError` where a
+    name is no candidate, or none is left.
     """
     where = "diagnosis.exclude"
     known = {name for effect in effects for name in (effect.kind, effect.label)}
@@ -136,24 +125,15 @@ class AllCandidatesProblem:
     def from_problem(
         problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
     ) -> AllCandidatesProblem:
-        """Build from a problem and its candidates, all at neutral values.
-
-        Raises
-        ------
-        DataError
-            A recording is both estimated on and held out.
-        """
+        """Build from a problem and its candidates; `DataError` if a recording is both estimated on and held out."""
         joint, effects = _joint(problem.step, tuple(effects))
         estimate = [episode.recording for episode in problem.episodes]
         held = [*held_out] or [episode.recording for episode in problem.held_out]
         for recording in held:
-            if any(recording is other or _same(recording, other) for other in estimate):
-                raise DataError(
-                    "a recording is both estimated on and held out",
-                    where=recording.name,
-                    allowed="held-out recordings of other motions",
-                    hint="leave held_out empty to split one recording in blocks",
-                )
+            if any(_same(recording, other) for other in estimate):
+                what, allowed = "a recording is both estimated on and held out", "held-out recordings of other motions"
+                hint = "leave held_out empty to split one recording in blocks"
+                raise DataError(what, where=recording.name, allowed=allowed, hint=hint)
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         extra = [name for effect in effects for name in effect.parameters.names]
         made = EstimationProblem(joint, estimate, problem.free, problem.options, values, held, extra)
@@ -165,10 +145,8 @@ class AllCandidatesProblem:
         return self.problem.free
 
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
-        """Return the problem whitened by sensor noise and torque noise, linearised at these unknowns.
-
-        Twice in a row, so that what is frozen is about the offsets that the torques have there.
-        """
+        """Return the problem whitened by sensor noise and torque noise, linearised at these unknowns."""
+        # twice in a row, so that what is frozen is about the offsets that the torques have there
         x = self.problem.vector(values)
         return replace(self, problem=problem_with_whitened_held_out(problem_whitened_at(self.problem, x, rounds=2), x))
 
@@ -177,9 +155,8 @@ class AllCandidatesProblem:
     ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
         """Truncate held-out recordings where the rollout fails; return the problem and the truncated recordings.
 
-        A gap may be so large that the nominal model cannot follow a recording at all; what it says until then is
-        compared all the same. Where nothing worth predicting is left, those to estimate on are split in blocks. Weights
-        are those of the sensors' noise; see `whitened_at`. `margin` is the part that is kept of what it follows.
+        `margin` is the part that is kept of what the nominal model follows. Where nothing worth predicting is left,
+        recordings to estimate on are split in blocks. Weights are those of the sensors' noise; see `whitened_at`.
         """
         problem, x = self.problem, self.problem.vector(values)
         kept, cuts = [], []
@@ -206,8 +183,7 @@ class AllCandidatesProblem:
     def relinearized_with_effects(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
         """Return the problem with some effects free, relinearised about the torque errors that remain with them.
 
-        Torque offsets that the nominal model sees are too large by what an effect does. Filters of held-out recordings
-        are left as they are: see `with_held_out_relinearized`.
+        Filters of held-out recordings are left as they are: see `with_held_out_relinearized`.
         """
         own = self.with_free_effects(effects)
         return problem_relinearized_at_torque_bias(own, *_beside(own, effects, at)) if own.has_process_noise else own
@@ -242,12 +218,8 @@ def _identity(effect: EffectBase) -> tuple[object, ...]:
 
 def _same(a: Recording, b: Recording) -> bool:
     """Whether two recordings hold the same positions."""
-    first, second = (
-        [*([] if r.joints is None else [r.joints.position]), *(group.position for group in r.points)] for r in (a, b)
-    )
-    return len(first) == len(second) and all(
-        np.array_equal(x, y, equal_nan=True) for x, y in zip(first, second, strict=True)
-    )
+    first, second = ([group.position for group in (r.joints, *r.points) if group is not None] for r in (a, b))
+    return len(first) == len(second) and all(map(partial(np.array_equal, equal_nan=True), first, second))
 
 
 def _in_blocks(problem: EstimationProblem) -> EstimationProblem:

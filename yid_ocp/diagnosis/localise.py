@@ -97,9 +97,8 @@ def attribute_gap_to_effects(
 ) -> tuple[GapLocation, ...]:
     """Return locations with shares by the closure of the effects there, the rest shared out by the smoother.
 
-    `before` and `rest` are the locations of the nominal model and of the model with the effects, `closed` the part of
-    the gap that the effects at each location close, and `windows` when the residual was more than noise, for locations
-    that the smoother has no unknown for (`world`, `clock`).
+    `before` and `rest` are the locations of the nominal model and of the model with the effects, `closed` is the part
+    that the effects at each close, `windows` serve locations without an unknown of the smoother (`world`, `clock`).
     """
     known = {place.location: place for place in before}
     left, share = max(1.0 - sum(closed.values()), 0.0), dict(closed)
@@ -123,8 +122,7 @@ def smoothed_unknown_z_scores(
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Return edges (J + 1,) [s], names, and values (J, nd) of a recording's unknowns over their posterior std.
 
-    Those that are not informed are NaN: informed is a value of which 1 - posterior/prior variance is above
-    `informed_fraction`.
+    They are NaN unless 1 - posterior/prior variance is above `informed_fraction`.
     """
     trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])

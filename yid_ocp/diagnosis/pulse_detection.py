@@ -67,10 +67,8 @@ class InverseDynamicsModel:
         squares, needed, held = (np.array(part).T for part in function(*(x[nodes].T for x in (q, v, a, z)), theta))
         applied = np.zeros((len(nodes), n))
         torque = applied_joint_torque(self._step, theta, rollout)
-        for indices, effort in (
-            (system.driven_coordinate_indices, torque),
-            (system.prescribed_coordinate_indices, rollout.effort),
-        ):
+        driven, prescribed = system.driven_coordinate_indices, system.prescribed_coordinate_indices
+        for indices, effort in ((driven, torque), (prescribed, rollout.effort)):
             if indices:
                 applied[:, list(indices)] = effort[np.minimum(nodes, len(effort) - 1)]
         rate = np.gradient(needed, time_step * nodes, axis=0) if len(nodes) > 1 else np.zeros_like(needed)
@@ -121,11 +119,8 @@ _FLAT_RAMP_FRACTION = 0.5  # part of a flat pulse in which it rises and falls
 _MAX_PROFILES = 12  # pulses and what is like them in one history
 MAX_EVENT_TIME_FRACTION = 1 / 3
 """Part of the time from which forces in short windows are none of events: the model errs everywhere."""
-_MIN_PROMINENCE_RATIO = 1.5
-"""Times the median size of a pulse of the same length anywhere in the history that one must have: more than the
-largest value of a sine over its median."""
-_MAX_PULSE_RANGE_RATIO = 1.5
-"""Times the range of the history about it that a pulse may have at most: a larger one is made up by the rest."""
+_MIN_PROMINENCE_RATIO = 1.5  # times the median size anywhere that a pulse must have: more than a sine's maximum has
+_MAX_PULSE_RANGE_RATIO = 1.5  # times the range of the history about it that one may have: a larger one is made up
 
 
 @dataclass(frozen=True)
@@ -317,7 +312,6 @@ def detect_force_pulses(
     """Return the pulses of one force history, largest evidence first, and the number of windows searched.
 
     p-values are those of single windows; windows count that do not overlap, of lengths a factor of two apart.
-    `limits.min_log_bayes_factor` is the rise of the log evidence from which a pulse is looked at.
     """
     windows, tries, profiles = _looked_at(history.t.tobytes(), history.filter_cutoff, limits.max_event_duration)
     if not len(windows.begin):

@@ -35,10 +35,8 @@ from yid_ocp.solvers.base import SolverResult
 
 REFIT_SOLVER = GaussNewton(max_iterations=25, step_tolerance=1e-3, cost_tolerance=1e-5)
 """A refit starts near its end and must be good to a small part of its std and of `chi2_equivalence` only."""
-_UNINFORMATIVE_STD_RATIO = 100.0
-"""A standard deviation so many times the range in which an engineer would expect a parameter tells nothing of it."""
-_RELINEARIZE_Z = 1.0
-"""Stated standard deviations of a torque's offset; an effect that takes more of it is fitted once more."""
+_UNINFORMATIVE_STD_RATIO = 100.0  # times the prior range that a std may be: beyond it the parameter is not known at all
+_RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effect that takes more is fitted once more
 
 
 @dataclass(frozen=True)
@@ -149,12 +147,8 @@ def refit_with_effects(
     ----------
     start : mapping of str to float
         Where unknowns begin; a start that cannot be rolled out is drawn back towards neutral effects.
-    store : RefitStore, optional
-        Asked before the solver is, and told what it finds.
     name : str
         In the store; the effects' labels where empty, which do for refits that differ by their effects alone.
-    limits : Thresholds
-        For when a refit is tried again.
     """
     known = load_stored_refit(problem, effects, store, name)
     if known is not None:
@@ -216,16 +210,8 @@ def _model(
     x: Array,
     is_from_store: bool = False,
 ) -> RefittedModel:
-    loss, same = _held_out_loss(own, x), vars(known)
-    return RefittedModel(
-        **same,
-        effects=tuple(effects),
-        problem=own,
-        cost=finish.cost,
-        evaluation=finish,
-        held_out_loss=loss,
-        is_from_store=is_from_store,
-    )
+    rest = (tuple(effects), own, finish.cost, finish, _held_out_loss(own, x), is_from_store)
+    return RefittedModel(known.values, known.std, known.amplitude_std, known.solver_message, *rest)
 
 
 def _half_done(
@@ -237,9 +223,8 @@ def _half_done(
 ) -> bool:
     """Whether a refit explains much of what the model without the effects leaves, but by far not all."""
     own, count = problem.with_free_effects(effects), len(finish.residual)
-    before = own.evaluate(
-        own.vector({**start, **neutral_effect_parameter_values(effects)}), False, finish.equilibrium_guesses
-    )
+    x = own.vector({**start, **neutral_effect_parameter_values(effects)})
+    before = own.evaluate(x, False, finish.equilibrium_guesses)
     if 2 * finish.cost < limits.restart_chi2 * count or not before.ok:
         return False
     return before.cost - finish.cost > limits.restart_gain * (before.cost - count / 2)
@@ -270,12 +255,10 @@ def _attempt(
             break
     found = _seen(problem, effects, outcome)
     # without effects all weights are frozen anew where it ends
-    if (
-        found is None
-        or not effects
-        or max_normalized_torque_bias_difference(problem.problem.whitening_filters, found.problem.whitening_filters)
-        < _RELINEARIZE_Z
-    ):
+    if found is None or not effects:
+        return found
+    filters = problem.problem.whitening_filters, found.problem.whitening_filters
+    if max_normalized_torque_bias_difference(*filters) < _RELINEARIZE_Z:
         return found
     # about fixed torques a run stops where the effect and an offset that it makes superfluous hold each other
     outcome = REFIT_SOLVER.minimize_cost(found.problem, outcome.x, None, _relinearizing(found.problem))
@@ -374,19 +357,17 @@ def _block_duration(episodes: Sequence[Episode]) -> float:
 
 
 def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
-    """Return the loss of a model on the held-out recordings; initial states are found alike for every model."""
-    length = _block_duration(problem.held_out)
+    """The loss of a model on the held-out recordings; initial states are found alike for every model."""
+    length, found = _block_duration(problem.held_out), problem.predict_held_out(x)
     squares: list[Array] = []
     counts: list[Array] = []
-    found = problem.predict_held_out(x)
     for i, (episode, result) in enumerate(found):
         number = int(episode.grid.steps * episode.grid.time_step / length) + 1
         blocks = []
         for samples in episode.measurements:
-            block = np.minimum((times_since_recording_start(episode, samples) / length).astype(int), number - 1)
-            blocks.append(
-                np.broadcast_to(block.reshape(len(block), -1), samples.used_output_mask.shape)[samples.used_output_mask]
-            )
+            used, block = samples.used_output_mask, times_since_recording_start(episode, samples) / length
+            block = np.minimum(block.astype(int), number - 1).reshape(len(block), -1)
+            blocks.append(np.broadcast_to(block, used.shape)[used])
         of_row = np.concatenate(blocks)
         count = np.bincount(of_row, minlength=number).astype(float)
         if isinstance(result, str):

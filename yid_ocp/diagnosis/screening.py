@@ -85,12 +85,7 @@ def linearize_candidates(
     """Return the residual and the signatures of all candidates that are not yet in the model.
 
     Effects of `base` are in the model with all their parameters free, `values` are the unknowns of its fit, and `grid`
-    is the number of values of every shape parameter.
-
-    Raises
-    ------
-    SolverError
-        The model cannot be rolled out there.
+    is the number of values of every shape parameter. `SolverError` where the model cannot be rolled out there.
     """
     labels = {effect.label for effect in base}
     grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
@@ -102,9 +97,8 @@ def linearize_candidates(
         chosen = [effect for effect in problem.candidate_effects if k < len(grids.get(effect.label, ()))]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
         amplitudes = [name for effect in chosen for name in effect.amplitude_names]
-        trial = placed.with_free_subset((*problem.nominal_free_parameters, *own, *amplitudes)).with_parameter_values(
-            shape
-        )
+        trial = placed.with_free_subset((*problem.nominal_free_parameters, *own, *amplitudes))
+        trial = trial.with_parameter_values(shape)
         evaluation = trial.evaluate(trial.vector(values), equilibrium_guesses=warm)
         if not evaluation.ok or evaluation.jacobian is None:
             raise SolverError(f"the model cannot be linearised: {evaluation.message}", where="diagnosis")
@@ -142,18 +136,13 @@ def candidate_detectability(
         variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
         sizes = np.where(np.diag(information) > 1e-16, detection_z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
         detectable = dict(zip(effect.amplitude_names, map(float, sizes), strict=True))
-        visible = any(
-            size < max(abs(bound - neutral[name]) for bound in effect.prior_ranges[name])
-            for name, size in detectable.items()
-        )
-        best = found.get(effect.label)
-        if (
-            best is None
-            or (visible and not best.is_detectable)
-            or min(detectable.values()) < min(best.detectable_amplitudes.values())
-        ):
-            visible |= best is not None and best.is_detectable
-            found[effect.label] = CandidateDetectability(effect, detectable, visible)
+        widths = {n: max(abs(bound - neutral[n]) for bound in effect.prior_ranges[n]) for n in effect.amplitude_names}
+        visible = any(size < widths[name] for name, size in detectable.items())
+        new, best = CandidateDetectability(effect, detectable, visible), found.get(effect.label)
+        if best is None or (visible and not best.is_detectable):
+            found[effect.label] = new
+        elif min(detectable.values()) < min(best.detectable_amplitudes.values()):
+            found[effect.label] = replace(new, is_detectable=visible or best.is_detectable)
     return tuple(found.values())
 
 
@@ -252,8 +241,8 @@ def _score(signature: _EffectSignature, residual: Array, series: Sequence[Residu
 
 def _values(effect: EffectBase, step: Array) -> dict[str, float]:
     """Amplitudes a step from neutral."""
-    neutral = effect.neutral_values
-    return {name: neutral[name] + float(moved) for name, moved in zip(effect.amplitude_names, step, strict=True)}
+    named = zip(effect.amplitude_names, map(float, step), strict=True)
+    return {name: effect.neutral_values[name] + moved for name, moved in named}
 
 
 @dataclass(frozen=True)
@@ -269,13 +258,8 @@ class ConfusabilityMatrix:
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
 
-@dataclass(frozen=True)
-class CandidatePairScore:
-    """First-order decrease of the residual by two candidates together."""
-
-    effects: tuple[EffectBase, EffectBase]
-    predicted_values: dict[str, float]  # amplitudes after the step of the linear model, and the shape values
-    penalized_chi2_decrease: float  # decrease of r'r beyond what chance alone brings by so many amplitudes
+_CandidatePair = tuple[tuple[EffectBase, EffectBase], dict[str, float], float]
+"""Two candidates, their values after the step of the linear model, and by how much more than by chance r'r falls."""
 
 
 @dataclass(frozen=True)
@@ -289,11 +273,10 @@ class AllCandidatesScoreModel:
 
     @property
     def _columns(self) -> list[IntArray]:
-        """Columns of every candidate."""
         return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
 
-    def ranked_pairs(self, among: Sequence[str]) -> Iterator[CandidatePairScore]:
-        """Yield all pairs of the candidates with these labels, largest penalised decrease first.
+    def ranked_pairs(self, among: Sequence[str]) -> Iterator[_CandidatePair]:
+        """Yield all pairs of the candidates with these labels, largest decrease of r'r first.
 
         What two effects do together neither need do alone: one of them may hide in what the other leaves.
         """
@@ -313,7 +296,7 @@ class AllCandidatesScoreModel:
             (one, other), width = (self.effects[i], self.effects[j]), len(columns[i])
             values = _values(one, step[:width]) | _values(other, step[width:])
             values |= self.shape_values[i] | self.shape_values[j]
-            yield CandidatePairScore((one, other), values, float(penalized))
+            yield (one, other), values, float(penalized)
 
 
 def score_candidates_jointly(

@@ -21,8 +21,6 @@ from yid_ocp.diagnosis.refit import (
     refit_with_effects,
 )
 from yid_ocp.diagnosis.screening import (
-    CandidatePairScore,
-    CandidateScore,
     ScreeningResult,
     bonferroni_min_p_value,
     screen_candidates,
@@ -65,9 +63,8 @@ def held_out_gap_closure(
     sure = _lr_decisive(before, after, limits)
     if before.excess_chi2 <= 0 or not np.isfinite(after.chi2_per_sample):
         return replace(UNDEFINED_GAP_CLOSURE, is_decisive=sure)
-    draws = np.random.default_rng(0).integers(
-        0, len(before.block_sample_counts), (_N_BOOTSTRAP, len(before.block_sample_counts))
-    )
+    count = len(before.block_sample_counts)
+    draws = np.random.default_rng(0).integers(0, count, (_N_BOOTSTRAP, count))
     n = before.block_sample_counts[draws].sum(axis=1)
     g0 = np.maximum((before.block_chi2[draws].sum(axis=1) + before.baseline_chi2) / n - 1.0, 0.0)
     g1 = np.maximum((after.block_chi2[draws].sum(axis=1) + after.baseline_chi2) / n - 1.0, 0.0)
@@ -76,7 +73,7 @@ def held_out_gap_closure(
     return GapClosure(1 - after.excess_chi2 / before.excess_chi2, float(low), float(high), sure)
 
 
-def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds = DEFAULT_THRESHOLDS) -> bool:
+def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds) -> bool:
     """Whether the held-out log likelihood ratio favours `after` decisively, if both models leave only noise."""
     fall = before.total_chi2 - after.total_chi2 if _noise_is_left(limits, before, after) else 0.0
     return fall > 2 * limits.min_log_bayes_factor
@@ -170,12 +167,12 @@ def _is_shape_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thre
 
 def _is_amplitude_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
     """Whether an amplitude lies outside its prior range by more than `prior_range_margin` widths of that range."""
-    ranges = {name: effect.prior_ranges[name] for name in effect.amplitude_names}
-    margin = limits.prior_range_margin
-    return not all(
-        low - margin * (high - low) <= fit.values[name] <= high + margin * (high - low)
-        for name, (low, high) in ranges.items()
-    )
+    for name in effect.amplitude_names:
+        low, high = effect.prior_ranges[name]
+        room = limits.prior_range_margin * (high - low)
+        if not low - room <= fit.values[name] <= high + room:
+            return True
+    return False
 
 
 def _is_significant(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
@@ -201,10 +198,13 @@ def relative_rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
 
 # -- several effects --------------------------------------------------------------------------------------------------
 
+_Start = tuple[tuple[EffectBase, ...], Mapping[str, float]]
+"""Effects that are refitted, and their values at the start."""
+
 
 def _refit_shortlist(
     screened: ScreeningResult, limits: Thresholds, base: Sequence[EffectBase] = (), places: Sequence[str] = ()
-) -> list[tuple[tuple[EffectBase, ...], Mapping[str, float]]]:
+) -> list[_Start]:
     """The candidates to refit, with their start values; the best of every place of the gap is among them."""
     scores, alike = screened.candidate_scores, screened.confusability
     ranked = [score for score in scores if score.p_value < limits.significance_level]
@@ -212,17 +212,13 @@ def _refit_shortlist(
         return []
     best = ranked[: limits.n_refit_per_round]
     names = {n for s in best for n in alike.confusable_with(s.effect.label, limits.signature_overlap)}
-    extra = sorted(
-        (s for s in ranked if s.effect.label in names and s not in best), key=lambda s: -s.predicted_chi2_decrease
-    )
+    extra = [s for s in ranked if s.effect.label in names and s not in best]
+    extra = sorted(extra, key=lambda s: -s.predicted_chi2_decrease)[: limits.n_refit_per_round]
     surest = sorted(ranked, key=lambda s: (s.p_value, -s.lm_statistic))[: limits.n_refit_lowest_p]
     # where the gap lay before anything was added asks for no more than the significant afterwards
     there = [[s for s in (ranked if base else scores) if s.effect.location == place][:1] for place in places]
-    chosen: list[CandidateScore] = []
-    for score in (*best, *extra[: limits.n_refit_per_round], *surest, *(s for own in there for s in own)):
-        if score not in chosen:
-            chosen.append(score)
-    return [((s.effect,), s.predicted_values) for s in chosen]
+    chosen = {s.effect.label: s for s in (*best, *extra, *surest, *(s for own in there for s in own))}
+    return [((s.effect,), s.predicted_values) for s in chosen.values()]
 
 
 def _from_before(search: RefitContext) -> list[RefittedModel]:
@@ -254,10 +250,10 @@ def select_effects(
 ) -> tuple[tuple[RefittedModel, ...], tuple[SelectedEffect, ...]]:
     """Select effects by forward selection on the held-out gap, then try replacing and removing each.
 
-    All candidates were screened at the nominal fit; `places` are where the smoother says that the gap lies, and `moved`
-    is whether the nominal fit has left what an earlier run found, so that candidates are tried from there as well.
-    Returned are the fits of single effects in the first round, the chosen one first, then by held-out loss (where one
-    effect alone stays, its last fit first), and what was selected.
+    `places` are where the smoother says that the gap lies, and `moved` is whether the nominal fit has left what an
+    earlier run found, so that candidates are tried from there as well. Returned are the fits of single effects in the
+    first round, the chosen one first, then by held-out loss (where one stays alone, its last fit first), and what was
+    selected.
     """
     limits, alone, current = search.thresholds, screened, nominal
     first: tuple[RefittedModel, ...] = ()
@@ -276,14 +272,11 @@ def select_effects(
         if moved and not base:
             fits = _likelier([*fits, *_from_before(search)])
         if len(base) == 1:
-            pairs = refit_with_each_effect(
-                search, (), _pairs_to_refit(alone, limits, base[0]), nominal.values, "together"
-            )
-            fits += [
-                fit
-                for fit in pairs
-                if _likely(fit.effects[0], fit, limits) and not _is_amplitude_outside_prior(fit.effects[0], fit, limits)
-            ]
+            pairs = _pairs_to_refit(alone, limits, base[0])
+            for fit in refit_with_each_effect(search, (), pairs, nominal.values, "together"):
+                one = fit.effects[0]
+                if _likely(one, fit, limits) and not _is_amplitude_outside_prior(one, fit, limits):
+                    fits.append(fit)
         fits = _of_a_size(fits, limits) if base else fits
         if not fits:
             break
@@ -312,27 +305,22 @@ def select_effects(
     return first, kept
 
 
-def _pairs_to_refit(
-    screened: ScreeningResult, limits: Thresholds, without: EffectBase
-) -> list[tuple[tuple[EffectBase, ...], Mapping[str, float]]]:
+def _pairs_to_refit(screened: ScreeningResult, limits: Thresholds, without: EffectBase) -> list[_Start]:
     """The pairs of candidates to refit: best penalized decrease first, without confusable duplicates."""
 
     def same(one: EffectBase, other: EffectBase) -> bool:
         alike = screened.confusability.confusable_with(one.label, limits.signature_overlap)
         return one.label == other.label or other.label in alike
 
-    def covered(pair: CandidatePairScore, by: CandidatePairScore) -> bool:
-        (a, b), (c, d) = pair.effects, by.effects
-        return (same(a, c) and same(b, d)) or (same(a, d) and same(b, c))
-
     labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without.label]
-    chosen: list[CandidatePairScore] = []
-    for pair in screened.joint_scores.ranked_pairs(labels):
+    chosen: list[_Start] = []
+    for (a, b), values, _ in screened.joint_scores.ranked_pairs(labels):
         if len(chosen) == limits.n_refit_pairs:
             break
-        if not any(covered(pair, before) for before in chosen):
-            chosen.append(pair)
-    return [(pair.effects, pair.predicted_values) for pair in chosen]
+        before = (pair for pair, _ in chosen)
+        if not any((same(a, c) and same(b, d)) or (same(a, d) and same(b, c)) for c, d in before):
+            chosen.append(((a, b), values))
+    return chosen
 
 
 def _of_a_size(fits: Sequence[RefittedModel], limits: Thresholds) -> list[RefittedModel]:
@@ -428,14 +416,11 @@ def _rebuilt(
     effects = [entry.effect for entry in entries]
     parts = [effects[:i] for i in range(1, len(effects))]
     fits = [_again(search, part, last, f"{join_effect_labels(part)} again") or last for part in parts]
-    return tuple(
-        replace(
-            entry,
-            refitted_model=fit,
-            cumulative_closure=held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss, search.thresholds),
-        )
-        for entry, fit in zip(entries, [*fits, last], strict=True)
-    )
+    found = []
+    for entry, fit in zip(entries, [*fits, last], strict=True):
+        closure = held_out_gap_closure(nominal.held_out_loss, fit.held_out_loss, search.thresholds)
+        found.append(replace(entry, refitted_model=fit, cumulative_closure=closure))
+    return tuple(found)
 
 
 def _again(search: RefitContext, effects: Sequence[EffectBase], near: RefittedModel, name: str) -> RefittedModel | None:

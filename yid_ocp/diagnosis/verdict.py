@@ -84,9 +84,8 @@ def _compare(
     size = max(abs(fit.values[n] - neutral[n]) / width[n] for fit in (first, second) for n in effect.amplitude_names)
     for name in effect.amplitude_names:
         own = (first.values[name], first.std[name], second.values[name], second.std[name])
-        entry = ParameterTransferCheck(
-            effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit, *own, True
-        )
+        what = (effect.label, name.removeprefix(f"{effect.label}."), effect.parameters[name].unit)
+        entry = ParameterTransferCheck(*what, *own, True)
         apart, spread = entry.estimate_difference_and_std
         # what has no standard deviation says nothing against it
         sure = math.isfinite(spread) and apart > limits.transfer_z_max * spread
@@ -97,9 +96,8 @@ def _compare(
 def inflate_std_by_disagreement(fit: RefittedModel, entries: Sequence[ParameterTransferCheck]) -> RefittedModel:
     """Return the fit with amplitude standard deviations inflated by the disagreement between the recordings.
 
-    What a model misses of all of a recording its residual does not show: where two fits differ by more than
-    `_DISAGREEMENT_Z` standard deviations of both together, each is known to the spread of the two, the difference over
-    the square root of two.
+    Where two fits differ by more than `_DISAGREEMENT_Z` standard deviations of both together, each is known to the
+    spread of the two, the difference over the square root of two.
     """
     std = dict(fit.std)
     for entry in entries:
@@ -124,9 +122,8 @@ def has_significant_gap(
     """Whether the residual exceeds noise significantly and by a relevant amount.
 
     Either as a whole, or along what a candidate would do to it with some channel above noise: the sum over all channels
-    does not notice what only a few samples show. A candidate alone has to be surer than that sum: it is the best of
-    many, at the end of a tail that is known by asymptotics only. An offset of a torque beyond what was stated needs no
-    such channel where `offsets` are stated: it is one number among thousands, and all others follow it.
+    does not notice what only a few samples show. A candidate alone has to be surer than that sum. An offset of a torque
+    beyond what was stated needs no such channel where `offsets` are stated: it is one number among thousands.
     """
     if residuals_exceed_noise((before, held_out), limits.null_test_limits):
         return True
@@ -161,10 +158,7 @@ def decide_verdict(
     reason: UnknownVerdictReason,
     added: Sequence[SelectedEffect],
 ) -> str:
-    """Return the verdict: insufficient_data, no_gap, unknown, confusable or effect.
-
-    `enough`: whether there are samples enough for the unknowns; `reason`: why effects do not explain a gap.
-    """
+    """Return the verdict; `enough`: whether there are samples enough for the unknowns."""
     if not enough or not any(entry.is_detectable for entry in visible):
         return "insufficient_data"
     if not gap:
@@ -180,7 +174,10 @@ def independent_assumption_count(added: Sequence[SelectedEffect]) -> int:
 
 
 def required_explained_fraction(added: Sequence[SelectedEffect], limits: Thresholds) -> float:
-    """Return the fraction of the smoother's explained chi2 that the effects are required to explain."""
+    """Return the fraction of the smoother's explained chi2 that the effects are required to explain.
+
+    Each further assumption has to explain that part of what could be left.
+    """
     return 1.0 - (1.0 - limits.min_explained_fraction) ** independent_assumption_count(added)
 
 
@@ -191,8 +188,7 @@ def find_unknown_verdict_reason(
 
     Effects have to explain the part `required_explained_fraction` of what the smoother explains where the model was
     fitted; a single assumption passes too where the lower 95 % bound of its held-out closure reaches
-    `min_explained_fraction`. Each further assumption has to explain that part of what could be left: two or three
-    together imitate almost anything, but only in part.
+    `min_explained_fraction`.
     """
     if not added:
         return "none"
@@ -207,10 +203,7 @@ def find_unknown_verdict_reason(
 def compute_explained_chi2_fraction(
     nominal: RefittedModel, added: Sequence[SelectedEffect], smoothed: SmootherResult | None
 ) -> float:
-    """Return the decrease of r'r by the effects divided by that of the smoother, both corrected for degrees of freedom.
-
-    Both are on the recordings to estimate on, so that the same noise stands in both. One where nothing was smoothed.
-    """
+    """Return the decrease of r'r by the effects over that by the smoother, both less degrees of freedom; else one."""
     if smoothed is None or not added:
         return 1.0
     last = added[-1].refitted_model
