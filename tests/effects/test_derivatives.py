@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.compiler import _compiler_path
-from yid_ocp.integrator.step import adjoint_gradient, compile_step
+from yid_ocp.integrator.step import compile_step
 from yid_ocp.sensors import sensor_reading_function
 
 STEPS = 4
@@ -106,5 +106,5 @@ def test_compiled_and_interpreted_agree_with_every_effect(cases) -> None:
     weight = np.random.default_rng(1).normal(size=slow.state.shape)
     exact = np.einsum("kx,kxd->d", weight, slow.state_sensitivity)
     for s, rollout in ((step, fast), (case.step, slow)):
-        gradient = adjoint_gradient(s, case.run.theta, rollout, case.names, weight)
+        gradient = s.kernel.adjoint_gradient(case.run.theta, rollout, None, case.names, weight, None, None)
         assert gradient.by_theta == pytest.approx(exact, rel=1e-6, abs=1e-8 * np.max(np.abs(exact)))

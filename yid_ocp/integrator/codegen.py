@@ -22,37 +22,24 @@ _Indices = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class StepFunctions:
-    """CasADi functions of one step, all with the arguments of `DiscreteEquations.arguments`.
+    """CasADi functions of one step, all with the arguments of `DiscreteEquations.arguments`, and the sparsity of parts.
 
     What is at the midpoint and after it is empty where the constraints pull at the node.
-
-    Attributes
-    ----------
-    residual : casadi.Function
-        (balance, internal, constraint, p1, share of Dphi(q_m)), balance and p1 without the constraints' pull.
-    jacobian_parts : casadi.Function
-        (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian, curvature), the last four as nonzeros;
-        the curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}.
-    before_constraint_jacobian, after_constraint_jacobian : casadi.Function
-        Share of Dphi(q_k) in the balance, which does not depend on the unknowns, and of Dphi(q_{k+1}) in p1.
-    constraint_force_derivatives : casadi.Function
-        Derivatives of the pull of the first of these two by (q_k, z_k), of the second by q_{k+1}.
-    row_scale_and_time_step : casadi.Function
-        (row scale, h)
-    internal_residual_at_rest : casadi.Function
-        (equations of the internal coordinates at rest, their derivative by (q, z, lam, u), nodes being one)
-    sparsity_patterns : dict of str to casadi.Sparsity
-        Of rest, rest of p1, constraint Jacobian, matrix (also of the other shares of Dphi), pull, curvature and that at
-        the end, derivative at rest.
     """
 
     equations: DiscreteEquations
+    # (balance, internal, constraint, p1, share of Dphi(q_m)), balance and p1 without the constraints' pull
     residual: ca.Function
+    # (pair vectors, rest Jacobian, rest Jacobian of p1, constraint Jacobian, curvature), the last four as nonzeros; the
+    # curvature is the derivative of the midpoint's pull by q_k, which is that by q_{k+1}
     jacobian_parts: ca.Function
+    # share of Dphi(q_k) in the balance, which does not depend on the unknowns, and of Dphi(q_{k+1}) in p1
     before_constraint_jacobian: ca.Function
     after_constraint_jacobian: ca.Function
+    # derivatives of the pull of the first of these two by (q_k, z_k), of the second by q_{k+1}
     constraint_force_derivatives: ca.Function
     row_scale_and_time_step: ca.Function
+    # (equations of the internal coordinates at rest, their derivative by (q, z, lam, u), nodes being one)
     internal_residual_at_rest: ca.Function
     sparsity_patterns: dict[str, ca.Sparsity]
 
@@ -65,8 +52,7 @@ class StepFunctions:
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
     """The CasADi functions that the stepping kernel calls.
 
-    The bodies' part of the Jacobians comes as vectors per joint, from which the kernel forms the entries pair by pair
-    (`RigidBodyLagrangianDerivatives`), everything else as sparse nonzeros from automatic differentiation.
+    The bodies' part of the Jacobians comes as vectors per joint, everything else from automatic differentiation.
     """
     e = equations
     rigid, pulls = e.rigid_body_terms, e.constraint_impulses
@@ -161,24 +147,13 @@ def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[st
 
 @dataclass(frozen=True)
 class StepSparsityTables:
-    """Sparsity, elimination order and fill-in of a step's Jacobians, the same at every state.
+    """Sparsity, elimination order and fill-in of a step's Jacobians, the same at every state."""
 
-    Attributes
-    ----------
-    unknown_rows : ndarray of int, shape (ny,)
-        Full row (balance, internal, constraint) of each unknown (free q1, z1, lam).
-    elimination_order : ndarray of int, shape (ny,)
-        Internal coordinates, tips before roots, multipliers last.
-    fill_in : tuple of ndarray of int
-        For each pivot, the later positions that its row and column fill.
-    residual_old_columns, p1_old_columns, p1_new_columns : tuple of ndarray of int
-        For each row of a Jacobian its columns that are not always zero.
-    """
-
-    unknown_rows: _Indices
-    elimination_order: _Indices
-    fill_in: tuple[_Indices, ...]
+    unknown_rows: _Indices  # full row (balance, internal, constraint) of each unknown (free q1, z1, lam), (ny,)
+    elimination_order: _Indices  # internal coordinates, tips before roots, multipliers last, (ny,)
+    fill_in: tuple[_Indices, ...]  # for each pivot, the later positions that its row and column fill
     joint_ancestors: tuple[_Indices, ...]
+    # for each row of a Jacobian its columns that are not always zero
     residual_old_columns: tuple[_Indices, ...]
     p1_old_columns: tuple[_Indices, ...]
     p1_new_columns: tuple[_Indices, ...]

@@ -60,12 +60,12 @@ class _ConstraintImpulses:
 
     @property
     def left_jacobian(self) -> ca.SX:
-        """Jacobian whose transpose times lam is subtracted in the momentum balance, shape (m, n)."""
+        """What the balance loses, times lam."""
         return self.start_share * self.before_jacobian + self.midpoint_share * self.middle_jacobian
 
     @property
     def right_jacobian(self) -> ca.SX:
-        """Jacobian whose transpose times lam is subtracted in p1, shape (m, n)."""
+        """What p1 loses, times lam."""
         return self.midpoint_share * (self.middle_jacobian - self.after_jacobian)
 
 
@@ -73,35 +73,8 @@ class _ConstraintImpulses:
 class DiscreteEquations:
     """Symbolic DEL equations of one step of a system.
 
-    Letters: n coordinates, nz internal coordinates, m constraints, nu inputs, ntheta parameters.
-
-    Attributes
-    ----------
-    q0, q1, z0, z1, p0 : casadi.SX, shape (n, 1) and (nz, 1)
-        Coordinates and internal coordinates at the two nodes; p_k [N m s].
-    lam, u, theta : casadi.SX, shape (m, 1), (nu, 1) and (ntheta, 1)
-        Multipliers of the step [N s]; motor torques held over it [N m], or what servos are commanded [rad or m].
-    time_step, h : casadi.SX
-        Recorded step [s], and the step in the equations: this times `System.recorded_time_scale`.
-    momentum_balance, p1 : casadi.SX, shape (n, 1)
-        Left side of the DEL equation; p_{k+1}.
-    internal_residual, internal_residual_at_rest : casadi.SX, shape (nz, 1)
-        Midpoint equations of the internal coordinates, and those in a static equilibrium.
-    constraint_residual : casadi.SX, shape (m, 1)
-        phi(q_{k+1}) - C lam / h.
-    constraint_relaxation_gain : casadi.SX or None, shape (m, 1)
-        Where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint_residual`; phi(q_k) has 1 minus it.
-    rigid_body_terms : RigidBodyLagrangianDerivatives
-        Closed-form derivatives of the bodies' Lagrangian at the midpoint.
-    balance_remainder, p1_remainder : casadi.SX, shape (n, 1)
-        `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force;
-        this gives the Jacobians without differentiating the tree.
-    closed_form_force, closed_form_force_shares : ForceWithDerivatives or None, (float, float)
-        Sum of the forces that effects give with their slopes, at the midpoint, and the parts of its impulse h F in
-        `momentum_balance` and in `p1`.
-    row_scale : casadi.SX, shape (n, 1)
-        Factor on each row of the bodies' part and of the `constraint_impulses`, in the balance and in p1 (1, or the
-        compliance of a compliant one).
+    Letters: n coordinates, nz internal coordinates, m constraints, nu inputs, ntheta parameters. 0 and 1 stand for the
+    two nodes; coordinates q (n, 1), internal ones z (nz, 1), momenta p (n, 1) [N m s].
     """
 
     system: System
@@ -112,24 +85,27 @@ class DiscreteEquations:
     z0: ca.SX
     z1: ca.SX
     p0: ca.SX
-    lam: ca.SX
-    u: ca.SX
+    lam: ca.SX  # multipliers of the step, (m, 1) [N s]
+    u: ca.SX  # motor torques held over the step [N m], or what servos are commanded [rad or m], (nu, 1)
     theta: ca.SX
-    time_step: ca.SX
-    h: ca.SX
-    momentum_balance: ca.SX
-    internal_residual: ca.SX
+    time_step: ca.SX  # as recorded [s]
+    h: ca.SX  # in the equations: this times `System.recorded_time_scale`
+    momentum_balance: ca.SX  # left side of the DEL equation, (n, 1)
+    internal_residual: ca.SX  # midpoint equations of the internal coordinates, (nz, 1)
     internal_residual_at_rest: ca.SX
-    constraint_residual: ca.SX
+    constraint_residual: ca.SX  # phi(q_{k+1}) - C lam / h, (m, 1)
+    # where a grasp relaxes: 1 + T/h, the factor on phi(q_{k+1}) in `constraint_residual`; phi(q_k) has 1 minus it
     constraint_relaxation_gain: ca.SX | None
     p1: ca.SX
     rigid_body_terms: RigidBodyLagrangianDerivatives
+    # `momentum_balance` and `p1` without the bodies' Lagrangian, p_k, the constraint impulses and the closed force: for
+    # Jacobians without differentiating the tree
     balance_remainder: ca.SX
     p1_remainder: ca.SX
-    closed_form_force: ForceWithDerivatives | None
-    closed_form_force_shares: tuple[float, float]
+    closed_form_force: ForceWithDerivatives | None  # sum of those that effects give with their slopes, at the midpoint
+    closed_form_force_shares: tuple[float, float]  # parts of its impulse h F in `momentum_balance` and in `p1`
     constraint_impulses: _ConstraintImpulses
-    row_scale: ca.SX
+    row_scale: ca.SX  # factor on rows of the bodies' part and of `constraint_impulses`: 1, or a compliance, (n, 1)
 
     @property
     def arguments(self) -> list[ca.SX]:
@@ -166,15 +142,7 @@ class DiscreteEquations:
 def discrete_equations(
     system: System, force_split: ForceSplit = "symmetric", constraint_force: ConstraintForcePlacement = "midpoint"
 ) -> DiscreteEquations:
-    """The DEL equations of one step.
-
-    Parameters
-    ----------
-    system : System
-    force_split : "symmetric" or "left"
-        Distribution of the force of a step between its two ends.
-    constraint_force : "node" or "midpoint"
-        Configuration at which the constraint forces act.
+    """The DEL equations of one step; arguments as in `compile_step`.
 
     Raises
     ------
@@ -212,6 +180,7 @@ def discrete_equations(
         p1 += (1 - share) * h * scale * closed.force
         closed = ForceWithDerivatives(at.placed(closed.force), at.placed(closed.A), at.placed(closed.T))
     symbols = {name: getattr(at, name) for name in ("q0", "q1", "z0", "z1", "p0", "lam", "u", "time_step", "h")}
+    rigid_at_midpoint = {name: at.placed(value) for name, value in vars(rigid).items()}
     return DiscreteEquations(
         system=system,
         force_split=force_split,
@@ -224,9 +193,7 @@ def discrete_equations(
         constraint_residual=constraint,
         constraint_relaxation_gain=gain,
         p1=at.placed(p1),
-        rigid_body_terms=RigidBodyLagrangianDerivatives(
-            **{name: at.placed(value) for name, value in vars(rigid).items()}
-        ),
+        rigid_body_terms=RigidBodyLagrangianDerivatives(**rigid_at_midpoint),
         balance_remainder=at.placed(balance_rest),
         p1_remainder=at.placed(p1_rest),
         closed_form_force=closed,
@@ -405,47 +372,29 @@ def _direction_products(grasp: Grasp, kinematics: Kinematics) -> list[list[tuple
 def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
     """The frame whose origin is the grasped point, on one side of a grasp."""
     if side == "holder":
-        frame, local = (
-            system.mechanism.frame(grasp.holder_frame),
-            Placement(grasp.held_orientation, grasp.holder_offset),
-        )
+        name, local = grasp.holder_frame, Placement(grasp.held_orientation, grasp.holder_offset)
     else:
-        frame = system.mechanism.frame(grasp.held_frame)
-        local = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -grasp.axial_slip))
+        name, local = grasp.held_frame, Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(0, 0, -grasp.axial_slip))
+    frame = system.mechanism.frame(name)
     return Frame(frame.joint_index, frame.placement @ local)
 
 
 @dataclass(frozen=True)
 class EquilibriumEquations:
-    """Equations of static equilibrium: driven joints held by torques and springs, prescribed joints given.
+    """Equations of static equilibrium: driven joints held by torques and springs, prescribed joints given."""
 
-    Attributes
-    ----------
-    inputs : list of casadi.SX
-        (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
-        held torque, holding spring's stiffness, theta, time step.
-    residual : casadi.SX
-        Balance of the free coordinates [N m], internal equations, constraints [m].
-    state : casadi.SX, shape (nx, 1)
-        (q, p, z) at rest.
-    """
-
+    # (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
+    # held torque, holding spring's stiffness, theta, time step
     inputs: list[ca.SX]
-    residual: ca.SX
-    state: ca.SX
+    residual: ca.SX  # balance of the free coordinates [N m], internal equations, constraints [m]
+    state: ca.SX  # (q, p, z) at rest, (nx, 1)
 
 
 def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
     """The static equilibrium equations: a step from a configuration to itself with unchanged momentum."""
     system, h, nu = e.system, e.h, e.u.numel()
-    free, fixed, driven = (
-        list(i)
-        for i in (
-            system.unprescribed_coordinate_indices,
-            system.prescribed_coordinate_indices,
-            system.driven_coordinate_indices,
-        )
-    )
+    free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
+    driven = list(system.driven_coordinate_indices)
     given, sought = ca.SX.sym("given", nu + len(fixed)), ca.SX.sym("sought", len(free))
     z, force = ca.SX.sym("z", e.z0.numel()), ca.SX.sym("force", e.lam.numel())
     held, stiffness = ca.SX.sym("held", nu), ca.SX.sym("stiffness")
@@ -467,33 +416,20 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
 class NlpStage:
     """Symbolic equality constraints of one step in a nonlinear program, and their Jacobians.
 
-    Letters: n coordinates, nz internal ones, m constraints, nu inputs, nc prescribed coordinates, nx = 2 n + nz.
-
-    Attributes
-    ----------
-    x0, x1 : casadi.SX, shape (nx, 1)
-        States (q, p, z) at the two nodes, `time_step` [s] apart.
-    residual : casadi.SX, shape (nr, 1)
-        Zero if the step equations hold.
-    residual_names : tuple of str
-        Names of the rows: `del[JOINT]`, `internal[NAME]`, `constraint[GRASP.x]`, `p1[JOINT]`.
-    prescribed_effort : casadi.SX, shape (nc, 1)
-        Effort of the prescribed coordinates at the first node [N m].
-    residual_jacobians, effort_jacobians : mapping of str to casadi.SX
-        Derivatives of the two by `x0`, `x1`, `lam` and `u`, sparse.
+    The latter are sparse derivatives of `residual` (nr, 1) and `prescribed_effort` (nc, 1) by `x0`, `x1`, `lam`, `u`.
     """
 
     equations: DiscreteEquations
-    time_step: float
-    x0: ca.SX
+    time_step: float  # [s]
+    x0: ca.SX  # state (q, p, z), (nx, 1)
     x1: ca.SX
     lam: ca.SX
     u: ca.SX
     theta: ca.SX
-    residual: ca.SX
-    residual_names: tuple[str, ...]
+    residual: ca.SX  # zero if the step equations hold
+    residual_names: tuple[str, ...]  # of its rows: `del[JOINT]`, `internal[NAME]`, `constraint[GRASP.x]`, `p1[JOINT]`
     residual_jacobians: dict[str, ca.SX]
-    prescribed_effort: ca.SX
+    prescribed_effort: ca.SX  # of the prescribed coordinates at the first node [N m]
     effort_jacobians: dict[str, ca.SX]
 
     def parameter_jacobians(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:

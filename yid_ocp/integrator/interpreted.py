@@ -201,7 +201,11 @@ class InterpretedKernel:
         by_multipliers: Array | None,
         by_effort: Array | None,
     ) -> CostGradient:
-        """Gradient of a cost whose partial derivatives along the rollout are given, by the recursion of the costate."""
+        """Gradient of a cost along a finished rollout by the adjoint (the paper's Lemma 1).
+
+        With the cost's partial derivatives by states (N + 1, nx), multipliers (N, m) and efforts (N, nc),
+        costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k.
+        """
         sizes, at, steps = self._model.sizes, self._at, len(rollout.torque)
         slopes, n = self._evaluators()[-1], sizes["n"]
         by_theta, by_torque = np.zeros(len(names)), np.zeros((steps, sizes["nu"]))

@@ -23,31 +23,16 @@ from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """A static equilibrium with its derivatives.
+    """A static equilibrium with its derivatives."""
 
-    Attributes
-    ----------
-    state : ndarray, shape (nx,)
-        (q, p, z); p is half a step's pull of the constraints, so that the next step stays at rest.
-    holding_torque : ndarray, shape (nu,)
-        Motor torque that holds the posture [N m], or command of its servos [rad or m].
-    constraint_reactions : ndarray, shape (m,)
-        [N or N m]
-    state_by_theta, state_by_known_coordinates, state_by_torque : ndarray, shape (nx, len(names)), (nx, nk) and (nx, nu)
-        Derivatives of `state` by the parameters asked for, by the known coordinates (driven, then prescribed), and by
-        the measured torque.
-    max_imbalance : float
-        Largest remaining imbalance [N m] or constraint violation [m].
-    """
-
-    state: Array
-    holding_torque: Array
-    constraint_reactions: Array
-    state_by_theta: Array
-    state_by_known_coordinates: Array
-    state_by_torque: Array
+    state: Array  # (q, p, z), (nx,); p is half a step's pull of the constraints, so that the next step stays at rest
+    holding_torque: Array  # of the motors that hold the posture [N m], or command of its servos [rad or m], (nu,)
+    constraint_reactions: Array  # (m,) [N or N m]
+    state_by_theta: Array  # by the parameters asked for, (nx, len(names))
+    state_by_known_coordinates: Array  # driven, then prescribed, (nx, nk)
+    state_by_torque: Array  # as measured, (nx, nu)
     is_converged: bool
-    max_imbalance: float
+    max_imbalance: float  # largest remaining imbalance [N m] or constraint violation [m]
     message: str
 
 
@@ -90,7 +75,7 @@ class EquilibriumSolver:
 
     @property
     def equations(self) -> EquilibriumEquations:
-        """Symbolic equilibrium equations."""
+        """The symbolic equations."""
         return self._equations(None)
 
     def solve(
@@ -101,7 +86,7 @@ class EquilibriumSolver:
         guess: ArrayLike | None = None,
         names: Sequence[str] = (),
     ) -> Equilibrium:
-        """Find the equilibrium for given driven and prescribed coordinates.
+        """Find the equilibrium for given driven and prescribed coordinates; the best point where Newton fails.
 
         Parameters
         ----------
@@ -115,11 +100,6 @@ class EquilibriumSolver:
             Configuration to start from; the undeformed object when absent.
         names : sequence of str
             Parameters by which to differentiate.
-
-        Returns
-        -------
-        Equilibrium
-            `is_converged` is False, with the best point found, where Newton's iteration does not succeed.
         """
         step, system = self.step, self.step.system
         given = checked_float_array("posture", posture, (len(self.known_coordinates),))

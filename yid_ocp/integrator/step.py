@@ -18,7 +18,6 @@ from yid_ocp.integrator.compiled import CompiledKernel
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, DiscreteEquations, ForceSplit
 from yid_ocp.integrator.interpreted import InterpretedKernel
 from yid_ocp.integrator.step_model import (
-    CostGradient,
     Rollout,
     RolloutInputs,
     SensitivityDirections,
@@ -98,7 +97,7 @@ class Step(ReprMixin):
         prescribed: tuple[ArrayLike, ArrayLike] | None = None,
         internal: ArrayLike | None = None,
     ) -> tuple[Array, Array, Array, StepStatus]:
-        """Compute one DEL step.
+        """Compute one DEL step, to (q, p)_{k+1}, the multipliers lam (m,) and a status.
 
         Parameters
         ----------
@@ -106,16 +105,10 @@ class Step(ReprMixin):
             q_k [rad or m] and p_k [N m s].
         u : array_like, shape (nu,)
             Motor torques held over the step [N m].
-        theta : array_like, shape (ntheta,)
         prescribed : pair of array_like, shape (nc,), optional
             s_k and s_{k+1}; required when the system has prescribed coordinates.
         internal : array_like, shape (nz,), optional
             z_k, zero when absent.
-
-        Returns
-        -------
-        q1, p1, lam : ndarray, shape (n,), (n,) and (m,)
-        status : StepStatus
         """
         rollout, n = self._single(q0, p0, u, theta, prescribed, internal, None), self.sizes["n"]
         return rollout.state[1, :n], rollout.state[1, n : 2 * n], rollout.multipliers[0], rollout.status
@@ -185,7 +178,6 @@ def compile_step(
 
     Parameters
     ----------
-    system : System
     time_step : float
         h [s], positive.
     force_split : "symmetric" or "left"
@@ -194,7 +186,7 @@ def compile_step(
         Where the constraints pull: as in the paper's engine, or so that no tension makes the motion grow (see
         `discrete_equations`).
     use_compiler : bool
-        Whether to generate and compile C; without a compiler on the machine the interpreter is used with one notice.
+        Without it, and without a compiler on the machine (with one notice), the step is interpreted.
     tolerance : float, optional
         Newton's, on the coordinates [rad or m]; follows from the time step when absent.
 
@@ -258,26 +250,18 @@ def simulate(
     ----------
     start : array_like, shape (nx,)
         Initial (q, p, z).
-    steps : int
-        N
     torque : array_like, shape (N, nu), optional
         Nominal motor torque of every step [N m]; zero when absent.
     path : array_like, shape (N + 1, nc), optional
         Prescribed coordinates at every node; held at their initial value when absent.
 
-    Returns
-    -------
-    Rollout
-        With NaN after the step at which Newton failed; `status` says so.
-
     Raises
     ------
     ModelError
-        An array of the wrong shape.
+        An array of the wrong shape; where Newton fails `status` says so, and what follows is NaN.
     """
-    return simulate_batch(
-        step, [checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)]
-    )[0]
+    inputs = checked_rollout_inputs(step, theta, start, steps, torque, path, feedback, directions)
+    return simulate_batch(step, [inputs])[0]
 
 
 def simulate_batch(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
@@ -331,37 +315,6 @@ def applied_joint_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> Arra
         function = ca.Function("applied", [e.u, e.q0, e.q1, e.theta], [force])
     middle, rate = (q[1:] + q[:-1]) / 2, np.diff(q, axis=0) / h
     return np.array(function.map(len(rate))(rollout.torque.T, middle.T, rate.T, np.asarray(theta, float))).T
-
-
-def adjoint_gradient(
-    step: Step,
-    theta: ArrayLike,
-    rollout: Rollout,
-    names: Sequence[str],
-    by_state: ArrayLike,
-    by_multipliers: ArrayLike | None = None,
-    by_effort: ArrayLike | None = None,
-    feedback: TrackingFeedback | None = None,
-) -> CostGradient:
-    """Gradient of a cost along a finished rollout by the adjoint (the paper's Lemma 1).
-
-    costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k.
-
-    Parameters
-    ----------
-    rollout : Rollout
-        From `simulate` with the same theta and feedback.
-    names : sequence of str
-        Parameters by which to differentiate.
-    by_state, by_multipliers, by_effort : array_like, shape (N + 1, nx), (N, m) and (N, nc)
-        Partial derivatives of the cost.
-    """
-    sizes, steps, check = step.sizes, len(rollout.multipliers), checked_float_array
-    outer = check("by_state", by_state, (steps + 1, sizes["nx"]))
-    last = None if by_multipliers is None else check("by_multipliers", by_multipliers, (steps, sizes["m"]))
-    effort = None if by_effort is None else check("by_effort", by_effort, (steps, sizes["nc"]))
-    values = check("theta", theta, (sizes["ntheta"],))
-    return step.kernel.adjoint_gradient(values, rollout, feedback, tuple(names), outer, last, effort)
 
 
 def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
@@ -433,11 +386,9 @@ def linearized_steps(
 
     `chosen` is a slice of steps in a row; all by default.
     """
-    sizes = step.sizes
     if loads is None:
-        loads = AdditionalLoadDerivatives(
-            np.zeros((sizes["n"] + sizes["nz"] + sizes["m"], 0)), np.zeros((sizes["n"], 0))
-        )
+        rows = sum(step.sizes[key] for key in ("n", "nz", "m"))
+        loads = AdditionalLoadDerivatives(np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0)))
     begin, end, _ = chosen.indices(len(rollout.torque))
     for first in range(begin, end, _STEPS_PER_CHUNK):
         yield from _chunk(step, theta, rollout, loads, slice(first, min(first + _STEPS_PER_CHUNK, end)))

@@ -54,10 +54,8 @@ def build_step_model(
     n, nz = system.n_coordinates, e.z0.numel()
     sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}
     sizes |= {"nx": 2 * n + nz, "ntheta": e.theta.numel()}
-    tables, limit = (
-        codegen.step_sparsity_tables(functions),
-        newton_tolerance(time_step) if tolerance is None else tolerance,
-    )
+    limit = newton_tolerance(time_step) if tolerance is None else tolerance
+    tables = codegen.step_sparsity_tables(functions)
     return StepModel(system, e, functions, tables, sizes, float(time_step), limit)
 
 
@@ -95,18 +93,10 @@ _INSTABILITY_HINT = (
 
 @dataclass(frozen=True)
 class StepStatus:
-    """Convergence status of a step or of a rollout.
+    """Convergence status of a step or of a rollout: Newton's last correction [rad or m], and totals over all steps.
 
-    Attributes
-    ----------
-    last_correction : float
-        Last Newton correction [rad or m].
-    newton_iterations, factorisations : int
-        Totals over all steps.
-    prescribed_effort : ndarray, shape (nc,)
-        Effort that the prescribed coordinates needed at the first node of the last step [N m].
-    internal_coordinates : ndarray, shape (nz,)
-        After the last step.
+    `prescribed_effort` (nc,) is that at the first node of the last step [N m], `internal_coordinates` (nz,) are those
+    after it.
     """
 
     code: NewtonStatus
@@ -138,12 +128,7 @@ class StepStatus:
 class SensitivityDirections:
     """The d directions in which a rollout is differentiated: named parameters first, then states and inputs.
 
-    Attributes
-    ----------
-    initial_state_tangents : ndarray, shape (nx, d)
-        Derivative of the initial state (q, p, z).
-    torque_tangents : ndarray, optional, shape (N, nu, d)
-    prescribed_tangents : ndarray, optional, shape (N + 1, nc, d)
+    Derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path (N + 1, nc, d).
     """
 
     parameter_names: tuple[str, ...]
@@ -166,14 +151,8 @@ class SensitivityDirections:
 class TrackingFeedback:
     """Time-varying feedback of the tracking filter, u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
-    Attributes
-    ----------
-    state_indices : ndarray of int, shape (nb,)
-        Rows of the state (q, p, z) that are fed back.
-    gain : ndarray, shape (N, nu, nb)
-        K_k [N m/rad for a coordinate, 1/s for a momentum].
-    reference : ndarray, shape (N, nb)
-        Measured values of these rows.
+    Of the rows of the state (q, p, z) in `state_indices` (nb,), with K_k in `gain` (N, nu, nb) [N m/rad for a
+    coordinate, 1/s for a momentum] and the rows' measured values in `reference` (N, nb).
     """
 
     state_indices: NDArray[np.int32]
@@ -185,13 +164,8 @@ class TrackingFeedback:
 class RolloutInputs:
     """Inputs of one rollout.
 
-    Attributes
-    ----------
-    theta, initial_state : ndarray, shape (ntheta,) and (nx,)
-        The state is (q, p, z).
-    torque : ndarray, shape (N, nu)
-        Nominal motor torque of every step [N m].
-    prescribed_path : ndarray, shape (N + 1, nc)
+    The parameters (ntheta,), the initial state (q, p, z) (nx,), the nominal motor torque of every step (N, nu) [N m],
+    and the prescribed coordinates at every node (N + 1, nc).
     """
 
     theta: Array
@@ -204,21 +178,11 @@ class RolloutInputs:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A simulated trajectory and, if requested, its forward sensitivities; NaN after a failed step.
+    """A simulated trajectory and, if requested, its derivatives (..., d) by the directions; NaN after a failed step.
 
-    Attributes
-    ----------
-    state : ndarray, shape (N + 1, nx)
-        (q, p, z) at every node.
-    multipliers : ndarray, shape (N, m)
-        [N s]
-    effort : ndarray, shape (N, nc)
-        Effort of prescribed coordinates at nodes 0..N-1 [N m]; at node 0 it assumes that p_0 came from a step before
-        (an `Equilibrium` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
-    torque : ndarray, shape (N, nu)
-        Applied torque [N m].
-    state_sensitivity, multipliers_sensitivity, effort_sensitivity : ndarray, shape (..., d), or None
-        Derivatives by the directions.
+    (q, p, z) at every node (N + 1, nx), multipliers (N, m) [N s], effort of prescribed coordinates at nodes 0..N-1
+    (N, nc) [N m] and applied torque (N, nu) [N m]. At node 0 the effort assumes that p_0 came from a step before (an
+    `Equilibrium` gives such a p_0); after p_0 = dL/dv it holds only half a step's impulse, half the effort.
     """
 
     state: Array
@@ -249,18 +213,9 @@ class CostGradient:
 class StepEquationLinearizations:
     """Residuals and Jacobians of the equations of many steps, at a trajectory that need not satisfy them.
 
-    Attributes
-    ----------
-    residual : ndarray, shape (N, nt)
-        Of every step: momentum balance (n), internal (nz) and constraint (m) equations.
-    p1 : ndarray, shape (N, n)
-        p_{k+1} that follows from the other values.
-    residual_by_new, p1_by_new : ndarray, shape (N, nt, nt) and (N, n, nt)
-        Derivatives by (q_{k+1}, z_{k+1}, lam_k).
-    residual_by_old, p1_by_old : ndarray, shape (N, nt, n + nz) and (N, n, n + nz)
-        Derivatives by (q_k, z_k); that of the balance by p_k is the identity.
-    residual_by_input, p1_by_input, residual_by_theta, p1_by_theta : ndarray, shape (N, ..., nu) and (N, ..., ntheta)
-        Derivatives by the torque and by the chosen parameters.
+    Of every step the momentum balance (n), internal (nz) and constraint (m) equations, nt in all, and the p_{k+1} (n)
+    that follows from the other values, with their derivatives by what is new, (q_{k+1}, z_{k+1}, lam_k), by what is
+    old, (q_k, z_k), by the torque and by the chosen parameters; that of the balance by p_k is the identity.
     """
 
     residual: Array

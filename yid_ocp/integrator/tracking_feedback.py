@@ -46,11 +46,7 @@ def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> 
 
 
 def lqr_feedback(
-    step: Step,
-    measured: ArrayLike,
-    torque: ArrayLike,
-    theta: ArrayLike,
-    arms: Step | None = None,
+    step: Step, measured: ArrayLike, torque: ArrayLike, theta: ArrayLike, arms: Step | None = None
 ) -> TrackingFeedback:
     """Feedback of a finite-horizon LQR of the driven arms, linearised about their measured motion.
 
@@ -148,10 +144,8 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
         else:
             raise np.linalg.LinAlgError
         known = np.broadcast_to(np.eye(nu), (count, nu, nu))
-        moved = -np.linalg.solve(
-            found.residual_by_new[own],
-            np.concatenate([found.residual_by_old[own], known, found.residual_by_input[own]], axis=2),
-        )
+        by_known = np.concatenate([found.residual_by_old[own], known, found.residual_by_input[own]], axis=2)
+        moved = -np.linalg.solve(found.residual_by_new[own], by_known)
     except np.linalg.LinAlgError:
         return np.full((count, 2 * nu, 2 * nu), np.nan), np.full((count, 2 * nu, nu), np.nan)
     momenta = np.concatenate([found.p1_by_old[own], 0 * known, found.p1_by_input[own]], axis=2)
@@ -163,21 +157,12 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 class DrivenJointMotion:
     """Angles and torques of the driven joints over the steps of a recording, with their derivatives.
 
-    Attributes
-    ----------
-    angles : ndarray, shape (N + 1, nu)
-        At every node [rad].
-    torque : ndarray, shape (N, nu)
-        Held over every step [N m].
-    initial_internal : ndarray, shape (nz,)
-        Internal coordinates at the first node.
-    angles_sensitivity, torque_sensitivity, initial_internal_sensitivity : ndarray, shape (..., d), or None
-        Derivatives by d parameters and what follows these; None where nothing depends on them.
+    The latter (..., d) are by d parameters and what follows these; None where nothing depends on them.
     """
 
-    angles: Array
-    torque: Array
-    initial_internal: Array
+    angles: Array  # at every node, (N + 1, nu) [rad]
+    torque: Array  # held over every step, (N, nu) [N m]
+    initial_internal: Array  # internal coordinates at the first node, (nz,)
     angles_sensitivity: Array | None = None
     torque_sensitivity: Array | None = None
     initial_internal_sensitivity: Array | None = None
@@ -322,9 +307,7 @@ def applied_torque_error_feedthrough(gain: Array, by_torque: Array) -> Array:
 class _Memory:
     """The internal coordinates of one effect along a motion; `rows` among those that the momentum depends on."""
 
-    def __init__(
-        self, step: Step, inputs: Sequence[ca.SX], law: ca.SX, rows: list[int], columns: Sequence[int]
-    ) -> None:
+    def __init__(self, step: Step, inputs: list[ca.SX], law: ca.SX, rows: list[int], columns: list[int]) -> None:
         before, now, last, then, theta, symbol = inputs
         self.rows, self._time_step = rows, np.array([step.time_step])
         old, new, own = last[rows], then[rows], law[rows]

@@ -11,7 +11,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.statics import Equilibrium
-from yid_ocp.integrator.step import Step, adjoint_gradient, checked_rollout_inputs, simulate_batch
+from yid_ocp.integrator.step import Step, checked_rollout_inputs, simulate_batch
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
 from yid_ocp.integrator.tracking_feedback import DrivenJointMotion
 from yid_ocp.model.system import System
@@ -95,10 +95,8 @@ class EpisodePredictor:
 
     def theta_with_episode_values(self, episode: Episode, theta: Array) -> Array:
         """Parameter vector theta with the episode's own values: known ones and those fitted with its initial state."""
-        fitted: Mapping[str, float] = (
-            {} if episode.fixed_initial_state is None else episode.fixed_initial_state.fitted_parameters
-        )
-        return self._with(theta, {**episode.known_parameters, **fitted})
+        start = episode.fixed_initial_state
+        return self._with(theta, {**episode.known_parameters, **({} if start is None else start.fitted_parameters)})
 
     def _with(self, theta: Array, values: Mapping[str, float]) -> Array:
         own = theta.copy()
@@ -111,16 +109,9 @@ class EpisodePredictor:
     ) -> InitialState:
         """Initial state of an episode's rollout and its derivative by (wanted parameters, offset).
 
-        Parameters
-        ----------
-        theta : ndarray, shape (ntheta,)
-            From `theta_with_episode_values`.
-        offset : ndarray, shape (number of estimated rows,)
-            Of an estimated initial state from equilibrium.
-        wanted : tuple of str
-            Parameters by which to differentiate.
-        guess : ndarray, optional, shape (n,)
-            Configuration near the equilibrium; when absent `Episode.equilibrium_guess`, else that of least energy.
+        `theta` is that of `theta_with_episode_values`, `offset` that of an estimated initial state from equilibrium,
+        and `guess` (n,) a configuration near the equilibrium; when absent `Episode.equilibrium_guess`, else that of
+        least energy.
         """
         nx, rows = self.step.sizes["nx"], list(self.estimated_initial_state_indices)
         by_offset = np.zeros((nx, len(rows)))
@@ -132,15 +123,14 @@ class EpisodePredictor:
             inputs = self.corrected_inputs(episode, theta, wanted)
             first = inputs.first_torque if self.system.driven else None
             near = episode.equilibrium_guess if guess is None else guess
-            rest = self.model_functions.find_equilibrium(inputs.initial_known_coordinates, theta, first, near, wanted)
+            known, statics = inputs.initial_known_coordinates, self.model_functions.equilibrium_solver
+            rest = statics.solve(known, theta, first, near, wanted)
             if not rest.is_converged:
                 none = np.zeros((nx, len(wanted) + len(rows)))
                 return InitialState(rest.state, none, rest, f"{episode.name}: {rest.message}")
             state = rest.state.copy()
-            by_theta = (
-                rest.state_by_theta
-                + rest.state_by_known_coordinates @ inputs.initial_known_coordinates_sensitivity(len(wanted))
-            )
+            by_known = inputs.initial_known_coordinates_sensitivity(len(wanted))
+            by_theta = rest.state_by_theta + rest.state_by_known_coordinates @ by_known
             if inputs.first_torque_sensitivity is not None:
                 by_theta += rest.state_by_torque @ inputs.first_torque_sensitivity
         state[rows] += offset
@@ -155,17 +145,14 @@ class EpisodePredictor:
             (inputs.prescribed_path, episode.prescribed_path),
             (inputs.driven_angles, episode.measured_driven_angles),
         )
-        slopes = [
-            x
-            for x in (inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity)
-            if x is not None
-        ]
+        slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
         if self._follows_momenta and self.model_functions.momentum_shift.is_active(theta, wanted):
             return False
-        slopes += self.model_functions.input_corrections.effort_lag_time_constants(theta, wanted) or ()
+        slopes += self.model_functions.input_corrections.joint_times("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
             slopes += self._delay_in_steps(samples, theta, wanted) or ()
-        return not any(np.any(x) for x in slopes) and all(np.array_equal(a, b) for a, b in pairs)
+        moved = any(x is not None and np.any(x) for x in slopes)
+        return not moved and all(np.array_equal(a, b) for a, b in pairs)
 
     @property
     def _follows_momenta(self) -> bool:
@@ -179,13 +166,7 @@ class EpisodePredictor:
     ) -> CorrectedInputs:
         """Corrected inputs of an episode, with the momentum shift of its tracking filter's reference.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (ntheta,)
-        state : ndarray, shape (nx,)
-            Initial state.
-        by_unknowns : ndarray, optional, shape (nx, d)
-            Derivative of the initial state by the parameters and its estimated components.
+        `state` (nx,) is the initial one, `by_unknowns` (nx, d) its derivative by the parameters and its estimated part.
         """
         inputs = self.corrected_inputs(episode, theta, wanted)
         if not self._follows_momenta:
@@ -204,17 +185,17 @@ class EpisodePredictor:
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
         first = torque[0] if nu else np.zeros(0)
         by_torque = by_first = by_arm = by_path = by_recorded = None
-        if nu and corrections.delays_torque:
-            joints = episode.recording.joints
+        late = corrections.joint_times("torque_delay", theta, wanted)
+        if late is not None:
+            joints, (delay, by_delay) = episode.recording.joints, late
             assert joints is not None
             where = (joints, self.system.driven, episode.grid, episode.name)
-            delay, by_delay = corrections.torque_delay(theta, wanted)
             torque = mean_step_inputs(*where, delay, self.system.servos)
             by_recorded = mean_step_input_delay_derivative(*where, delay, self.system.servos)[:, :, None] * by_delay
         if errors is not None:
             # what multiplies or follows a reading would else take its noise for torque, and shrink to be rid of it
             torque, first = torque - errors.recorded_torque_noise, first - errors.recorded_torque_noise[0]
-        if nu and (corrections.delays_torque or corrections.corrects_efforts):
+        if nu and (late is not None or corrections.corrects_efforts):
             readings = np.pad(np.vstack([torque, first]), ((0, 0), (0, nc)))
             _, true, _, by_theta, by_reading = corrections.true_angles_and_efforts(
                 np.zeros_like(readings), readings, theta, wanted
@@ -223,14 +204,11 @@ class EpisodePredictor:
             if by_recorded is not None and wanted:
                 by_theta[:-1] += by_reading[:-1, :nu, None] * by_recorded
             torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
-        lag = corrections.torque_lag_time_constants(theta, wanted)
-        if lag is not None:
+        if (lag := corrections.joint_times("torque_lag", theta, wanted)) is not None:
             torque, by_torque = FirstOrderLag(*lag, self.step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
-            torque, first = (
-                torque - errors.torque_error_subtracted_after_effects,
-                first - errors.torque_error_subtracted_after_effects[0],
-            )
+            left = errors.torque_error_subtracted_after_effects
+            torque, first = torque - left, first - left[0]
         if corrections.corrects_angles:
             true, _, by_angle, _, _ = corrections.true_angles_and_efforts(
                 np.hstack([arm, path]), episode.joint_loads, theta, wanted
@@ -285,16 +263,8 @@ class EpisodePredictor:
             by_path = None if by_path is None else np.pad(by_path, ((0, 0), (0, 0), (0, width - len(wanted))))
             directions = SensitivityDirections(wanted, by_start, by_torque, by_path)
         feedback = inputs.corrected_feedback(feedback, driven, episode.measured_driven_angles)
-        member = checked_rollout_inputs(
-            self.step,
-            theta,
-            start.state,
-            episode.grid.steps,
-            inputs.torque,
-            inputs.prescribed_path,
-            feedback,
-            directions,
-        )
+        given = (start.state, episode.grid.steps, inputs.torque, inputs.prescribed_path)
+        member = checked_rollout_inputs(self.step, theta, *given, feedback, directions)
         return _Prepared(episode, start, inputs, member, wanted, derivatives)
 
     def _told(self, prepared: _Prepared | str, rollout: Rollout | None) -> EpisodePrediction | str:
@@ -327,32 +297,17 @@ class EpisodePredictor:
                 by_correction[:, :, : len(wanted)] -= inputs.torque_sensitivity
         # states by all directions are the largest arrays of all, and what samples need of them has been taken
         rollout = replace(rollout, state_sensitivity=None, multipliers_sensitivity=None, effort_sensitivity=None)
-        return EpisodePrediction(
-            rollout,
-            start.equilibrium,
-            tuple(predicted),
-            tuple(sensitivities) if prepared.derivatives else None,
-            None if start.equilibrium is None else start.equilibrium.state[: self.system.n_coordinates],
-            correction,
-            by_correction,
-        )
+        slopes = tuple(sensitivities) if prepared.derivatives else None
+        guess = None if start.equilibrium is None else start.equilibrium.state[: self.system.n_coordinates]
+        said = (rollout, start.equilibrium, tuple(predicted), slopes)
+        return EpisodePrediction(*said, guess, correction, by_correction)
 
     def readings_along_trajectory(
         self, samples: Measurements, state: Array, by_state: Array, theta: Array
     ) -> tuple[Array, Array]:
-        """Sensor readings along a given trajectory and their derivatives.
+        """Sensor readings (M, k) along a trajectory (N + 1, nx), and their derivatives (M, k, d).
 
-        Parameters
-        ----------
-        state : ndarray, shape (N + 1, nx)
-        by_state : ndarray, shape (N + 1, nx, d)
-            The first of the d directions are the free parameters.
-        theta : ndarray, shape (ntheta,)
-
-        Returns
-        -------
-        predicted : ndarray, shape (M, k)
-        sensitivities : ndarray, shape (M, k, d)
+        `by_state` (N + 1, nx, d) are those of the trajectory, the first ones by the free parameters.
         """
         read = _Trajectory(TimeGridStateValues.from_trajectory(self.step, state), by_state, None, None, None)
         y, total = self._read(samples, read, theta, self.unknowns.free_parameters)
@@ -382,7 +337,7 @@ class EpisodePredictor:
     def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
         """The rollout with efforts of prescribed joints as they are compared: as sensors follow them, and smoothed."""
         effort, slope = rollout.effort, rollout.effort_sensitivity
-        if (lag := self.model_functions.input_corrections.effort_lag_time_constants(theta, wanted)) is not None:
+        if (lag := self.model_functions.input_corrections.joint_times("effort_lag", theta, wanted)) is not None:
             effort, slope = FirstOrderLag(*lag, self.step.time_step).lagged_node_values(effort, slope)
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             effort, slope = smooth.smooth(effort), None if slope is None else smooth.smooth(slope)
@@ -393,10 +348,9 @@ class EpisodePredictor:
         compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
-        nodes = np.unique(
-            np.concatenate([self.delay_corrected_measurements(samples, theta).evaluation_nodes for samples in compared])
-        )
-        return LowPassFilter(self.options.path_cutoff).node_smoother(nodes, episode.grid.steps, self.step.time_step)
+        nodes = [self.delay_corrected_measurements(samples, theta).evaluation_nodes for samples in compared]
+        smooth, grid = LowPassFilter(self.options.path_cutoff), episode.grid
+        return smooth.node_smoother(np.unique(np.concatenate(nodes)), grid.steps, self.step.time_step)
 
     def _predict(
         self, samples: Measurements, rollout: Rollout, by_applied: Array | None, theta: Array, wanted: tuple[str, ...]
@@ -404,13 +358,8 @@ class EpisodePredictor:
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
             samples = samples.shifted_earlier_by(late[0])
-        along = _Trajectory(
-            self.node_values(rollout),
-            rollout.state_sensitivity,
-            rollout.effort_sensitivity,
-            by_applied,
-            rollout.multipliers_sensitivity,
-        )
+        slopes_of = (rollout.state_sensitivity, rollout.effort_sensitivity, by_applied, rollout.multipliers_sensitivity)
+        along = _Trajectory(self.node_values(rollout), *slopes_of)
         y, total = self._read(samples, along, theta, wanted)
         predicted, slopes = samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
         if late is not None and rollout.state_sensitivity is not None:
@@ -441,10 +390,8 @@ class EpisodePredictor:
                 total += by_load @ by_load_there[np.minimum(nodes, len(by_load_there) - 1)]
         if read.by_lam.shape[2]:
             if along.by_multipliers is None:
-                raise SolverError(
-                    f"'{samples.sensor.group_name}' depends on constraint forces, which node states do not carry",
-                    hint="use gauss_newton",
-                )
+                what = f"'{samples.sensor.group_name}' depends on constraint forces, which node states do not carry"
+                raise SolverError(what, hint="use gauss_newton")
             last = np.minimum(nodes, len(along.by_multipliers) - 1)
             total += read.by_lam @ along.by_multipliers[last] / self.step.time_step
         total[:, :, : len(wanted)] += read.by_theta
@@ -457,15 +404,7 @@ class EpisodePredictor:
     ) -> Array:
         """Gradient of a cost of an episode's predictions by its (shared, local, start) unknowns, by the adjoint.
 
-        Parameters
-        ----------
-        result : EpisodePrediction
-            At the same unknowns.
-        theta : ndarray, shape (ntheta,)
-        offset : ndarray
-            Of an estimated start.
-        pulls : list of ndarray, shape (M, k) each
-            Derivative of the cost by every prediction.
+        `result` is predicted at the same unknowns, `pulls` (M, k) are the cost's derivatives by every prediction.
         """
         wanted, rollout = self.unknowns.free_parameters, result.rollout
         theta = self.theta_with_episode_values(episode, theta)
@@ -477,16 +416,15 @@ class EpisodePredictor:
             total += self._pull(samples, pull, read, theta, _Pulls(by_state, by_effort, by_applied, by_multipliers))
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             by_effort = smooth.smoothing_adjoint(by_effort)
-        if (lag := self.model_functions.input_corrections.effort_lag_time_constants(theta, wanted)) is not None:
-            by_effort, by_lag = FirstOrderLag(*lag, self.step.time_step).lagged_node_values_adjoint(
-                rollout.effort, by_effort
-            )
+        if (lag := self.model_functions.input_corrections.joint_times("effort_lag", theta, wanted)) is not None:
+            lagged = FirstOrderLag(*lag, self.step.time_step)
+            by_effort, by_lag = lagged.lagged_node_values_adjoint(rollout.effort, by_effort)
             total += by_lag
         feedback = episode.tracking_feedback
         if feedback is not None:
             by_state[:-1, feedback.state_indices] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)
         by_lam = by_multipliers if np.any(by_multipliers) else None
-        by_inputs = adjoint_gradient(self.step, theta, rollout, wanted, by_state, by_lam, by_effort, feedback)
+        by_inputs = self.step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, by_state, by_lam, by_effort)
         start = self.initial_state(episode, theta, offset, wanted, result.equilibrium_guess)
         inputs = self.corrected_inputs_with_momentum_shift(episode, theta, wanted, start.state, start.state_sensitivity)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
@@ -495,9 +433,8 @@ class EpisodePredictor:
             own += np.einsum("ku,kuw->w", by_inputs.by_torque + by_applied, by_torque)
         if inputs.prescribed_path_sensitivity is not None:
             # node 0 is part of the start state
-            own[: len(total)] += np.einsum(
-                "kc,kcw->w", by_inputs.by_prescribed_path[1:], inputs.prescribed_path_sensitivity[1:]
-            )
+            by_path = by_inputs.by_prescribed_path[1:]
+            own[: len(total)] += np.einsum("kc,kcw->w", by_path, inputs.prescribed_path_sensitivity[1:])
         return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)
 
     def _pull(

@@ -49,62 +49,32 @@ from yid_ocp.sensors.joints import (
 
 @dataclass(frozen=True)
 class EpisodePrediction:
-    """Rollout of one episode, its predicted sensor readings and their sensitivities.
-
-    Attributes
-    ----------
-    equilibrium : Equilibrium or None
-        Equilibrium from which the rollout starts.
-    predicted_outputs : tuple of ndarray, shape (M, k) each
-        Prediction of every sample, in the sensor's unit.
-    output_sensitivities : tuple of ndarray, shape (M, k, d) each, or None
-    equilibrium_guess : ndarray, shape (n,), or None
-        Configuration at `equilibrium`, the initial guess for similar parameters.
-    torque_correction : ndarray, shape (N, nu), or None
-        Torque that the tracking filter adds to the recorded one [N m], where encoders are measurements.
-    torque_correction_sensitivity : ndarray, shape (N, nu, d), or None
-        Its derivative, with `output_sensitivities`.
-    """
+    """Rollout of one episode from its equilibrium, its predicted sensor readings and their sensitivities."""
 
     rollout: Rollout
     equilibrium: Equilibrium | None
-    predicted_outputs: tuple[Array, ...]
-    output_sensitivities: tuple[Array, ...] | None
-    equilibrium_guess: Array | None = None
+    predicted_outputs: tuple[Array, ...]  # of every sample, in the sensor's unit, (M, k) each
+    output_sensitivities: tuple[Array, ...] | None  # (M, k, d) each
+    equilibrium_guess: Array | None = None  # configuration at `equilibrium`, for similar parameters, (n,)
+    # what the tracking filter adds to the recorded torque where encoders are measurements, (N, nu) [N m]
     torque_correction: Array | None = None
-    torque_correction_sensitivity: Array | None = None
+    torque_correction_sensitivity: Array | None = None  # (N, nu, d)
 
     @property
     def torque_correction_and_sensitivity(self) -> Array | None:
         """`torque_correction` followed by the columns of its derivative where it is known, shape (N, nu, 1 + d)."""
         if self.torque_correction is None:
             return None
-        known = self.torque_correction[:, :, None]
-        return (
-            known
-            if self.torque_correction_sensitivity is None
-            else np.concatenate([known, self.torque_correction_sensitivity], axis=2)
-        )
+        known, slopes = self.torque_correction[:, :, None], self.torque_correction_sensitivity
+        return known if slopes is None else np.concatenate([known, slopes], axis=2)
 
 
 @dataclass(frozen=True)
 class InitialState:
-    """Initial state of a rollout with its derivative.
+    """Initial state of a rollout with its derivative, and what went wrong, if anything."""
 
-    Attributes
-    ----------
-    state : ndarray, shape (nx,)
-        (q, p, z)
-    state_sensitivity : ndarray, shape (nx, d)
-        Derivative by (wanted parameters, offset of the start).
-    equilibrium : Equilibrium or None
-        The equilibrium, where it is one.
-    failure_message : str
-        What went wrong; empty where all is well.
-    """
-
-    state: Array
-    state_sensitivity: Array
+    state: Array  # (q, p, z), (nx,)
+    state_sensitivity: Array  # by (wanted parameters, offset of the start), (nx, d)
     equilibrium: Equilibrium | None
     failure_message: str
 
@@ -120,39 +90,22 @@ seconds without correction."""
 class InputErrorModel:
     """Noise levels and current estimates of the torque and angle errors that drive one recording's rollout.
 
-    Attributes
-    ----------
-    torque_std, torque_bias_std, angle_std : ndarray, shape (nu,)
-        Of w in a step and of b [N m], of v [rad].
-    sample_of_step : ndarray of int, shape (N,)
-        Recorded sample that each step's torque comes from: w is the same in all its steps.
-    encoder_noise_steps : float
-        Number of steps that share one encoder sample's noise through interpolation.
-    has_encoder_measurements : bool
-        Whether the encoders are measurements.
-    torque_bias : ndarray, shape (nu,)
-        Value of b that is subtracted from the recorded torque [N m].
-    torque_noise : ndarray, shape (N, nu)
-        Value of w that is subtracted in every step [N m].
-    recorded_torque_noise : ndarray, shape (N, nu)
-        Noise of the recorded torque that w implies, subtracted before effects on torques apply [N m].
-    transmitted_torque_noise : ndarray, shape (N, nu)
-        Part of w that subtracting `recorded_torque_noise` already removes from the acting torque [N m].
-    smoothed_reference : ndarray, shape (N, nb), or None
-        Smoothed reference of the tracking filter in place of the measured motion.
+    The torque is off by w in a step and by b throughout [N m], the angles by v [rad].
     """
 
-    torque_std: Array
-    torque_bias_std: Array
-    angle_std: Array
-    sample_of_step: IntArray
-    encoder_noise_steps: float
+    torque_std: Array  # of w, (nu,)
+    torque_bias_std: Array  # of b, (nu,)
+    angle_std: Array  # of v, (nu,)
+    sample_of_step: IntArray  # recorded sample that each step's torque comes from: w is the same in all its steps, (N,)
+    encoder_noise_steps: float  # number of steps that share one encoder sample's noise through interpolation
     has_encoder_measurements: bool
-    torque_bias: Array
-    torque_noise: Array
+    torque_bias: Array  # value of b that is subtracted from the recorded torque, (nu,)
+    torque_noise: Array  # value of w that is subtracted in every step, (N, nu)
+    # noise of the recorded torque that w implies, subtracted before effects on torques apply, (N, nu) [N m]; then the
+    # part of w that this already removes from the acting torque
     recorded_torque_noise: Array
     transmitted_torque_noise: Array
-    smoothed_reference: Array | None = None
+    smoothed_reference: Array | None = None  # of the tracking filter, in place of the measured motion, (N, nb)
 
     @property
     def total_torque_error(self) -> Array:
@@ -174,15 +127,9 @@ class InputErrorModel:
 
     def truncated_to_steps(self, steps: int) -> InputErrorModel:
         """The same error model restricted to the first `steps` steps of the rollout."""
-        first = {
-            name: getattr(self, name)[:steps]
-            for name in ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
-        }
-        return replace(
-            self,
-            **first,
-            smoothed_reference=None if self.smoothed_reference is None else self.smoothed_reference[:steps],
-        )
+        names = ["sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise"]
+        names += [] if self.smoothed_reference is None else ["smoothed_reference"]
+        return replace(self, **{name: getattr(self, name)[:steps] for name in names})
 
 
 def _recorded_input_errors(
@@ -230,50 +177,26 @@ def _recorded_input_errors(
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording placed on the nodes of a rollout: inputs, measurements, tracking filter, input errors.
-
-    Attributes
-    ----------
-    torque : ndarray, shape (N, nu)
-        Of motors, or what servos are commanded.
-    prescribed_path : ndarray, shape (N + 1, nc)
-    initial_known_coordinates : ndarray, shape (nk,)
-        Known coordinates (driven, then prescribed) at node 0.
-    measured_driven_angles : ndarray, shape (N + 1, nu)
-        Measured angles of the driven joints at every node.
-    joint_loads : ndarray, shape (N + 1, nk)
-        Recorded effort of driven, then prescribed joints, where an effect makes their true angle depend on it.
-    smoothed_driven_angles : ndarray, shape (N + 1, nu)
-        Measured angles of the driven joints, smooth enough to be differenced; as measured where no filter needs them.
-    tracking_feedback : TrackingFeedback or None
-        Tracking filter of the driven joints with gains computed at the nominal parameters.
-    known_parameters : mapping of str to float
-        Known values of parameters that differ from recording to recording.
-    input_errors : InputErrorModel or None
-        Of the torques and angles that drive the rollout; None where there are none.
-    fixed_initial_state : FixedInitialState or None
-        Initial state that is given or was fitted to points; None where it is an equilibrium.
-    initial_state_shared_with : int, optional
-        Index of the estimation episode whose initial state this held-out part of the same recording shares.
-    equilibrium_guess : ndarray, optional, shape (n,)
-        Configuration near the initial equilibrium, where that is not the one of least energy.
-    """
+    """One recording placed on the nodes of a rollout: inputs, measurements, tracking filter, input errors."""
 
     recording: Recording
     grid: TimeGrid
-    torque: Array
-    prescribed_path: Array
-    initial_known_coordinates: Array
-    measured_driven_angles: Array
+    torque: Array  # of motors, or what servos are commanded, (N, nu) [N m, rad or m]
+    prescribed_path: Array  # (N + 1, nc)
+    initial_known_coordinates: Array  # driven, then prescribed, at node 0, (nk,)
+    measured_driven_angles: Array  # of the driven joints at every node, (N + 1, nu)
     measurements: tuple[Measurements, ...]
+    # recorded effort of driven, then prescribed joints, where their true angle depends on it, (N + 1, nk) [N m]
     joint_loads: Array
+    # the measured ones, smooth enough to be differenced; as measured where no filter needs them, (N + 1, nu)
     smoothed_driven_angles: Array
-    tracking_feedback: TrackingFeedback | None = None
-    known_parameters: Mapping[str, float] = field(default_factory=dict)
-    input_errors: InputErrorModel | None = None
-    fixed_initial_state: FixedInitialState | None = None
+    tracking_feedback: TrackingFeedback | None = None  # of the driven joints, its gains of the nominal parameters
+    known_parameters: Mapping[str, float] = field(default_factory=dict)  # those that differ among recordings
+    input_errors: InputErrorModel | None = None  # of the torques and angles that drive the rollout
+    fixed_initial_state: FixedInitialState | None = None  # given or fitted to points; else it is an equilibrium
+    # index of the estimation episode whose initial state this held-out part of the same recording shares
     initial_state_shared_with: int | None = None
-    equilibrium_guess: Array | None = None
+    equilibrium_guess: Array | None = None  # near the initial equilibrium, where that is not of least energy, (n,)
 
     @property
     def feedback_about_smoothed_motion(self) -> TrackingFeedback | None:
@@ -296,10 +219,7 @@ class Episode:
 def prepare_episode(functions: ModelFunctions, recording: Recording, options: ProblemOptions, theta: Array) -> Episode:
     """Place a recording on the nodes of a rollout: torques, paths, joint coordinates, samples, tracking filter.
 
-    Parameters
-    ----------
-    theta : ndarray, shape (ntheta,)
-        Nominal parameters, at which encoder noise is converted to effort and the filter's gains are computed.
+    At the nominal parameters `theta` encoder noise is converted to effort and the filter's gains are computed.
 
     Raises
     ------
@@ -325,25 +245,14 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     load = np.zeros((grid.steps + 1, len(known)))
     if functions.input_corrections.angles_depend_on_effort:
         load = smoothed_joint_efforts(recording, known, grid, low_pass)
-    start = options.known_initial_states.get(recording.name)
-    episode = Episode(
-        recording,
-        grid,
-        torque,
-        path,
-        np.concatenate([arm[0], path[0]]),
-        arm,
-        samples,
-        load,
-        smooth,
-        known_parameters=options.parameters_by_recording.get(recording.name, {}),
-        input_errors=None
-        if options.weighting == "paper"
-        else _recorded_input_errors(recording, system, grid, options.sensors, samples),
-        fixed_initial_state=None
-        if start is None
-        else FixedInitialState(checked_float_array("known_start", start, (step.sizes["nx"],))),
-    )
+    known_parameters = options.parameters_by_recording.get(recording.name, {})
+    start = errors = None
+    if (state := options.known_initial_states.get(recording.name)) is not None:
+        start = FixedInitialState(checked_float_array("known_start", state, (step.sizes["nx"],)))
+    if options.weighting != "paper":
+        errors = _recorded_input_errors(recording, system, grid, options.sensors, samples)
+    inputs = (recording, grid, torque, path, np.concatenate([arm[0], path[0]]), arm)
+    episode = Episode(*inputs, samples, load, smooth, None, known_parameters, errors, start)
     return _tracked(episode, functions, options, theta)
 
 
@@ -353,14 +262,10 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
     if not step.system.driven or step.system.servos or options.feedback == "none":
         return episode
     if options.feedback == "proportional":
-        return replace(
-            episode,
-            tracking_feedback=proportional_feedback(step, episode.measured_driven_angles, options.proportional_gains),
-        )
-    plain = functions.momentum_shift.theta_without_effects(theta)
-    loop = lqr_feedback(
-        step, episode.smoothed_driven_angles, episode.torque, plain, arms=functions.arms_only_integrator_step
-    )
+        loop = proportional_feedback(step, episode.measured_driven_angles, options.proportional_gains)
+    else:
+        plain, arms = functions.momentum_shift.theta_without_effects(theta), functions.arms_only_integrator_step
+        loop = lqr_feedback(step, episode.smoothed_driven_angles, episode.torque, plain, arms)
     return replace(episode, tracking_feedback=loop)
 
 
@@ -375,20 +280,16 @@ def truncate_episode(episode: Episode, steps: int) -> Episode:
         if entry.noise_correlation is not None:
             parts["noise_correlation"] = entry.noise_correlation[early]
         samples.append(replace(entry, **parts, predictable_nodes=(entry.predictable_nodes[0], last)))
-    whole, errors = episode.tracking_feedback, episode.input_errors
+    loop, errors = episode.tracking_feedback, episode.input_errors
+    at_nodes = ("prescribed_path", "measured_driven_angles", "joint_loads", "smoothed_driven_angles")
     return replace(
         episode,
         grid=replace(episode.grid, steps=steps),
         torque=episode.torque[:steps],
-        prescribed_path=episode.prescribed_path[: steps + 1],
-        measured_driven_angles=episode.measured_driven_angles[: steps + 1],
         measurements=tuple(samples),
-        joint_loads=episode.joint_loads[: steps + 1],
-        smoothed_driven_angles=episode.smoothed_driven_angles[: steps + 1],
-        tracking_feedback=None
-        if whole is None
-        else TrackingFeedback(whole.state_indices, whole.gain[:steps], whole.reference[:steps]),
-        input_errors=None if errors is None else errors.truncated_to_steps(steps),
+        tracking_feedback=loop and replace(loop, gain=loop.gain[:steps], reference=loop.reference[:steps]),
+        input_errors=errors and errors.truncated_to_steps(steps),
+        **{name: getattr(episode, name)[: steps + 1] for name in at_nodes},
     )
 
 
@@ -435,9 +336,6 @@ def _samples(
     found.sort(key=lambda data: bool(data.sensor.effort_joints))
     samples = tuple(locate_measurements_on_grid(data, grid, recording.name) for data in found)
     if not any(s.n_residuals for s in samples):
-        raise DataError(
-            "the recording holds no measurement that the model could be compared with",
-            where=recording.name,
-            hint="check `sensors` and the names of the recorded points",
-        )
+        what = "the recording holds no measurement that the model could be compared with"
+        raise DataError(what, where=recording.name, hint="check `sensors` and the names of the recorded points")
     return tuple(with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples

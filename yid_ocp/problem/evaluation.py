@@ -35,12 +35,8 @@ class ResidualWhitener(Protocol):
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
         """Whitened residual and derivatives (r, c), and the estimated constant torque errors (nu, c) [N m].
 
-        Parameters
-        ----------
-        rows : ndarray, shape (r, c)
-            A residual in units of the sensors' noise, then columns of its derivative.
-        push : ndarray, shape (N, nu, c), or None
-            The tracking filter's correction of the torque, and its derivative [N m].
+        Of `rows` (r, c), a residual in units of the sensors' noise and columns of its derivative, and `push`
+        (N, nu, c), the tracking filter's correction of the torque and its derivative [N m].
         """
         ...
 
@@ -57,15 +53,9 @@ class EvaluateFunction(Protocol):
 
 @dataclass(frozen=True)
 class ResidualVectorLayout:
-    """Layout of the residual vector as slices: measurements of all episodes, then stated priors, then weak priors.
+    """Layout of the residual vector as slices: measurements of all episodes, then stated priors, then weak priors."""
 
-    Attributes
-    ----------
-    measurements : tuple of tuple of slice
-        Rows of every group of measurements of every episode, those without a measurement left out.
-    """
-
-    measurements: tuple[tuple[slice, ...], ...]
+    measurements: tuple[tuple[slice, ...], ...]  # of every episode, of every group in it
     data: slice
     stated_priors: slice
     weak_priors: slice
@@ -85,26 +75,17 @@ class ResidualVectorLayout:
                 own.append(slice(at, at + samples.n_residuals))
                 at += samples.n_residuals
             groups.append(tuple(own))
-        return ResidualVectorLayout(
-            tuple(groups), slice(0, at), slice(at, at + stated), slice(at + stated, at + stated + weak)
-        )
+        last = at + stated
+        return ResidualVectorLayout(tuple(groups), slice(0, at), slice(at, last), slice(last, last + weak))
 
 
 @dataclass(frozen=True, repr=False)
 class Evaluation(ReprMixin):
-    """Cost, residual and optional Jacobian of an estimation problem at one unknown vector.
+    """Cost, residual and optional Jacobian of an estimation problem at one unknown vector."""
 
-    Attributes
-    ----------
-    cost : float
-        1/2 |r|^2, or the robust loss; infinite where the rollout failed.
-    residual : ndarray, shape (nr,)
-    jacobian : ndarray, shape (nr, nx), or None
-    """
-
-    cost: float
-    residual: Array
-    jacobian: Array | None
+    cost: float  # 1/2 |r|^2, or the robust loss; infinite where the rollout failed
+    residual: Array  # (nr,)
+    jacobian: Array | None  # (nr, nx)
     ok: bool
     message: str
     episode_predictions: tuple[EpisodePrediction, ...]

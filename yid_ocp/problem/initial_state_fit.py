@@ -39,18 +39,10 @@ _TRIALS_PER_PARAMETER = 4
 
 @dataclass(frozen=True)
 class FixedInitialState:
-    """Initial state that is given or fitted to the first measured points, independent of the unknowns.
+    """Initial state that is given or fitted to the first measured points, independent of the unknowns."""
 
-    Attributes
-    ----------
-    state : ndarray, shape (nx,)
-        (q, p, z) at node 0.
-    fitted_parameters : mapping of str to float
-        Parameters fitted along with it, by name, in their units.
-    """
-
-    state: Array
-    fitted_parameters: Mapping[str, float] = field(default_factory=dict)
+    state: Array  # (q, p, z) at node 0, (nx,)
+    fitted_parameters: Mapping[str, float] = field(default_factory=dict)  # along with it, in their units
 
 
 @dataclass(frozen=True)
@@ -74,12 +66,7 @@ class InitialStateFitter:
 
     so that among all shapes through the measured points it is the one of least elastic energy: that is what tells
     apart turns which no point sees, such as the roll of a clamp. At the last frame of the window the prior is that the
-    rate between the two is small. The momentum is that of this rate.
-
-    Parameters
-    ----------
-    fitted_parameters : sequence of str
-        Parameters fitted along with every start; their bounds must be finite.
+    rate between the two is small. The momentum is that of this rate. `fitted_parameters` must have finite bounds.
     """
 
     def __init__(self, step: Step, fitted_parameters: Sequence[str] = ()) -> None:
@@ -93,17 +80,11 @@ class InitialStateFitter:
         self._sensor: CasadiLockedCache[Sensor, ca.Function] = CasadiLockedCache(
             lambda sensor: sensor_reading_function(step.system, sensor, self.fitted_parameters)
         )
-        chosen = (
-            ca.vertcat(*(system.parameters[name].symbol for name in self.fitted_parameters))
-            if self.fitted_parameters
-            else ca.SX(0, 1)
-        )
+        chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in self.fitted_parameters))
         kinematics = forward_kinematics(system.mechanism, e.q1)
         aligned = ca.vertcat(ca.SX(0, 1), *(grasp.aligned_axis_differences(kinematics) for grasp in system.grasps))
-        held = ca.vertcat(
-            e.end_of_step_constraint_violation,
-            ca.substitute(aligned, ca.vertcat(ca.SX(0, 1), *system.internal_coordinates.values()), e.z1),
-        )
+        internal = ca.vertcat(ca.SX(0, 1), *system.internal_coordinates.values())
+        held = ca.vertcat(e.end_of_step_constraint_violation, ca.substitute(aligned, internal, e.z1))
         outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
         self._phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], outputs)
         at = [system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints]
@@ -117,26 +98,16 @@ class InitialStateFitter:
             for index, spring in zip(at, system.elastic_joints, strict=True)
             if f"{spring.joint_name}.{START_ANGLE_AND_LOAD_SUFFIXES[0]}" in system.parameters
         )
-        self._load = ca.Function(
-            "load", e.arguments, [e.rigid_body_terms.lagrangian_by_q, e.constraint_impulses.before_jacobian]
-        )
+        loads = [e.rigid_body_terms.lagrangian_by_q, e.constraint_impulses.before_jacobian]
+        self._load = ca.Function("load", e.arguments, loads)
 
     def fit_to_points(
         self, posture: Array, samples: Sequence[Measurements], theta: Array, window: float, path: Array
     ) -> FixedInitialState:
         """Fit the configuration to the points of the first frame and the momentum to their change within the window.
 
-        Parameters
-        ----------
-        posture : ndarray, shape (nk,)
-            Driven, then prescribed coordinates at node 0.
-        samples : sequence of Measurements
-            Only points are used.
-        theta : ndarray, shape (ntheta,)
-        window : float
-            How far from the start frames may be used [s].
-        path : ndarray, shape (N + 1, nc)
-            Prescribed coordinates.
+        Given are driven, then prescribed coordinates at node 0 (nk,), samples, of which only points are used, how far
+        from the start frames may be used [s], and the prescribed coordinates at all nodes (N + 1, nc).
 
         Raises
         ------
@@ -153,18 +124,15 @@ class InitialStateFitter:
                     if near <= last and np.any(group.weight[row] > 0):
                         frames.setdefault(near, []).append((group, row))
         if not frames:
-            raise DataError(
-                f"no point is seen in the first {window:g} s, so the start state cannot be fitted",
-                hint="widen problem.start_fit_window, or start from equilibrium",
-            )
+            what = f"no point is seen in the first {window:g} s, so the start state cannot be fitted"
+            raise DataError(what, hint="widen problem.start_fit_window, or start from equilibrium")
         nodes = sorted(frames)
         first, then = nodes[0], nodes[-1]
         index = [system.parameters.index(name) for name in self.fitted_parameters]
         stiffness, rest = (np.array(x).ravel() for x in self._elastic(theta))
         typical = float(np.mean(stiffness[stiffness > 0])) if np.any(stiffness > 0) else 1.0
-        weight = (
-            np.sqrt(np.where(stiffness > 0, np.maximum(stiffness / typical, _MIN_STIFFNESS_RATIO), 1.0)) / _BEND_STD
-        )
+        ratio = np.where(stiffness > 0, np.maximum(stiffness / typical, _MIN_STIFFNESS_RATIO), 1.0)
+        weight = np.sqrt(ratio) / _BEND_STD
         guess = rest.copy()
         guess[self._known] = posture
         guess[list(system.prescribed_coordinate_indices)] = path[first]
@@ -201,21 +169,18 @@ class InitialStateFitter:
         """
         if not self._presets:
             return {}
-        s = self.step.sizes
-        zero = np.zeros
-        by_q, pull = self._load(
-            q, q, zero(s["n"]), zero(s["nz"]), zero(s["nz"]), zero(s["m"]), zero(s["nu"]), theta, self.step.time_step
-        )
+        none = (np.zeros(self.step.sizes[key]) for key in ("n", "nz", "nz", "m", "nu"))
+        by_q, pull = self._load(q, q, *none, theta, self.step.time_step)
         at = [index for index, _ in self._presets]
         weight = 1 / np.sqrt(np.maximum(stiffness[at], 1e-12))
         free = np.array(by_q).ravel()[at]
         columns = np.array(ca.densify(pull))[:, at].T
         reaction = np.linalg.lstsq(weight[:, None] * columns, weight * (stiffness[at] * q[at] - free), rcond=None)[0]
         load = free + columns @ reaction
-        angles = {f"{joint}.{START_ANGLE_AND_LOAD_SUFFIXES[0]}": float(q[index]) for index, joint in self._presets}
-        return angles | {
-            f"{j}.{START_ANGLE_AND_LOAD_SUFFIXES[1]}": float(v) for (_, j), v in zip(self._presets, load, strict=True)
-        }
+        angle_suffix, load_suffix = START_ANGLE_AND_LOAD_SUFFIXES
+        angles = {f"{joint}.{angle_suffix}": float(q[index]) for index, joint in self._presets}
+        loads = zip(self._presets, load, strict=True)
+        return angles | {f"{joint}.{load_suffix}": float(value) for (_, joint), value in loads}
 
     def _trials(self, values: Array) -> list[Array]:
         if not self.fitted_parameters:
@@ -260,17 +225,19 @@ class InitialStateFitter:
         step, free, wanted = self.step, self._free, task.wanted
         nz, m = step.sizes["nz"], step.sizes["m"]
         residuals, jacobians = [], []
+
+        def joined(by_q: ca.DM, by_theta: ca.DM) -> Array:
+            return np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])
+
         for group, row in task.measured:
             read = self._sensor(group.sensor)(q=q, theta=theta)
-            y, by_q, by_theta = (read[name] for name in ("y", "by_q", "by_theta"))
             weight = group.weight[row] / task.softness
             value = np.where(weight > 0, group.value[row], 0.0)
-            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])
-            residuals.append(weight * (np.array(y).ravel() - value))
-            jacobians.append(weight[:, None] * wide)
+            residuals.append(weight * (np.array(read["y"]).ravel() - value))
+            jacobians.append(weight[:, None] * joined(read["by_q"], read["by_theta"]))
         if m:
-            gap, by_q, by_theta = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
-            wide = np.hstack([np.array(ca.densify(by_q))[:, free], np.array(ca.densify(by_theta[:, :wanted]))])
+            gap, *slopes = self._phi(q, np.zeros(nz), np.zeros(m), theta, step.time_step)
+            wide = joined(*slopes)
             residuals.append(np.array(gap).ravel() / (_CONSTRAINT_STD * task.softness))
             jacobians.append(wide / (_CONSTRAINT_STD * task.softness))
         residuals.append(((q - task.rest) * task.prior)[free])

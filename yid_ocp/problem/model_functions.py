@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.compiler import MappedFunction
-from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import DrivenJointMotion, EffectMomentumShift, driven_joints_only_step
@@ -23,35 +23,18 @@ from yid_ocp.sensors import Sensor, sensor_reading_function
 
 @dataclass(frozen=True)
 class CorrectedInputs:
-    """True inputs of a rollout, with derivatives by d parameters; a derivative that is zero is None.
+    """True inputs of a rollout, with derivatives (..., d) by d parameters; a derivative that is zero is None."""
 
-    Attributes
-    ----------
-    torque : ndarray, shape (N, nu)
-        [N m]
-    first_torque : ndarray, shape (nu,)
-        Torque of the initial equilibrium [N m].
-    prescribed_path : ndarray, shape (N + 1, nc)
-    driven_angles : ndarray, shape (N + 1, nu)
-        Angles of the driven joints [rad].
-    torque_sensitivity, first_torque_sensitivity : ndarray, shape (..., d), or None
-    prescribed_path_sensitivity, driven_angles_sensitivity : ndarray, shape (..., d), or None
-    momentum_shift : ndarray, shape (N, nu), or None
-        Momentum that effects add to the driven joints along their measured motion.
-    momentum_shift_sensitivity : ndarray, shape (N, nu, d'), or None
-        Includes the initial state's unknowns where they are asked for.
-    """
-
-    torque: Array
-    first_torque: Array
-    prescribed_path: Array
-    driven_angles: Array
+    torque: Array  # (N, nu) [N m]
+    first_torque: Array  # of the initial equilibrium, (nu,) [N m]
+    prescribed_path: Array  # (N + 1, nc)
+    driven_angles: Array  # of the driven joints, (N + 1, nu) [rad]
     torque_sensitivity: Array | None = None
     first_torque_sensitivity: Array | None = None
     prescribed_path_sensitivity: Array | None = None
     driven_angles_sensitivity: Array | None = None
-    momentum_shift: Array | None = None
-    momentum_shift_sensitivity: Array | None = None
+    momentum_shift: Array | None = None  # what effects add to the driven joints along their measured motion, (N, nu)
+    momentum_shift_sensitivity: Array | None = None  # by the initial state's unknowns too, where they are asked for
 
     @property
     def initial_known_coordinates(self) -> Array:
@@ -70,16 +53,15 @@ class CorrectedInputs:
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
     ) -> TrackingFeedback | None:
         """Tracking filter whose reference has the true angles and the momentum shift of the effects."""
-        if feedback is None or (self.driven_angles_sensitivity is None and self.momentum_shift is None):
+        turned = None if self.driven_angles_sensitivity is None else self.driven_angles - measured
+        if feedback is None or (turned is None and self.momentum_shift is None):
             return feedback
         reference = feedback.reference.copy()
-        for column, at in self._followed(feedback, driven, momenta=False):
-            if self.driven_angles_sensitivity is not None:
-                reference[:, column] += (self.driven_angles - measured)[: len(reference), at]
-        for column, at in self._followed(feedback, driven, momenta=True):
-            if self.momentum_shift is not None:
-                reference[:, column] += self.momentum_shift[:, at]
-        return TrackingFeedback(feedback.state_indices, feedback.gain, reference)
+        for moved, momenta in ((turned, False), (self.momentum_shift, True)):
+            if moved is not None:
+                for column, at in self._followed(feedback, driven, momenta):
+                    reference[:, column] += moved[: len(reference), at]
+        return replace(feedback, reference=reference)
 
     def with_momentum_shift(
         self,
@@ -92,29 +74,16 @@ class CorrectedInputs:
     ) -> CorrectedInputs:
         """Inputs with the momentum that effects add to the driven joints.
 
-        Parameters
-        ----------
-        recorded : DrivenJointMotion
-            Its angles are smooth.
-        measured : ndarray, shape (N + 1, nu)
-            Angles as they were read.
-        theta : ndarray, shape (ntheta,)
-        by_internal : ndarray, shape (nz, d), or None
-            Derivative of the internal coordinates at the start.
+        The angles `recorded` are smooth, those `measured` (N + 1, nu) are as they were read; `by_internal` (nz, d) is
+        the derivative of the internal coordinates at the start.
         """
         slopes = [x for x in (self.torque_sensitivity, self.driven_angles_sensitivity) if x is not None]
         read = np.array_equal(self.torque, recorded.torque) and np.array_equal(self.driven_angles, measured)
         if read and not any(np.any(x) for x in slopes) and not shift.is_active(theta, wanted):
             return self
-        smooth = recorded.angles + self.driven_angles - measured
-        true = DrivenJointMotion(
-            smooth,
-            self.torque,
-            recorded.initial_internal,
-            self.driven_angles_sensitivity,
-            self.torque_sensitivity,
-            by_internal,
-        )
+        smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
+        remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
+        true = DrivenJointMotion(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
         momentum, slope = shift.momentum_shift_and_derivatives(recorded, true, theta, wanted)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 
@@ -159,17 +128,15 @@ class InputCorrections:
         angle, effort = ca.SX.sym("angle", count), ca.SX.sym("effort", count)
         true_angle, true_effort = self._corrected(angle, effort)
         theta = system.parameters.symbols
-        late = ca.vertcat(ca.SX(0, 1), *(self._delay(f"torque.{joint}", False) for joint in system.driven))
         self.corrects_angles = _depends(true_angle, theta)
         self.corrects_efforts = _depends(true_effort, theta)
         self.angles_depend_on_effort = _depends(true_angle, effort)
-        self.delays_torque = _depends(late, theta)
         self._chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in names))
-        self._lags = {
-            kind: self._lag_function(kind, joints)
-            for kind, joints in (("torque", system.driven), ("joints.effort", system.prescribed))
+        self._times = {
+            "torque_delay": self._with_jacobian([self._delay(f"torque.{joint}", False) for joint in system.driven]),
+            "torque_lag": self._with_jacobian([self._lag(f"torque.{joint}") for joint in system.driven]),
+            "effort_lag": self._with_jacobian([self._lag(f"joints.effort.{joint}") for joint in system.prescribed]),
         }
-        self._late = ca.Function("delay", [theta], [late, ca.jacobian(late, self._chosen)])
         slope = ca.vertcat(ca.SX(0, 1), *(ca.jacobian(true_effort[i], effort[i]) for i in range(count)))
         outputs = [true_angle, true_effort, ca.densify(slope)]
 
@@ -204,55 +171,34 @@ class InputCorrections:
         # a delay is in true time, a recording in its own
         return total / self.system.recorded_time_scale
 
+    def _lag(self, channel: str) -> ca.SX:
+        total = sum((effect.channel_lag_time_constant(channel) for effect in self._effects), ca.SX(0))
+        return total / self.system.recorded_time_scale
+
     def true_angles_and_efforts(
         self, angle: Array, effort: Array, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """True angles and efforts of `joint_names` computed from recorded ones, with derivatives by `wanted`.
+        """True angles and efforts of `joint_names`, (K, nj), computed from recorded ones.
 
-        Parameters
-        ----------
-        angle, effort : ndarray, shape (K, nj)
-        theta : ndarray, shape (ntheta,)
-        wanted : tuple of str
-            Parameters by which to differentiate, d of them.
-
-        Returns
-        -------
-        angle, effort : ndarray, shape (K, nj)
-        angle_by_theta, effort_by_theta : ndarray, shape (K, nj, d)
-        effort_by_reading : ndarray, shape (K, nj)
+        Followed by their derivatives by the d parameters `wanted`, (K, nj, d), and that of the effort by its reading.
         """
         a, e, e_reading, *slopes = self._maps(bool(wanted))(angle, effort, theta)
         at = [self._names.index(name) for name in wanted]
         a_theta, e_theta = (x[:, :, at] for x in slopes) if wanted else (np.zeros((*a.shape[:2], 0)),) * 2
         return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
 
-    def torque_delay(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
-        """Delay from recorded to acting torque, shape (nu,) [s], and its derivatives by `wanted` parameters."""
-        return self._evaluate(self._late, theta, wanted)
+    def joint_times(
+        self, kind: Literal["torque_delay", "torque_lag", "effort_lag"], theta: Array, wanted: tuple[str, ...]
+    ) -> tuple[Array, Array] | None:
+        """Delays or lags' time constants of driven joints' torques or prescribed joints' efforts, shape (nj,) [s].
 
-    def torque_lag_time_constants(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """Time constants of driven joints' torque lags, (nu,) [s], and derivatives by `wanted`; None without lags."""
-        function = self._lags["torque"]
-        return None if function is None else self._evaluate(function, theta, wanted)
-
-    def effort_lag_time_constants(self, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """Time constants of prescribed joints' effort lags, (nc,) [s], derivatives by `wanted`; None without lags."""
-        function = self._lags["joints.effort"]
-        return None if function is None else self._evaluate(function, theta, wanted)
-
-    def _lag_function(self, kind: str, joints: tuple[str, ...]) -> ca.Function | None:
-        lags = [
-            sum((effect.channel_lag_time_constant(f"{kind}.{joint}") for effect in self._effects), ca.SX(0))
-            / self.system.recorded_time_scale
-            for joint in joints
-        ]
-        return self._with_jacobian(lags)
+        With their derivatives by the parameters `wanted`; None where no effect has any.
+        """
+        return self._evaluate(self._times[kind], theta, wanted)
 
     def sensor_delay(self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
         """Recorded minus true time of each output, (k,) [s], with derivatives by `wanted`; None without delays."""
-        found = self._sensor_delays(sensor)
-        return None if found is None else self._evaluate(found, theta, wanted)
+        return self._evaluate(self._sensor_delays(sensor), theta, wanted)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
         camera, width = sensor.camera_pose is not None, sensor.outputs_per_channel
@@ -265,7 +211,11 @@ class InputCorrections:
             return None
         return ca.Function("times", [theta], [expression, ca.jacobian(expression, self._chosen)])
 
-    def _evaluate(self, function: ca.Function, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array]:
+    def _evaluate(
+        self, function: ca.Function | None, theta: Array, wanted: tuple[str, ...]
+    ) -> tuple[Array, Array] | None:
+        if function is None:
+            return None
         value, slope = (np.array(ca.densify(x)) for x in function(theta))
         at = [self._names.index(name) for name in wanted]
         return value.ravel(), slope.reshape(value.size, len(self._names))[:, at]
@@ -372,26 +322,19 @@ class _CompiledSensor:
 class ModelFunctions:
     """Compiled functions of one step's system: sensors, equilibrium, initial state fit and input corrections.
 
-    Parameters
-    ----------
-    parameter_names : tuple of str
-        Parameters by which derivatives may be asked for.
-    start_parameters : tuple of str
-        Parameters fitted along with a start from points.
+    Derivatives may be asked for by the parameters `names`; `start_parameters` are fitted along with starts from points.
     """
 
     def __init__(self, step: Step, names: tuple[str, ...], start_parameters: tuple[str, ...] = ()) -> None:
         self.step = step
         self.parameter_names = names
         self.input_corrections = InputCorrections(step.system, names, step.is_compiled)
-        self._statics: CasadiLockedCache[None, EquilibriumSolver] = CasadiLockedCache(lambda _: EquilibriumSolver(step))
-        self._start_fit: CasadiLockedCache[None, InitialStateFitter] = CasadiLockedCache(
+        self._statics = CasadiLockedCache[None, EquilibriumSolver](lambda _: EquilibriumSolver(step))
+        self._start_fit = CasadiLockedCache[None, InitialStateFitter](
             lambda _: InitialStateFitter(step, start_parameters)
         )
-        self._arms: CasadiLockedCache[None, Step] = CasadiLockedCache(lambda _: driven_joints_only_step(step))
-        self._momentum: CasadiLockedCache[None, EffectMomentumShift] = CasadiLockedCache(
-            lambda _: EffectMomentumShift(step)
-        )
+        self._arms = CasadiLockedCache[None, Step](lambda _: driven_joints_only_step(step))
+        self._momentum = CasadiLockedCache[None, EffectMomentumShift](lambda _: EffectMomentumShift(step))
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
 
     @property
@@ -418,17 +361,8 @@ class ModelFunctions:
         """Compiled function of a sensor's readings, with derivatives by the parameters `wanted`."""
         if not wanted or wanted == self.parameter_names:
             return _CompiledSensor(self._sensors((sensor, bool(wanted))))
-        return _CompiledSensor(self._sensors((sensor, True)), self.parameter_columns(wanted))
-
-    def find_equilibrium(
-        self, posture: Array, theta: Array, torque: Array | None, guess: Array | None, wanted: tuple[str, ...]
-    ) -> Equilibrium:
-        """Equilibrium at known joint coordinates, differentiated by the parameters `wanted`."""
-        return self.equilibrium_solver.solve(posture, theta, torque, guess, wanted)
-
-    def parameter_columns(self, wanted: tuple[str, ...]) -> tuple[int, ...]:
-        """Column indices of the parameters `wanted` in `parameter_names`."""
-        return tuple(self.parameter_names.index(name) for name in wanted)
+        columns = tuple(self.parameter_names.index(name) for name in wanted)
+        return _CompiledSensor(self._sensors((sensor, True)), columns)
 
     def _compiled(self, key: tuple[Sensor, bool]) -> MappedFunction:
         sensor, differentiated = key
