@@ -16,11 +16,12 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -43,7 +44,6 @@ from yid_ocp.problem.prediction_errors import (
     constant_position_baseline,
     interpolated_displacement_baseline,
     measured_point_positions,
-    point_rmse_by_recording,
     position_rmse,
 )
 from yid_ocp.solvers import GaussNewton, solve
@@ -88,6 +88,25 @@ def cable_options(cable: CableTopology, recordings: list[Recording], options: Ca
         start_fit_parameters=("clamp_start.roll",),
         parameters_by_recording=known,
     )
+
+
+def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: Sequence[str]) -> dict[str, float]:
+    """Root mean square position error over some points, by recording, held-out ones included [m].
+
+    NaN for a recording whose rollout fails. The first two frames are given and do not count.
+    """
+    errors, found = {}, problem.predict_held_out(x)
+    for i, episode in enumerate(problem.episodes):
+        found.append((episode, problem.predictor.predict_episode(episode, *problem.split(x, i), False)))
+    for episode, result in found:
+        if isinstance(result, str):
+            errors[episode.name] = float("nan")
+            continue
+        for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
+            if samples.sensor.point_names == tuple(points):
+                shape = (len(predicted), len(points), 3)
+                errors[episode.name] = position_rmse(predicted.reshape(shape), samples.value.reshape(shape))
+    return errors
 
 
 def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:

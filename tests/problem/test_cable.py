@@ -20,14 +20,8 @@ from yid_ocp.model.objects.cable import (
     estimable_parameter_names,
     read_vertex_positions,
 )
-from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
-from yid_ocp.problem.prediction_errors import (
-    interpolated_displacement_baseline,
-    measured_point_positions,
-    point_rmse_by_recording,
-    position_rmse,
-)
 from yid_ocp.problem.recorded_inputs import prescribed_path
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.solvers import GaussNewton, solve
@@ -48,27 +42,22 @@ def line(at, towards, length):
     return at, at + length * direction
 
 
-def cable_options(cable, recordings, noise, model_error, path_cutoff=8.0, options=None):
-    """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
-    options = options or CableOptions()
-    known = {
-        r.name: edge_length_parameter_values(cable, median_point_pair_distances(cable.edges, [r], 2))
-        for r in recordings
-    }
-    names = [name for name in estimable_parameter_names(cable, options) if name.endswith(".rest")]
-    return ProblemOptions(
-        initial_state="fitted_to_points",
-        path_cutoff=path_cutoff,
-        sensors={"points": SensorOptions(std=model_error, points=cable.free_vertex_names)},
-        clamp_paths=cable.clamp_paths,
-        prior_stds=dict.fromkeys(names, 0.2),
-        start_fit_window=PERIOD,
-        start_point_noise_std=noise,
-        start_fit_parameters=("clamp_start.roll", "clamp_end.roll")
-        if options.end_clamp == "weld"
-        else ("clamp_start.roll",),
-        parameters_by_recording=known if options.lengths_per_recording else {},
-    )
+@pytest.fixture(scope="module")
+def real(benchmark_module):
+    """The benchmark on the real cable: its options, and errors by recording."""
+    return benchmark_module("cable")
+
+
+@pytest.fixture(scope="module")
+def twin_options(real, cable):
+    """The benchmark's options for recordings of the twin, whose edges are as long in all of them."""
+
+    def make(recordings, options, path_cutoff=np.inf):
+        sharp = {"points": SensorOptions(std=1e-3, points=cable.free_vertex_names)}
+        changes = {"sensors": sharp, "start_point_noise_std": 1e-6, "parameters_by_recording": {}}
+        return replace(real.cable_options(cable, recordings, options), path_cutoff=path_cutoff, **changes)
+
+    return make
 
 
 @pytest.fixture(scope="module")
@@ -168,30 +157,30 @@ def test_every_row_of_the_axis_constraint_matches_its_derivatives(twin):
     np.testing.assert_allclose(hessian, np.array(ca.densify(pull(q, lam, theta))), atol=1e-11)
 
 
-def test_the_values_of_a_twin_are_found_from_its_vertices(cable, twin):
+def test_the_values_of_a_twin_are_found_from_its_vertices(real, twin_options, cable, twin):
     step, options, recording = twin
     settings = replace(
-        cable_options(cable, [recording], 1e-6, 1e-3, path_cutoff=np.inf, options=options),
+        twin_options([recording], options),
         # the first edge of the twin is not seen bent, so its roll is given here and fitted elsewhere
         start_fit_parameters=(),
         parameters_by_recording={recording.name: {"clamp_start.roll": TRUTH["clamp_start.roll"]}},
     )
     free = ("parent.bend", "parent.damping", "c.bend")
     problem = EstimationProblem(step, [recording], free, settings)
-    before = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)["twin"]
+    before = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)["twin"]
     solution = solve(problem, GaussNewton())
     # what the points leave open of the start follows the stiffnesses with which it was fitted, so once more
     problem = problem.with_free_parameters(free, dict(zip(free, solution.x, strict=True)))
     solution = solve(problem, GaussNewton())
     np.testing.assert_allclose(solution.x, [TRUTH[name] for name in free], rtol=0.08)
-    after = point_rmse_by_recording(problem, solution.x, cable.free_vertex_names)["twin"]
+    after = real.point_rmse_by_recording(problem, solution.x, cable.free_vertex_names)["twin"]
     assert after < 5e-4
     assert before > 10 * after
 
 
-def test_the_roll_of_a_clamp_is_found_from_two_frames(cable, twin):
+def test_the_roll_of_a_clamp_is_found_from_two_frames(twin_options, twin):
     step, options, recording = twin
-    settings = cable_options(cable, [recording], 1e-6, 1e-3, path_cutoff=np.inf, options=options)
+    settings = twin_options([recording], options)
     problem = EstimationProblem(step, [recording], ("parent.bend",), settings, TRUTH | {"clamp_start.roll": -2.0})
     episode = problem.episodes[0]
     fitted = episode.fixed_initial_state
@@ -201,13 +190,13 @@ def test_the_roll_of_a_clamp_is_found_from_two_frames(cable, twin):
     np.testing.assert_allclose(result.predicted_outputs[0][0], episode.measurements[0].value[0], atol=1e-5)
 
 
-def test_held_out_starts_use_no_frame_after_the_second(cable, twin):
+def test_held_out_starts_use_no_frame_after_the_second(twin_options, cable, twin):
     step, options, recording = twin
     seen = recording.points[0].position.copy()
     free = [recording.points[0].names.index(v) for v in cable.free_vertex_names]
     seen[2:, free] += 1.0
     other = Recording(points=(replace(recording.points[0], position=seen),), name="other")
-    settings = cable_options(cable, [recording, other], 1e-6, 1e-3, options=options)
+    settings = twin_options([recording, other], options, path_cutoff=8.0)
     problem = EstimationProblem(step, [recording], ("parent.bend",), settings, None, [other])
     first = problem.predictor.predict_episode(problem.episodes[0], problem.theta, np.zeros(0), False)
     [(_, second)] = problem.predict_held_out(problem.initial_unknowns)
@@ -267,22 +256,14 @@ def test_vertices_are_read_from_a_table(tmp_path):
         read_vertex_positions(tmp_path / "none.csv")
 
 
-def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository):
+def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository, real):
     folder = repository.parent / "shared" / "recordings" / "deft"
     if not folder.is_dir():
         pytest.skip(f"the recordings are not there: {folder}")
-    cable = CableTopology(
-        tuple(f"p{i}" for i in range(13)),
-        {"a": ("p4", "a1", "a2", "a3", "a4"), "b": ("p8", "b1", "b2", "b3")},
-        read_vertex_positions(folder / "bdlo1_undeformed.csv"),
-    )
-    recording = read_recording(folder / "bdlo1_train_021.h5")
+    cable, recording = real.branched_cable(folder), read_recording(folder / "bdlo1_train_021.h5")
     options = CableOptions(shape_memory=0.75)
     step = compile_step(cable_system(median_point_pair_distances(cable.edges, [recording]), cable, options), PERIOD)
-    settings = replace(cable_options(cable, [recording], 2e-4, 0.1, options=options), duration=1.0)
+    settings = replace(real.cable_options(cable, [recording], options), duration=1.0)
     problem = EstimationProblem(step, [recording], estimable_parameter_names(cable, options), settings)
-    error = point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)[recording.name]
-    carried = interpolated_displacement_baseline(
-        recording, cable.free_vertex_names, cable.parent_vertices, cable.child_vertices, cable.clamped_vertex_names
-    )
-    assert error < 0.5 * position_rmse(carried, measured_point_positions(recording, cable.free_vertex_names))
+    error = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)[recording.name]
+    assert error < 0.5 * real.baselines(recording, cable)["linear_carry"]

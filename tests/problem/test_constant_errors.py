@@ -12,9 +12,10 @@ from small_problems import pendulum_step, taken
 from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import (
-    ConstantSensorErrorModel,
+    estimated_constant_errors,
     sensitivities_to_constant_errors,
     subtract_estimated_biases,
+    whitened_by_constant_errors,
 )
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
@@ -53,15 +54,11 @@ def test_the_map_is_that_of_generalised_least_squares():
     rng = np.random.default_rng(3)
     slopes, columns = rng.standard_normal((40, 3)) * [0.1, 2.0, 30.0], rng.standard_normal((40, 5))
     covariance = np.eye(40) + slopes @ slopes.T
-    made = ConstantSensorErrorModel.from_sensitivities(slopes).whiten(columns)
+    made = whitened_by_constant_errors(slopes, columns)
     np.testing.assert_allclose(made.T @ made, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
     expected = -slopes.T @ np.linalg.solve(covariance, columns[:, 0])
-    np.testing.assert_allclose(
-        ConstantSensorErrorModel.from_sensitivities(slopes).estimate_constant_errors(columns[:, 0]),
-        expected,
-        rtol=1e-9,
-        atol=1e-12,
-    )
+    found = estimated_constant_errors(slopes, columns[:, 0])
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_stated_constant_is_what_an_offset_of_every_recording_beside_its_prior_would_be(urdf_folder):

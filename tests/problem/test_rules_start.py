@@ -15,7 +15,7 @@ from small_problems import H, efforts, measured, pendulum_step, points, taken
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.initial_state_fit import InitialStateFitter, _speed
-from yid_ocp.problem.prediction_errors import point_rmse_by_recording, rmse_by_channel
+from yid_ocp.problem.prediction_errors import rmse_by_channel
 
 NAN = math.nan
 
@@ -304,18 +304,3 @@ def test_errors_are_euclidean_for_points_and_plain_for_efforts():
         )
         == {}
     )
-
-
-def test_errors_of_points_in_all_recordings(step):
-    problem = EstimationProblem(
-        step, [swung(step), swung(step, 6)], ("elbow.stiffness",), ProblemOptions(), held_out=[swung(step, 5)]
-    )
-    found = point_rmse_by_recording(problem, [3.0], ("tip",))
-    assert set(found) == {"run_4", "run_5", "run_6"}
-    for i, episode in enumerate(problem.episodes):
-        predicted = problem.evaluate([3.0], False).episode_predictions[i].predicted_outputs[0]
-        error = np.linalg.norm(predicted - episode.measurements[0].value, axis=1)[2:]
-        assert found[episode.name] == pytest.approx(math.sqrt(np.mean(error**2)))
-    assert point_rmse_by_recording(problem, [3.0], ("lower",)) == {}
-    failing = EstimationProblem(step, [swung(step)], ("elbow.rest",), ProblemOptions())
-    assert math.isnan(point_rmse_by_recording(failing, [1e8], ("tip",))["run_4"])

@@ -74,10 +74,8 @@ class EstimationProblem(ReprMixin):
     ----------
     theta : ndarray, shape (ntheta,)
         Initial values of free parameters and values of fixed ones.
-    unknowns : UnknownVectorLayout
-        Layout of the unknown vector.
-    residual_rows : ResidualVectorLayout
-        Layout of the residual.
+    unknowns, residual_rows : UnknownVectorLayout, ResidualVectorLayout
+        Layouts of the unknown vector and of the residual.
     whitening_filters, held_out_whitening_filters : tuple of ResidualWhitener or None
         Filter that whitens each recording's residual; None where sensor noise is the only noise.
 
@@ -156,12 +154,8 @@ class EstimationProblem(ReprMixin):
         self.predictor = EpisodePredictor(model_functions, options, self.unknowns)
         inertia = partial(mass_matrix_diagonal_at_zero, model_functions.step, theta)
         self._prior_std = stated_prior_std(self.unknowns, options, model_functions.step.system, inertia)
-        bare = options.weighting == "paper" or options.weak_prior_factor <= 1
-        weak = (
-            np.zeros(len(self.unknown_names), bool)
-            if bare
-            else self.positive_unknowns_mask & ~np.isfinite(self._prior_std)
-        )
+        has_weak_priors = options.weighting != "paper" and options.weak_prior_factor > 1
+        weak = self.positive_unknowns_mask & ~np.isfinite(self._prior_std) & has_weak_priors
         self._weak: IntArray = np.flatnonzero(weak)
         self._stated = stated_prior_jacobian(self.unknowns, options, self._prior_std)
         self.residual_rows = ResidualVectorLayout.from_episodes(episodes, len(self._stated), len(self._weak))
@@ -176,13 +170,11 @@ class EstimationProblem(ReprMixin):
 
     def _summary(self) -> ReprSummary:
         free = f"{len(self.free)} of {count_with_noun(len(self.system.parameters), 'parameter')} free"
-        seen = sum(int(samples.used_output_mask.sum()) for episode in self.episodes for samples in episode.measurements)
+        seen = sum(samples.n_residuals for episode in self.episodes for samples in episode.measurements)
         used, held = (count_with_noun(len(entries), "recording") for entries in (self.episodes, self.held_out))
         rows: list[tuple[str, ...]] = [("unknown", "start", "lower", "upper")]
-        rows += [
-            (n, *(f"{v:.4g}" for v in own))
-            for n, *own in zip(self.unknown_names, self.initial_unknowns, *self.bounds, strict=True)
-        ]
+        table = zip(self.unknown_names, self.initial_unknowns, *self.bounds, strict=True)
+        rows += [(name, *(f"{value:.4g}" for value in own)) for name, *own in table]
         return ReprSummary(f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows)
 
     # -- what it is made of -------------------------------------------------------------------------------------------
@@ -215,26 +207,19 @@ class EstimationProblem(ReprMixin):
     @property
     def initial_unknowns(self) -> Array:
         """Initial guess of the unknown vector, shape (nx,)."""
-        index = self.system.parameters.index
-        shared, local = (
-            [self.theta[index(name)] for name in part] for part in (self.shared_parameters, self.local_parameters)
-        )
-        return self.unknowns.pack_same_for_all_recordings(
-            shared, local, np.zeros(len(self.unknowns.initial_state_names))
-        )
+        index, parts = self.system.parameters.index, (self.shared_parameters, self.local_parameters)
+        shared, local = ([self.theta[index(name)] for name in part] for part in parts)
+        offset = np.zeros(len(self.unknowns.initial_state_names))
+        return self.unknowns.pack_same_for_all_recordings(shared, local, offset)
 
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the unknown vector."""
-        shared, local = (
-            self.system.parameters.bounds(part) for part in (self.shared_parameters, self.local_parameters)
-        )
+        parts = (self.shared_parameters, self.local_parameters)
+        (low, high), (own_low, own_high) = (self.system.parameters.bounds(part) for part in parts)
         wide = initial_state_offset_limits(self.system, self.unknowns.initial_state_names)
-        lower, upper = (
-            self.unknowns.pack_same_for_all_recordings(shared[side], local[side], wide * (-1 if side == 0 else 1))
-            for side in (0, 1)
-        )
-        return lower, upper
+        pack = self.unknowns.pack_same_for_all_recordings
+        return pack(low, own_low, -wide), pack(high, own_high, wide)
 
     @property
     def unknown_scales(self) -> Array:
@@ -302,18 +287,17 @@ class EstimationProblem(ReprMixin):
             return Evaluation(np.inf, np.zeros(0), None, False, failures[0], ())
         done = tuple(result for result in results if isinstance(result, EpisodePrediction))
         cost, residuals, jacobians = 0.0, [], []
+        threshold = self.options.huber_threshold
         for i, result in enumerate(done):
-            part = whitened_episode_residual(
-                self.episodes[i], self.whitening_filters[i], result, self.options.huber_threshold
-            )
+            part = whitened_episode_residual(self.episodes[i], self.whitening_filters[i], result, threshold)
             cost += part.cost
             residuals.append(part.residual)
             if part.jacobian is not None:
                 jacobians.append(self.unknowns.scatter_to_unknown_columns(part.jacobian, i))
         done = tuple(replace(result, output_sensitivities=None, torque_correction_sensitivity=None) for result in done)
-        prior_residual_and_jacobian, prior_jacobian = self.prior_residual_and_jacobian(x)
-        residual = np.concatenate([*residuals, prior_residual_and_jacobian])
-        cost += 0.5 * float(prior_residual_and_jacobian @ prior_residual_and_jacobian)
+        prior, prior_jacobian = self.prior_residual_and_jacobian(x)
+        residual = np.concatenate([*residuals, prior])
+        cost += 0.5 * float(prior @ prior)
         jacobian = np.vstack([*jacobians, prior_jacobian]) if derivatives else None
         if not np.isfinite(cost):
             return Evaluation(np.inf, residual, None, False, "the cost is not finite", done)
@@ -326,19 +310,8 @@ class EstimationProblem(ReprMixin):
     ) -> tuple[float, Array, Evaluation]:
         """Return the cost and its gradient by the adjoint; with process noise by forward sensitivities.
 
-        Parameters
-        ----------
-        x : array_like, shape (nx,)
-        evaluation : Evaluation, optional
-            At `x`, where it is known already: the rollout is most of the work.
-        equilibrium_guesses : EquilibriumGuesses, optional
-            As in `evaluate`.
-
-        Returns
-        -------
-        gradient : ndarray, shape (nx,)
-        evaluation : Evaluation
-            Without a Jacobian.
+        An `evaluation` at `x` that is known already saves the rollout, most of the work; it is returned, without a
+        Jacobian.
         """
         x = np.asarray(x, float)
         weighted = any(own is not None for own in self.whitening_filters)
@@ -358,8 +331,8 @@ class EstimationProblem(ReprMixin):
                 pulls.append(samples.whitened_residual_adjoint(factor**2 * raw))
             own = self.predictor.cost_gradient_by_adjoint(self.episodes[i], result, *self.split(x, i), pulls)
             gradient += self.unknowns.scatter_to_unknown_columns(own[None, :], i)[0]
-        prior_residual_and_jacobian, prior_jacobian = self.prior_residual_and_jacobian(x)
-        return evaluation.cost, gradient + prior_jacobian.T @ prior_residual_and_jacobian, evaluation
+        prior, prior_jacobian = self.prior_residual_and_jacobian(x)
+        return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
 
     def prior_residual_and_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Return the residual of the stated and weak priors, and its Jacobian by the unknowns."""
@@ -373,15 +346,9 @@ class EstimationProblem(ReprMixin):
     def initial_state(
         self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
     ) -> InitialState:
-        """Initial state of an episode with its derivative by (free parameters, offset).
+        """Initial state of an episode with its derivative by (free parameters, offset of an estimated start from rest).
 
-        Parameters
-        ----------
-        theta : ndarray, shape (ntheta,)
-        offset : ndarray, optional
-            Of an estimated start from rest.
-        guess : ndarray, optional, shape (n,)
-            Configuration near the equilibrium.
+        `guess` (n,) is a configuration near the equilibrium.
         """
         own = self.predictor.theta_with_episode_values(episode, theta)
         none = np.zeros(len(self.unknowns.initial_state_names)) if offset is None else offset
@@ -446,9 +413,8 @@ class EstimationProblem(ReprMixin):
         ConfigError, SolverError
             There is no such parameter; the model cannot be rolled out.
         """
-        return synthesize_recording(
-            self.predictor, self.episodes[recording], self.with_parameter_values(values or {}).theta, seed
-        )
+        theta = self.with_parameter_values(values or {}).theta
+        return synthesize_recording(self.predictor, self.episodes[recording], theta, seed)
 
     # -- problems like this one ---------------------------------------------------------------------------------------
 
@@ -471,12 +437,9 @@ class EstimationProblem(ReprMixin):
         held_out_whitening_filters: Sequence[ResidualWhitener | None] = (),
     ) -> EstimationProblem:
         """The same problem on other episodes of its model, whitened by sensor noise alone without filters."""
-        return self._changed(
-            episodes=tuple(episodes),
-            held_out=tuple(held_out),
-            whitening_filters=tuple(whitening_filters),
-            held_out_whitening_filters=tuple(held_out_whitening_filters),
-        )
+        filters = {"whitening_filters": whitening_filters, "held_out_whitening_filters": held_out_whitening_filters}
+        changes = {"episodes": episodes, "held_out": held_out, **filters}
+        return self._changed(**{name: tuple(value) for name, value in changes.items()})
 
     @property
     def has_process_noise(self) -> bool:
@@ -497,23 +460,16 @@ class EstimationProblem(ReprMixin):
 
     def with_free_parameters(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
         """The same problem rebuilt with other free parameters and values."""
-        keep = set(free)
         options = replace(
             self.options,
-            local_parameters=tuple(name for name in self.options.local_parameters if name in keep),
-            prior_stds={name: std for name, std in self.options.prior_stds.items() if name in keep},
+            local_parameters=tuple(name for name in self.options.local_parameters if name in free),
+            prior_stds={name: std for name, std in self.options.prior_stds.items() if name in free},
             multivariate_prior=self.options.multivariate_prior.restricted_to(free),
         )
-        nominal = dict(zip(self.system.parameters.names, self.theta, strict=True))
-        return self._prepared(free=free, options=options, values=nominal | dict(values or {}))
+        return self._prepared(values, free=free, options=options)
 
-    def _prepared(self, **changes: Any) -> EstimationProblem:
-        same = {
-            "step": self.step,
-            "recordings": [episode.recording for episode in self.episodes],
-            "free": self.free,
-            "options": self.options,
-            "values": dict(zip(self.system.parameters.names, self.theta, strict=True)),
-            "held_out": [episode.recording for episode in self.held_out],
-        }
-        return EstimationProblem(**{**same, **changes})
+    def _prepared(self, values: Mapping[str, float] | None = None, **changes: Any) -> EstimationProblem:
+        known = dict(zip(self.system.parameters.names, self.theta, strict=True)) | dict(values or {})
+        estimated, held_out = ([episode.recording for episode in group] for group in (self.episodes, self.held_out))
+        same = {"recordings": estimated, "free": self.free, "options": self.options, "held_out": held_out}
+        return EstimationProblem(self.step, values=known, **{**same, **changes})

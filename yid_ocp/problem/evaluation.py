@@ -13,11 +13,11 @@ from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.measurements import (
-    ConstantSensorErrorModel,
     Measurements,
     ResidualBlock,
     huber_loss_and_residual_factors,
     sensitivities_to_constant_errors,
+    whitened_by_constant_errors,
 )
 
 EquilibriumGuesses = tuple[Array | None, ...]
@@ -124,7 +124,7 @@ def whitened_episode_residual(
 ) -> ResidualBlock:
     """Whitened residual of one episode: by sensor noise, or by the frozen Kalman filter where one is given.
 
-    Constant sensor errors count as noise, see `ConstantSensorErrorModel`.
+    Constant sensor errors count as noise, see `whitened_by_constant_errors`.
     """
     by_constants = sensitivities_to_constant_errors(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
@@ -136,7 +136,7 @@ def whitened_episode_residual(
     if whitening is not None:
         columns, by_constants = _innovations(whitening, columns, by_constants, result.torque_correction_and_sensitivity)
     if by_constants.shape[1]:
-        columns = ConstantSensorErrorModel.from_sensitivities(by_constants).whiten(columns)
+        columns = whitened_by_constant_errors(by_constants, columns)
     cost, factor = huber_loss_and_residual_factors(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualBlock(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)

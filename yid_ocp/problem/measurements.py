@@ -58,18 +58,13 @@ def make_time_grid(recording: Recording, time_step: float, duration: float | Non
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))
     steps = math.floor(span / time_step + 1e-6)
     if steps > _MAX_STEPS or steps > _MAX_STEPS_PER_SAMPLE * len(t):
-        raise DataError(
-            f"{span:.3g} s of data, {len(t)} samples, are {steps:.3g} time steps of {time_step:g} s",
-            where=recording.name,
-            allowed=f"at most {_MAX_STEPS}, and {_MAX_STEPS_PER_SAMPLE} from one sample to the next",
-            hint="see whether times are in seconds and the clock does not jump; else cut the recording",
-        )
+        what = f"{span:.3g} s of data, {len(t)} samples, are {steps:.3g} time steps of {time_step:g} s"
+        allowed = f"at most {_MAX_STEPS}, and {_MAX_STEPS_PER_SAMPLE} from one sample to the next"
+        hint = "see whether times are in seconds and the clock does not jump; else cut the recording"
+        raise DataError(what, where=recording.name, allowed=allowed, hint=hint)
     if steps < 2:
-        raise DataError(
-            f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s",
-            where=recording.name,
-            hint="record longer, or choose a smaller time step",
-        )
+        what = f"{span:.3g} s of data are shorter than two time steps of {time_step:g} s"
+        raise DataError(what, where=recording.name, hint="record longer, or choose a smaller time step")
     return TimeGrid(float(t[0]), time_step, steps)
 
 
@@ -78,57 +73,27 @@ ResidualWeighting = Literal["whitened", "paper"]
 
 @dataclass(frozen=True)
 class ResidualBlock:
-    """One block of a residual: robust cost, weighted residual and Jacobian.
+    """One block of a residual: robust cost, weighted residual and Jacobian."""
 
-    Attributes
-    ----------
-    cost : float
-        Loss: half the sum of squares, or Huber's.
-    residual : ndarray, shape (nr,)
-    jacobian : ndarray, shape (nr, d), or None
-    robust_factor : ndarray, shape (nr,)
-        Robust weights, already multiplied into residual and Jacobian.
-    """
-
-    cost: float
-    residual: Array
-    jacobian: Array | None
-    robust_factor: Array
+    cost: float  # half the sum of squares, or Huber's loss
+    residual: Array  # (nr,)
+    jacobian: Array | None  # (nr, d)
+    robust_factor: Array  # already multiplied into residual and Jacobian, (nr,)
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """Samples of one sensor, located between the nodes of a rollout, with weights and noise levels.
-
-    Attributes
-    ----------
-    node : ndarray of int, shape (M,), or (M, k) where outputs are late by different times
-        Node before each sample.
-    fraction : ndarray, shape of `node`
-        Fraction of a step beyond it; predictions are interpolated linearly between the two nodes.
-    value : ndarray, shape (M, k)
-        Measured outputs, NaN where there is none.
-    weight : ndarray, shape (M, k)
-        Factor that turns a difference into a residual, zero where there is no measurement.
-    std : ndarray, shape (M, k)
-        Standard deviation of the noise, in the sensor's unit; NaN where it is not known.
-    predictable_nodes : (int, int)
-        First and last node at which the sensor can be predicted.
-    bias_std : ndarray, shape (k,)
-        Standard deviation of a constant error of every output, in the sensor's unit; zero where there is none.
-    noise_correlation : ndarray, shape (M, k, k), or None
-        Of the noise of the outputs of one sample; None where they are independent.
-    """
+    """M samples of the k outputs of one sensor, between the nodes of a rollout, with weights and noise levels."""
 
     sensor: Sensor
-    node: IntArray
-    fraction: Array
-    value: Array
-    weight: Array
-    std: Array
-    predictable_nodes: tuple[int, int]
-    bias_std: Array
-    noise_correlation: Array | None = None
+    node: IntArray  # before each sample, (M,), or (M, k) where outputs are late by different times
+    fraction: Array  # of a step beyond it, shape of `node`; predictions are interpolated linearly between two nodes
+    value: Array  # measured outputs, NaN where there is none, (M, k)
+    weight: Array  # factor that turns a difference into a residual, zero where there is no measurement, (M, k)
+    std: Array  # standard deviation of the noise, in the sensor's unit; NaN where it is not known, (M, k)
+    predictable_nodes: tuple[int, int]  # first and last node at which the sensor can be predicted
+    bias_std: Array  # standard deviation of a constant error of every output, zero where there is none, (k,)
+    noise_correlation: Array | None = None  # of the noise of a sample's outputs, if not independent, (M, k, k)
 
     @property
     def output_channel_names(self) -> tuple[str, ...]:
@@ -228,10 +193,8 @@ class Measurements:
         on = np.isclose(self.fraction, np.rint(self.fraction), rtol=0, atol=1e-9)
         middle = place + np.rint(self.fraction).astype(np.int64)
         rate = np.where(on, (at(middle + 1) - at(middle - 1)) / 2, at(place + 1) - at(place))
-        position = (unmoved.node + unmoved.fraction)[:, None] - steps
-        return np.where(
-            (position < self.predictable_nodes[0] - 1e-9) | (position > self.predictable_nodes[1] + 1e-9), 0.0, rate
-        )
+        position, (first, last) = (unmoved.node + unmoved.fraction)[:, None] - steps, self.predictable_nodes
+        return np.where((position < first - 1e-9) | (position > last + 1e-9), 0.0, rate)
 
     def interpolate_to_samples(self, at_nodes: Array) -> Array:
         """Interpolate values at `evaluation_nodes`, shape (len(nodes), ...), to the samples, shape (M, ...)."""
@@ -263,12 +226,9 @@ def locate_measurements_on_grid(data: SensorData, grid: TimeGrid, where: str) ->
     """Locate a sensor's data on the nodes of a rollout; raises `DataError` where a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
-        raise DataError(
-            "a noise level is zero or missing",
-            where=f"{where}: {data.sensor.group_name}",
-            allowed="a positive standard deviation",
-            hint="set it under `sensors`",
-        )
+        what, allowed = "a noise level is zero or missing", "a positive standard deviation"
+        place, hint = f"{where}: {data.sensor.group_name}", "set it under `sensors`"
+        raise DataError(what, where=place, allowed=allowed, hint=hint)
     weight = np.where(seen, 1.0 / np.where(data.std > 0, data.std, 1.0), 0.0)
     node, fraction = grid.node_and_fraction(data.t)
     std = np.where(seen, data.std, np.nan)
@@ -291,20 +251,9 @@ def with_paper_weights(samples: Measurements, grid: TimeGrid) -> Measurements:
 
 
 def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[float, Array]:
-    """Return the Huber loss of whitened residuals and the factors that scale them for weighted least squares.
+    """Return the Huber loss of whitened residuals, sum rho(r), and factors for weighted least squares, sqrt(rho'(r)/r).
 
-    Parameters
-    ----------
-    residual : ndarray, shape (nr,)
-    scale : float
-        Residual beyond which the loss grows linearly [standard deviations]; infinite for plain squares.
-
-    Returns
-    -------
-    cost : float
-        sum of rho(r)
-    factor : ndarray, shape (nr,)
-        Square root of rho'(r)/r.
+    Beyond `scale` the loss grows linearly [standard deviations]; infinite for plain squares.
     """
     size = np.abs(residual)
     inside = size <= scale
@@ -314,42 +263,19 @@ def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[floa
     return float(np.sum(cost)), factor
 
 
-@dataclass(frozen=True)
-class ConstantSensorErrorModel:
-    """Noise model of constant sensor errors: SVD of the residual's sensitivities to errors of unit variance.
+def whitened_by_constant_errors(slopes: Array, columns: Array) -> Array:
+    """Columns (a residual, its derivatives), (r, c), whitened by sensor noise and constant sensor errors.
 
-    Attributes
-    ----------
-    left_vectors : ndarray, shape (r, m)
-        Q
-    singular_values : ndarray, shape (m,)
-        S
-    right_vectors : ndarray, shape (m, m)
-        V'
+    `slopes` (r, m) are the sensitivities of residuals of unit variance to errors of unit variance.
     """
+    left, size, _ = np.linalg.svd(slopes, full_matrices=False)
+    return np.asarray(columns - left @ ((1 - 1 / np.sqrt(1 + size**2))[:, None] * (left.T @ columns)))
 
-    left_vectors: Array
-    singular_values: Array
-    right_vectors: Array
 
-    @staticmethod
-    def from_sensitivities(slopes: Array) -> ConstantSensorErrorModel:
-        """Model from the sensitivities of residuals of unit variance, shape (r, m)."""
-        return ConstantSensorErrorModel(*np.linalg.svd(slopes, full_matrices=False))
-
-    def whiten(self, columns: Array) -> Array:
-        """Whiten columns (a residual, its derivatives) by sensor noise and constant errors, shape (r, c)."""
-        along = self.left_vectors.T @ columns
-        return np.asarray(
-            columns - self.left_vectors @ ((1 - 1 / np.sqrt(1 + self.singular_values**2))[:, None] * along)
-        )
-
-    def estimate_constant_errors(self, residual: Array) -> Array:
-        """Estimate the errors, measured minus true, from a residual, prediction minus measurement, shape (m,)."""
-        return np.asarray(
-            -self.right_vectors.T
-            @ ((self.singular_values / (1 + self.singular_values**2)) * (self.left_vectors.T @ residual))
-        )
+def estimated_constant_errors(slopes: Array, residual: Array) -> Array:
+    """Constant errors (m,), measured minus true, of a residual, prediction minus measurement; `slopes` as above."""
+    left, size, right = np.linalg.svd(slopes, full_matrices=False)
+    return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
 
 
 def sensitivities_to_constant_errors(samples: Sequence[Measurements]) -> Array:
@@ -376,10 +302,9 @@ def subtract_estimated_biases(samples: Sequence[Measurements], predicted: Sequen
     slopes = sensitivities_to_constant_errors(samples)
     if not slopes.shape[1]:
         return tuple(samples)
-    residual = np.concatenate(
-        [s.whitened_residual(y)[s.used_output_mask] for s, y in zip(samples, predicted, strict=True)]
-    )
-    left = ConstantSensorErrorModel.from_sensitivities(slopes).estimate_constant_errors(residual)
+    pairs = zip(samples, predicted, strict=True)
+    residual = np.concatenate([s.whitened_residual(y)[s.used_output_mask] for s, y in pairs])
+    left = estimated_constant_errors(slopes, residual)
     made = []
     for s in samples:
         error, own = s.bias_std.copy(), s.bias_std > 0

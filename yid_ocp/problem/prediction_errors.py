@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.problem.estimation_problem import EstimationProblem
 
 
 def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGroup:
@@ -22,14 +20,10 @@ def _group_with_points(recording: Recording, points: Sequence[str]) -> PointGrou
     for group in recording.points:
         if set(points) <= set(group.names):
             return group
-    missing = [point for point in points if point not in recording.point_names]
-    raise DataError(
-        f"point '{missing[0]}' is not recorded" if missing else "the points stand in several groups",
-        where=recording.name,
-        hint=nearest_name_hint(missing[0], recording.point_names)
-        if missing
-        else "put points of one object in one group",
-    )
+    what, hint = "the points stand in several groups", "put points of one object in one group"
+    if missing := [point for point in points if point not in recording.point_names]:
+        what, hint = f"point '{missing[0]}' is not recorded", nearest_name_hint(missing[0], recording.point_names)
+    raise DataError(what, where=recording.name, hint=hint)
 
 
 def constant_position_baseline(recording: Recording, points: Sequence[str], given: int = 2) -> Array:
@@ -62,16 +56,9 @@ def interpolated_displacement_baseline(
 ) -> Array:
     """Baseline prediction: displacement interpolated in arc length along the parent; children move with their junction.
 
-    Shape and errors as in `constant_position_baseline`, and for a point of no branch.
-
-    Parameters
-    ----------
-    parent : sequence of str
-        Points of the parent from end to end.
-    children : mapping of str to sequence of str, optional
-        Points of each child, the first one the parent's point at which it leaves.
-    clamped : sequence of str, optional
-        Points of the parent between which is interpolated; its two ends when absent.
+    Shape and errors as in `constant_position_baseline`, and for a point of no branch. `parent` has its points from end
+    to end, of which `clamped` are those between which is interpolated, its two ends when absent; each child begins with
+    the parent's point at which it leaves.
     """
     known = tuple(clamped) if clamped is not None else (parent[0], parent[-1])
     at = _given_frame(recording, parent, given)
@@ -134,25 +121,15 @@ def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChannelPrediction(ReprMixin):
-    """Measured and predicted samples of one channel of one recording.
-
-    Attributes
-    ----------
-    t : ndarray, shape (M,)
-        On the channel's own clock [s].
-    measured, predicted : ndarray, shape (M, w)
-        w is 3 for a point and 1 for a joint; NaN where nothing was measured.
-    noise_std : ndarray, shape (M, w)
-        Of the sensor's noise; NaN where it is not known.
-    """
+    """Measured and predicted samples of one channel of one recording; w is 3 for a point and 1 for a joint."""
 
     recording: str
     channel: str
     unit: str
-    t: Array
-    measured: Array
+    t: Array  # on the channel's own clock, (M,) [s]
+    measured: Array  # NaN where nothing was measured, (M, w)
     predicted: Array
-    noise_std: Array
+    noise_std: Array  # of the sensor; NaN where it is not known, (M, w)
 
     @property
     def residual(self) -> Array:
@@ -165,9 +142,8 @@ class ChannelPrediction(ReprMixin):
         return float(np.sqrt(np.nanmean(np.sum(self.residual**2, axis=1))))
 
     def _summary(self) -> ReprSummary:
-        return ReprSummary(
-            f"{self.channel} of '{self.recording}', {len(self.t)} samples, rmse {self.rmse:.3g} {self.unit}"
-        )
+        samples = f"{len(self.t)} samples, rmse {self.rmse:.3g} {self.unit}"
+        return ReprSummary(f"{self.channel} of '{self.recording}', {samples}")
 
 
 def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[ChannelPrediction, ...]:
@@ -204,24 +180,3 @@ def rmse_by_channel(results: Sequence[EpisodePrediction], episodes: Sequence[Epi
         for channel, values in squares.items()
         if values
     }
-
-
-def point_rmse_by_recording(problem: EstimationProblem, x: ArrayLike, points: Sequence[str]) -> dict[str, float]:
-    """Root mean square position error over some points, by recording, held-out ones included [m].
-
-    NaN for a recording whose rollout fails. The first two frames are given and do not count.
-    """
-    x = np.asarray(x, float)
-    errors = {}
-    found: list[tuple[Episode, EpisodePrediction | str]] = list(problem.predict_held_out(x))
-    for i, episode in enumerate(problem.episodes):
-        found.append((episode, problem.predictor.predict_episode(episode, *problem.split(x, i), False)))
-    for episode, result in found:
-        if isinstance(result, str):
-            errors[episode.name] = float("nan")
-            continue
-        for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
-            if samples.sensor.point_names == tuple(points):
-                shape = (len(predicted), len(points), 3)
-                errors[episode.name] = position_rmse(predicted.reshape(shape), samples.value.reshape(shape))
-    return errors

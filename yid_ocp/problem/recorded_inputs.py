@@ -34,16 +34,8 @@ def mean_step_inputs(
 
     An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; through samples of
     efforts goes a cubic spline, and where means over the recorded intervals are given, the derivative of one through
-    their sums, which keeps every mean.
-
-    Parameters
-    ----------
-    where : str
-        Name of the recording.
-    delay : ndarray, shape (nu,), optional
-        How much later than recorded each of them acts [s].
-    servos : mapping of joint to PositionServo, optional
-        Of all driven joints, which then follow commands.
+    their sums, which keeps every mean. Each acts later than recorded by its `delay` (nu,) [s]; with `servos`, those of
+    all driven joints, these follow commands. `where` is the recording's name.
 
     Raises
     ------
@@ -56,7 +48,7 @@ def mean_step_inputs(
     courses = _courses(joints, driven, where, servos or {})
     total = [_summed(course, grid.node_times - shift) for course, shift in zip(courses, late, strict=True)]
     mean = np.asarray(np.diff(np.stack(total, axis=1), axis=0) / grid.time_step)
-    mean[motor_off_steps(joints, driven, grid, where, bool(servos))] = MOTOR_OFF_COMMAND
+    mean[_motor_off_steps(joints, driven, grid, where, bool(servos))] = MOTOR_OFF_COMMAND
     return mean
 
 
@@ -74,24 +66,17 @@ def mean_step_input_delay_derivative(
         sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
         result.append(-np.diff(sum(sides)) / 2 / grid.time_step)
     slope = np.stack(result, axis=1)
-    slope[motor_off_steps(joints, driven, grid, where, bool(servos))] = 0.0
+    slope[_motor_off_steps(joints, driven, grid, where, bool(servos))] = 0.0
     return slope
 
 
-def motor_off_steps(
+def _motor_off_steps(
     joints: JointGroup, driven: tuple[str, ...], grid: TimeGrid, where: str, has_servos: bool
 ) -> BoolArray:
-    """In which steps the motor of a servo is off, shape (steps, nu).
-
-    By `torque_enable`, held from sample to sample, at the middle of a step; all of them without commands.
-    """
-    off = np.zeros((grid.steps, len(driven)), bool)
-    if not has_servos:
-        return off
-    if joints.position_command is None:
-        return np.ones_like(off)
-    if joints.torque_enable is None:
-        return off
+    """Steps in which a motor of a servo is off, (steps, nu): by `torque_enable` at their middle; all without commands."""
+    is_off = has_servos and joints.position_command is None
+    if is_off or not has_servos or joints.torque_enable is None:
+        return np.full((grid.steps, len(driven)), is_off)
     row = np.searchsorted(joints.t, grid.node_times[:-1] + grid.time_step / 2, "right") - 1
     enabled = joints.torque_enable[:, recorded_joint_columns(joints, driven, where)]
     return np.asarray(enabled[np.clip(row, 0, len(joints.t) - 1)] < 0.5)
@@ -134,23 +119,21 @@ def _courses(
         if joints.position_command is None and joints.effort is not None and not np.any(joints.effort):
             return [_held(np.zeros(len(t)), edges)] * len(driven)  # motors are off
         if joints.position_command is None:
-            raise DataError(
-                "the recording has no commanded positions, which the arms' servos follow",
-                where=f"{where}: joints/position_command",
-                allowed="the commanded position of every joint beside the measured one",
-                hint="import them (the action of a LeRobot dataset, --command-topic of a bag), "
+            what = "the recording has no commanded positions, which the arms' servos follow"
+            allowed = "the commanded position of every joint beside the measured one"
+            hint = (
+                "import them (the action of a LeRobot dataset, --command-topic of a bag), "
                 "or prescribe the arms' motion instead (model.arms.mode: prescribed); "
-                "with motors off an effort that is zero throughout says so",
+                "with motors off an effort that is zero throughout says so"
             )
+            raise DataError(what, where=f"{where}: joints/position_command", allowed=allowed, hint=hint)
         rows = joints.position_command[:, recorded_joint_columns(joints, driven, where)].T
         held = [servos[name].command_interpolation == "held" for name in driven]
         return [_held(row, edges) if jumps else _straight(row, t) for row, jumps in zip(rows, held, strict=True)]
     if joints.effort is None:
-        raise DataError(
-            "the recording has no joint effort, which drives the model",
-            where=f"{where}: joints/effort",
-            hint="prescribe the arms' motion instead (model.arms.mode: prescribed)",
-        )
+        what = "the recording has no joint effort, which drives the model"
+        hint = "prescribe the arms' motion instead (model.arms.mode: prescribed)"
+        raise DataError(what, where=f"{where}: joints/effort", hint=hint)
     effort = joints.effort[:, recorded_joint_columns(joints, driven, where)]
     if joints.effort_kind_or_default == "sample":
         return [scipy.interpolate.CubicSpline(t, column) for column in effort.T]
@@ -179,28 +162,24 @@ def smoothed_joint_angles(
     joints: JointGroup, names: tuple[str, ...], grid: TimeGrid, where: str, low_pass: LowPassFilter
 ) -> Array:
     """Smoothed joint angles at every node by a cubic spline, shape (steps + 1, len(names)) [rad]."""
-    values = low_pass(joints.t, joints.position[:, recorded_joint_columns(joints, names, where)])
-    spline = scipy.interpolate.CubicSpline(joints.t, values, axis=0)
-    return np.asarray(spline(np.clip(grid.node_times, *joints.t[[0, -1]])))
+    columns = recorded_joint_columns(joints, names, where)
+    return _smoothed_at_nodes(joints.t, joints.position[:, columns], grid, low_pass)
+
+
+def _smoothed_at_nodes(t: Array, values: Array, grid: TimeGrid, low_pass: LowPassFilter) -> Array:
+    spline = scipy.interpolate.CubicSpline(t, low_pass(t, values), axis=0)
+    return np.asarray(spline(np.clip(grid.node_times, *t[[0, -1]])))
 
 
 def smoothed_joint_efforts(
     recording: Recording, names: tuple[str, ...], grid: TimeGrid, low_pass: LowPassFilter
 ) -> Array:
-    """Smoothed recorded joint efforts at every node, shape (steps + 1, len(names)) [N m].
-
-    Raises
-    ------
-    DataError
-        No effort recorded, or a joint that is missing.
-    """
+    """Smoothed recorded joint efforts at every node, shape (steps + 1, len(names)) [N m]; `DataError` without them."""
     joints = recording.joints
     if joints is None or joints.effort is None:
-        raise DataError(
-            "the model's gears give way under an effort that the recording does not have",
-            where=f"{recording.name}: joints/effort",
-            hint="leave series_elasticity and backlash out",
-        )
+        what = "the model's gears give way under an effort that the recording does not have"
+        hint = "leave series_elasticity and backlash out"
+        raise DataError(what, where=f"{recording.name}: joints/effort", hint=hint)
     effort = low_pass(joints.t, joints.effort[:, recorded_joint_columns(joints, names, recording.name)])
     return np.stack([np.interp(grid.node_times, joints.t, column) for column in effort.T], axis=1)
 
@@ -208,15 +187,8 @@ def smoothed_joint_efforts(
 def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
     """Gear loads: the model's own plus the slow part of measured minus own, so that effort noise is not fed back.
 
-    Parameters
-    ----------
-    measured, own : ndarray, shape (N + 1, k)
-        Smoothed.
-    nodes : ndarray of int, shape (M,)
-        At which they are compared; beyond the first and the last neither side is right.
-    times : ndarray, shape (N + 1,)
-    cutoff : float
-        Of the filter of paths and efforts [Hz].
+    Both are smoothed (N + 1, k) and compared at `nodes` (M,), beyond the first and last of which neither is right; the
+    filter of paths and efforts has the `cutoff` [Hz].
     """
     gap = (measured - own)[np.clip(np.arange(len(own)), nodes.min(), nodes.max())]
     return measured - gap + LowPassFilter(_SLOW_LOAD_CUTOFF_FRACTION * cutoff)(times, gap)
@@ -248,12 +220,8 @@ def prescribed_path(
 ) -> Array:
     """Prescribed coordinates at every node, shape (steps + 1, nc).
 
-    Joints follow the smoothed recorded positions, clamps their smoothed points.
-
-    Raises
-    ------
-    DataError
-        A prescribed joint or a clamp's point is not recorded, or is seen too seldom.
+    Joints follow the smoothed recorded positions, clamps their smoothed points; `DataError` where one is not recorded,
+    or is seen too seldom.
     """
     if not system.prescribed:
         return np.zeros((grid.steps + 1, 0))
@@ -301,9 +269,6 @@ def _smoothed_point_path(recording: Recording, point: str, grid: TimeGrid, low_p
             if good.sum() < 4:
                 what = f"point '{point}' is seen {good.sum()} times"
                 raise DataError(what, where=recording.name, allowed="4 or more")
-            values = low_pass(group.t[good], seen[good])
-            spline = scipy.interpolate.CubicSpline(group.t[good], values, axis=0)
-            return np.asarray(spline(np.clip(grid.node_times, group.t[good][0], group.t[good][-1])))
-    raise DataError(
-        f"point '{point}' is not recorded", where=recording.name, hint=nearest_name_hint(point, recording.point_names)
-    )
+            return _smoothed_at_nodes(group.t[good], seen[good], grid, low_pass)
+    hint = nearest_name_hint(point, recording.point_names)
+    raise DataError(f"point '{point}' is not recorded", where=recording.name, hint=hint)

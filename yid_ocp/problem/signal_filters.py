@@ -23,27 +23,13 @@ _MIN_RELATIVE_WEIGHT = 1e-4
 
 @dataclass(frozen=True)
 class LowPassFilter:
-    """Zero-phase low-pass filter (Butterworth of order 4, forward and backward) on an even clock.
+    """Zero-phase low-pass filter (Butterworth of order 4, forward and backward) on an even clock."""
 
-    Attributes
-    ----------
-    cutoff : float
-        Frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter.
-    passes : int
-        How many times the filter is applied.
-    """
-
-    cutoff: float
+    cutoff: float  # frequency at which the amplitude is halved in power twice over [Hz]; infinite for no filter
     passes: int = 1
 
     def __call__(self, t: Array, values: Array) -> Array:
-        """Smoothed values at the same times; an uneven clock is resampled to its median step in between.
-
-        Parameters
-        ----------
-        t : ndarray, shape (M,)
-        values : ndarray, shape (M, k)
-        """
+        """Smoothed values (M, k) at the same times; an uneven clock is resampled to its median step in between."""
         if not math.isfinite(self.cutoff):
             return values
         step = float(np.median(np.diff(t)))
@@ -104,10 +90,8 @@ class LowPassFilter:
         nyquist = 0.5 / step
         least = _MIN_CUTOFF_FRACTION * nyquist
         if not least < self.cutoff < nyquist:
-            raise DataError(
-                f"path_cutoff = {self.cutoff:g} Hz",
-                allowed=f"above {least:.2g} and below {nyquist:g} Hz for this recording",
-            )
+            allowed = f"above {least:.2g} and below {nyquist:g} Hz for this recording"
+            raise DataError(f"path_cutoff = {self.cutoff:g} Hz", allowed=allowed)
         warped = math.tan(math.pi / 2 * self.cutoff / nyquist)
         damping = 2 * warped * np.sin(np.pi / (2 * _FILTER_ORDER) * np.arange(1, _FILTER_ORDER, 2))
         scale = 1 + damping + warped**2
@@ -116,14 +100,7 @@ class LowPassFilter:
 
 @dataclass(frozen=True)
 class NodeSmoother:
-    """Matrix that smooths values at chosen nodes and leaves the others unchanged.
-
-    Attributes
-    ----------
-    nodes : ndarray of int, shape (M,)
-    matrix : sparse array, shape (M, N)
-        From values at all nodes.
-    """
+    """Matrix (M, N) that smooths values at M of N nodes and leaves the others unchanged."""
 
     nodes: IntArray
     matrix: scipy.sparse.csr_array
@@ -162,33 +139,16 @@ class FirstOrderLag:
 
     With E = exp(-h/T) and f = T/h (1 - E), both zero at T = 0, where a value is followed at once. At nodes T may be
     negative: then the value follows z with the time constant -T, so that z = x - T dx/dt.
-
-    Attributes
-    ----------
-    time_constant : ndarray, shape (k,)
-        T [s]
-    time_constant_sensitivity : ndarray, shape (k, d)
-    time_step : float
-        h [s]
     """
 
-    time_constant: Array
-    time_constant_sensitivity: Array
-    time_step: float
+    time_constant: Array  # T, (k,) [s]
+    time_constant_sensitivity: Array  # (k, d)
+    time_step: float  # h [s]
 
     def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
         """Mean over each step of the lagged output for inputs held over steps; output and input start equal.
 
-        Parameters
-        ----------
-        value : ndarray, shape (N, k)
-        slope : ndarray, shape (N, k, d), or None
-
-        Returns
-        -------
-        mean : ndarray, shape (N, k)
-            x + (z - x) f, with z_{k+1} = x + (z - x) E.
-        by_parameters : ndarray, shape (N, k, d)
+        Of x (N, k) with its slope (N, k, d), if any, it is x + (z - x) f, with z_{k+1} = x + (z - x) E; and its slope.
         """
         decay, share, decay_slope, share_slope = self._factors()
         held = self._following(value, np.zeros(value.shape), decay)
@@ -201,19 +161,10 @@ class FirstOrderLag:
         return value + share * gap, through + mean_by_time
 
     def lagged_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
-        """Lagged output at nodes for an input that is linear between nodes, starting at node 1.
+        """Lagged output at nodes for an input that is linear between nodes, starting at node 1, and its slope.
 
-        Parameters
-        ----------
-        value : ndarray, shape (N, k)
-        slope : ndarray, shape (N, k, d), or None
-            By all directions, the first ones of which are the parameters of `time_constant_sensitivity`.
-
-        Returns
-        -------
-        followed : ndarray, shape (N, k)
-            z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}, or x - T dx/dt by central differences.
-        slope : ndarray, shape (N, k, d), or None
+        Of x (N, k) it is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}, or x - T dx/dt by central differences. Slopes
+        (N, k, d) are by all directions, first the parameters of `time_constant_sensitivity`.
         """
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
@@ -228,23 +179,11 @@ class FirstOrderLag:
         return followed, total
 
     def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """Adjoint of `lagged_node_values`: cost derivatives by input and parameters from those by the output.
-
-        Parameters
-        ----------
-        value, pull : ndarray, shape (N, k)
-
-        Returns
-        -------
-        pull : ndarray, shape (N, k)
-        by_parameters : ndarray, shape (d,)
-        """
+        """Adjoint of `lagged_node_values`: cost derivatives by input (N, k) and parameters (d,) from the output's."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
-        direct = (
-            np.sum(pull * self._by_time(value, self._straight(value, decay, share)), axis=0)
-            @ self.time_constant_sensitivity
-        )
+        by_time = self._by_time(value, self._straight(value, decay, share))
+        direct = np.sum(pull * by_time, axis=0) @ self.time_constant_sensitivity
         back = pull.copy()
         for k in range(len(back) - 2, 0, -1):
             back[k] += decay * back[k + 1]

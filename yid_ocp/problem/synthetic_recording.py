@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.sensors.base import expand_to_joint_values
+from yid_ocp.sensors.base import EffortKind, expand_to_joint_values
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
     JOINT_POSITION_GROUP_NAME,
@@ -31,16 +32,9 @@ def recording_from_prediction(
     seed: int | None = None,
     description: str = "",
 ) -> Recording:
-    """Convert an episode's predicted rollout into a recording with its sensors' clocks and noise levels.
+    """Convert an episode's rollout, predicted at `theta`, into a recording with its sensors' clocks and noise levels.
 
-    Parameters
-    ----------
-    outcome : EpisodePrediction
-        Of this predictor.
-    theta : ndarray, shape (ntheta,)
-        At which it was predicted.
-    seed : int, optional
-        Of the noise that the estimation assumes, constant torque offsets included; no noise when absent.
+    `seed` is that of the noise that the estimation assumes, constant torque offsets included; no noise when absent.
     """
     rng = None if seed is None else np.random.default_rng(seed)
     system, source = predictor.system, episode.recording
@@ -52,26 +46,17 @@ def recording_from_prediction(
             std = np.where(np.isfinite(samples.std), samples.std, np.nanmedian(samples.std)).reshape(shape)
             position = np.where(samples.weight > 0, predicted, np.nan).reshape(shape)
             original = next(group for group in source.points if group.name == samples.sensor.group_name)
-            groups.append(
-                PointGroup(
-                    original.name, samples.sensor.point_names, t, _noisy(position, std, rng), std,
-                    original.sensor, original.frame, original.pose,
-                )
-            )  # fmt: skip
+            where = (original.sensor, original.frame, original.pose)
+            noisy = _noisy(position, std, rng)
+            groups.append(PointGroup(original.name, samples.sensor.point_names, t, noisy, std, *where))
     groups = [_with_clamps(group, predictor, source) for group in groups]
     own = predictor.theta_with_episode_values(episode, theta)
     truth = dict(zip(system.parameters.names, map(float, own), strict=True))
     text = f"{description} Simulated with the inputs of {episode.name}.".strip()
     joints = _joints(predictor, episode, outcome, rng)
-    made = Recording(
-        joints,
-        tuple(groups),
-        text,
-        "yid_ocp simulate",
-        f"{episode.name}_simulated",
-        true_parameters=truth,
-        channel_groups=_channel_groups(predictor, episode, outcome, own, rng),
-    )
+    channels = _channel_groups(predictor, episode, outcome, own, rng)
+    said = (text, "yid_ocp simulate", f"{episode.name}_simulated")
+    made = Recording(joints, tuple(groups), *said, true_parameters=truth, channel_groups=channels)
     return validate_recording(replace(made, marker_reference_pose=_straight(made, source)))
 
 
@@ -108,9 +93,8 @@ def _channel_groups(
             given = own if own is not None else original.stds.get(attribute)
             if given is not None:
                 stds[attribute] = expand_to_joint_values(given, original.names, names, f"sensors.{sensor.group_name}")
-        read = predictor.model_functions.compiled_sensor_function(sensor)(
-            predictor.node_values(outcome.rollout), theta
-        ).output
+        function = predictor.model_functions.compiled_sensor_function(sensor)
+        read = function(predictor.node_values(outcome.rollout), theta).output
         values = read.reshape(len(read), len(names), *([-1] if sensor.channel.components else []))
         std, bias = (stds.get(attribute, np.zeros(len(names))) for attribute in sensor.channel.std_attribute_names)
         widen = (slice(None), *[None] * (values.ndim - 2))
@@ -124,9 +108,8 @@ def _channel_groups(
 def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recording) -> PointGroup:
     """A group with the points that clamps follow, as they were recorded: what moves the object, not what it does."""
     original = next(entry for entry in source.points if entry.name == group.name)
-    followed = dict.fromkeys(
-        point for path in predictor.options.clamp_paths for point in (path.origin_point, path.z_axis_point)
-    )
+    clamps = predictor.options.clamp_paths
+    followed = dict.fromkeys(point for clamp in clamps for point in (clamp.origin_point, clamp.z_axis_point))
     names = tuple(name for name in followed if name in original.names and name not in group.names)
     if not names:
         return group
@@ -159,24 +142,18 @@ def _joints(
     held = {name: outcome.rollout.torque[:, i] for i, name in enumerate(system.driven)}
     held |= {name: outcome.rollout.effort[:, i] for i, name in enumerate(system.prescribed)}
     effort = np.stack([np.append(held[name], held[name][-1]) for name in names], axis=1)
-    levels = _levels(predictor, episode, names)
+    angle_std, effort_std, bias_std = _levels(predictor, episode, names)
     position, effort = (
         _noisy(values, np.broadcast_to(0.0 if std is None else std, values.shape), rng)
-        for values, std in ((position, levels.angle), (effort, levels.torque))
+        for values, std in ((position, angle_std), (effort, effort_std))
     )
     # constant over the recording, for every joint one draw
-    bias = np.zeros(len(names)) if levels.bias is None else np.asarray(levels.bias)
-    return JointGroup(
-        names,
-        episode.grid.node_times,
-        position,
-        effort=effort + _noisy(np.zeros(len(names)), bias, rng),
-        position_std=levels.angle,
-        effort_std=levels.torque,
-        effort_bias_std=levels.bias,
-        # of prescribed joints it is the effort at the nodes
-        effort_kind="command" if system.driven else "sample",
-    )
+    bias = np.zeros(len(names)) if bias_std is None else bias_std
+    effort = effort + _noisy(np.zeros(len(names)), bias, rng)
+    levels: dict[str, Any] = {"position_std": angle_std, "effort_std": effort_std, "effort_bias_std": bias_std}
+    # of prescribed joints it is the effort at the nodes
+    kind: EffortKind = "command" if system.driven else "sample"
+    return JointGroup(names, episode.grid.node_times, position, effort=effort, effort_kind=kind, **levels)
 
 
 def _commanded(
@@ -194,36 +171,25 @@ def _commanded(
     rows = np.clip(np.searchsorted(source.t, times + 1e-9) - 1, 0, len(source.t) - 1)
     between = np.stack([np.interp(times, source.t, column) for column in commands.T], axis=1)
     held = [predictor.system.servos[name].command_interpolation == "held" for name in names]
-    std = joint_angle_noise_std(
-        source, names, predictor.options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), episode.name
-    )
+    choice = predictor.options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
+    std = joint_angle_noise_std(source, names, choice, episode.name)
     noisy = _noisy(position, np.broadcast_to(std, position.shape), rng)
     given = np.where(held, commands[rows], between)
     off = np.stack([episode.torque[:, predictor.system.driven.index(name)] >= MOTOR_OFF_COMMAND / 2 for name in names])
     enabled = None if not off.any() else np.append(~off, ~off[:, -1:], axis=1).T.astype(float)
     gain = None if source.proportional_gain is None else np.broadcast_to(source.proportional_gain, len(source.names))
-    return JointGroup(
-        names,
-        times,
-        noisy,
-        position_command=given,
-        position_std=std,
-        torque_enable=enabled,
-        proportional_gain=None if gain is None else gain[columns],
-    )
+    own_gain = None if gain is None else gain[columns]
+    motors: dict[str, Any] = {"position_command": given, "torque_enable": enabled, "proportional_gain": own_gain}
+    return JointGroup(names, times, noisy, position_std=std, **motors)
 
 
-@dataclass(frozen=True)
-class _Levels:
-    """Standard deviations of what joints record, (nj,) each [rad], [N m]; None where nothing says so."""
+def _levels(
+    predictor: EpisodePredictor, episode: Episode, names: tuple[str, ...]
+) -> tuple[Array | None, Array | None, Array | None]:
+    """Standard deviations of angle, torque and its constant error, (nj,) each, as the estimation takes them.
 
-    angle: Array | None
-    torque: Array | None
-    bias: Array | None
-
-
-def _levels(predictor: EpisodePredictor, episode: Episode, names: tuple[str, ...]) -> _Levels:
-    """Noise as the estimation takes it: of driven joints that of what drives the motion, else what is stated."""
+    Of driven joints those of what drives the motion, else what is stated; None where nothing says so.
+    """
     joints, driven = episode.recording.joints, predictor.system.driven
     assert joints is not None
     effort, position = (
@@ -237,7 +203,7 @@ def _levels(predictor: EpisodePredictor, episode: Episode, names: tuple[str, ...
             None if given is None else expand_to_joint_values(given, joints.names, names, f"sensors.{group}.std")
             for group, given in ((JOINT_POSITION_GROUP_NAME, joint_angles), (JOINT_EFFORT_GROUP_NAME, torques))
         )
-        return _Levels(angle, torque, None)
+        return angle, torque, None
     at, rest = [names.index(name) for name in driven], [i for i, name in enumerate(names) if name not in driven]
     other = tuple(names[i] for i in rest)
     angle, torque, bias = np.zeros((3, len(names)))
@@ -247,10 +213,9 @@ def _levels(predictor: EpisodePredictor, episode: Episode, names: tuple[str, ...
     if other:
         stated = ((angle, joint_angles, JOINT_POSITION_GROUP_NAME), (torque, torques, JOINT_EFFORT_GROUP_NAME))
         for target, std, group in stated:
-            target[rest] = expand_to_joint_values(
-                0.0 if std is None else std, joints.names, other, f"sensors.{group}.std"
-            )
-    return _Levels(angle, torque, bias)
+            own = 0.0 if std is None else std
+            target[rest] = expand_to_joint_values(own, joints.names, other, f"sensors.{group}.std")
+    return angle, torque, bias
 
 
 def _noisy(values: Array, std: Array, rng: np.random.Generator | None) -> Array:

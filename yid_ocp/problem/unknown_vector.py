@@ -23,29 +23,19 @@ SOFT_LOGARITHM_MIN_RATIO = 1e-3
 
 @dataclass(frozen=True)
 class UnknownVectorLayout:
-    """Layout of the unknown vector: (shared | recording 1: local, initial state offset | recording 2: ...).
+    """Layout of the unknown vector: (shared | recording 1: local, initial state offset | recording 2: ...)."""
 
-    Attributes
-    ----------
-    shared_parameters, local_parameters : tuple of str
-        Free parameters with one value for all recordings, and with a value in each.
-    initial_state_names : tuple of str
-        Estimated components of the initial state: `q.JOINT`, `p.JOINT` and, of unobserved internal ones, `z.NAME`.
-    """
-
-    shared_parameters: tuple[str, ...]
-    local_parameters: tuple[str, ...]
-    initial_state_names: tuple[str, ...]
+    shared_parameters: tuple[str, ...]  # free, with one value for all recordings
+    local_parameters: tuple[str, ...]  # free, with a value in each
+    initial_state_names: tuple[str, ...]  # estimated: `q.JOINT`, `p.JOINT` and, of unobserved internal ones, `z.NAME`
     recording_names: tuple[str, ...]
 
     @cached_property
     def unknown_names(self) -> tuple[str, ...]:
         """Names of all unknowns; local ones and initial states carry their recording's name."""
         own = [*self.local_parameters, *(f"{INITIAL_STATE_PREFIX}{name}" for name in self.initial_state_names)]
-        return (
-            *self.shared_parameters,
-            *(f"{name}[{recording}]" for recording in self.recording_names for name in own),
-        )
+        each = (f"{name}[{recording}]" for recording in self.recording_names for name in own)
+        return (*self.shared_parameters, *each)
 
     @property
     def free_parameters(self) -> tuple[str, ...]:
@@ -173,11 +163,9 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
     for name in free:
         entry, value = system.parameters[name], theta[system.parameters.index(name)]
         if not entry.lower <= value <= entry.upper:
-            raise ConfigError(
-                f"initial value {value:g} {entry.unit} of {name} lies outside its bounds",
-                where=f"parameters.{name}",
-                allowed=f"{entry.lower:g} to {entry.upper:g} {entry.unit}",
-            )
+            what = f"initial value {value:g} {entry.unit} of {name} lies outside its bounds"
+            allowed = f"{entry.lower:g} to {entry.upper:g} {entry.unit}"
+            raise ConfigError(what, where=f"parameters.{name}", allowed=allowed)
         if not entry.lower < entry.upper:
             what, hint = f"the bounds of {name} leave no room", "fix the parameter instead of closing its bounds"
             raise ConfigError(what, where=f"parameters.{name}", allowed="lower below upper", hint=hint)
