@@ -73,7 +73,7 @@ def mean_step_input_delay_derivative(
 def _motor_off_steps(
     joints: JointGroup, driven: tuple[str, ...], grid: TimeGrid, where: str, has_servos: bool
 ) -> BoolArray:
-    """Steps in which a motor of a servo is off, (steps, nu): by `torque_enable` at their middle; all without commands."""
+    """Where motors of servos are off, (steps, nu): by `torque_enable` at the middle of a step; all without commands."""
     is_off = has_servos and joints.position_command is None
     if is_off or not has_servos or joints.torque_enable is None:
         return np.full((grid.steps, len(driven)), is_off)
