@@ -13,7 +13,7 @@ import pytest
 
 from yid_ocp.report import terminal
 from yid_ocp.report.html import _script_name, _shared_script, write_shared_plotly_script
-from yid_ocp.report.summaries import SUMMARY_BY_FORMAT
+from yid_ocp.report.terminal import SUMMARY_BY_FORMAT
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 COMMANDS = {

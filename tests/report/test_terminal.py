@@ -9,7 +9,7 @@ import pytest
 
 from yid_ocp.data import JointGroup, Recording
 from yid_ocp.inference.uncertainty import VERDICT_PREDICATES, VERDICT_TABLE_TEXTS, parameter_verdict
-from yid_ocp.report import summaries, terminal
+from yid_ocp.report import diagnosis_summaries, summaries, terminal  # noqa: F401, they register
 from yid_ocp.report.terminal import CodeBlock, SummaryStatement, SummaryTable
 
 GOOD = {"chi2_per_dof": 1.03, "p_value": 0.3, "explains": True, "believed": True, "worse_than_guess": []}
@@ -54,8 +54,8 @@ def judged(said: str) -> dict:
     }  # fmt: skip
 
 
-def told(summary: str, result: dict) -> list[str]:
-    return terminal.summary_terminal_lines(getattr(summaries, summary)(result))
+def told(form: str, result: dict) -> list[str]:
+    return terminal.summary_terminal_lines(terminal.SUMMARY_BY_FORMAT[form](result))
 
 
 def line_of(lines: list[str], name: str) -> str:
@@ -72,14 +72,14 @@ def test_every_verdict_has_its_words():
 @pytest.mark.parametrize("said", ["identifiable", "weak", "not_identifiable", "at_bound"])
 def test_a_verdict_reads_alike_in_every_command(said):
     words, name = VERDICT_TABLE_TEXTS[said], f"p_{said}"
-    assert words in line_of(told("solve_summary", solved()), name)
-    assert words in line_of(told("compare_summary", compared()), name)
+    assert words in line_of(told("yid-solve/1", solved()), name)
+    assert words in line_of(told("yid-compare/1", compared()), name)
     result = information(parameters={name: judged(said)})
-    assert words in line_of(told("identifiability_summary", result), name)
+    assert words in line_of(told("yid-identifiability/1", result), name)
 
 
 def test_a_solve_says_what_is_not_found():
-    lines = told("solve_summary", solved())
+    lines = told("yid-solve/1", solved())
     assert "cannot be found from these recordings: p_not_identifiable" in lines
     assert "only weakly determined: p_weak" in lines
     assert lines[-1] == "converged: done (4 iterations, 1.0 s)"
@@ -91,7 +91,7 @@ def test_a_solve_says_what_is_not_found():
 
 def test_of_what_nothing_informs_no_spread_is_shown():
     lost = solved(parameters={"a": parameter("not_identifiable") | {"std": None}, "b": parameter("identifiable")})
-    lines = told("solve_summary", lost)
+    lines = told("yid-solve/1", lost)
     assert line_of(lines, "a").split() == ["a", "2", "N", "m/rad", "cannot", "be", "found", "3", "0", "to", "inf"]
     assert "±" not in "".join(lines[1:-4])
 
@@ -102,16 +102,16 @@ def test_a_model_that_does_not_explain_the_recordings_is_the_first_thing_said_bu
     said = solved(fit=BAD, parameters=doubtful)
     first = "the model does not explain the recordings (chi2 per degree of freedom is 41.7, 1 is noise alone): "
     first += "no number is to be trusted; run `yid-ocp diagnose`"
-    assert told("solve_summary", said)[0] == first
+    assert told("yid-solve/1", said)[0] == first
     said["fit"] = BAD | {"worse_than_guess": [worse] * 6}
-    lines = told("solve_summary", said)
+    lines = told("yid-solve/1", said)
     assert lines[0] == "worse than a guess without a model: w_T2 of run, 50 mm against 20 mm (stays)"
     assert lines[4:6] == ["and so for 2 more channels, in result.json", first]
-    lines = told("compare_summary", compared(methods={"gauss_newton": said}, judged=said))
+    lines = told("yid-compare/1", compared(methods={"gauss_newton": said}, judged=said))
     assert first in lines[:6]
     assert "the model does not explain the recordings, so agreement of methods says nothing of the truth" in lines
     judgement = information(parameters={"a": judged("not_trusted")}, fit=BAD)
-    assert told("identifiability_summary", judgement)[0] == first
+    assert told("yid-identifiability/1", judgement)[0] == first
 
 
 def test_a_solve_says_which_estimates_a_finer_model_moves():
@@ -120,7 +120,7 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
         "p.b": {"links": 0.1, "time_step": -0.02, "std": 0.2},
         "p.c": {"links": 1e3, "time_step": 1e3, "std": None},
     }
-    lines = told("solve_summary", solved() | {"discretisation": moved, "discretisation_notes": ["it snaps"]})
+    lines = told("yid-solve/1", solved() | {"discretisation": moved, "discretisation_notes": ["it snaps"]})
     said = "these move by more than the data's standard deviation"
     at = lines.index(f"with twice the links {said}: p.a by -5.5 (± 0.073 from the data)")
     assert lines[at + 1 : at + 3] == [
@@ -128,11 +128,11 @@ def test_a_solve_says_which_estimates_a_finer_model_moves():
         "it snaps",
     ]
     moved = {name: own | {"links": None} for name, own in moved.items()}
-    assert not any("twice the links" in line for line in told("solve_summary", solved() | {"discretisation": moved}))
+    assert not any("twice the links" in line for line in told("yid-solve/1", solved() | {"discretisation": moved}))
 
 
 def test_a_failed_solve_says_nothing_of_its_parameters():
-    lines = told("solve_summary", solved(status="failed", message="step 3"))
+    lines = told("yid-solve/1", solved(status="failed", message="step 3"))
     assert not any(word in line for line in lines for word in VERDICT_TABLE_TEXTS.values())
     assert "the values are the best point that was reached; nothing can be said about how sure they are" in lines
 
@@ -141,7 +141,7 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     weak = solved(parameters={"a": parameter("weak")})
     methods = {"single_shooting": weak, "other": weak | {"status": "failed", "whitened_cost": None}}
     beside = {"published": {"a": 1.0}, "published_explained": ["a = 1 of the paper: unexplained"]}
-    lines = told("compare_summary", compared(methods=methods, judged=weak, **beside))
+    lines = told("yid-compare/1", compared(methods=methods, judged=weak, **beside))
     assert "no parameter can be found from these recordings, so there is nothing to agree on" in lines
     assert line_of(lines, "cost (whitened)").split()[-2:] == ["5", "failed"]
     assert line_of(lines, "a").split()[1:4] == ["2", "±", "0.1"]
@@ -150,14 +150,14 @@ def test_a_comparison_without_a_parameter_that_is_found_has_nothing_to_agree_on(
     assert "truth" not in lines[0]
     assert "a = 1 of the paper: unexplained" in lines
     said = "all methods agree within their uncertainty on the parameters that are found"
-    assert said in told("compare_summary", compared())
+    assert said in told("yid-compare/1", compared())
 
 
 def test_verdicts_of_a_comparison_weigh_all_noise():
     """The methods themselves do not, so that nothing of theirs is to be trusted."""
     doubtful = solved(parameters={"a": parameter("not_trusted", 7.0)}, fit=BAD)
     sure = solved(parameters={"a": parameter("identifiable", 9.0)})
-    lines = told("compare_summary", compared(methods={"single_shooting": doubtful}, judged=sure, disturbed=True))
+    lines = told("yid-compare/1", compared(methods={"single_shooting": doubtful}, judged=sure, disturbed=True))
     assert lines[0].split()[:3] == ["parameter", "single_shooting", "all"]
     assert line_of(lines, "a").split() == ["a", "7", "±", "0.1", "9", "±", "0.1", "found"]
     assert not any("does not explain" in line for line in lines)
@@ -169,17 +169,17 @@ def test_what_if_names_the_fewest_changes_or_that_there_are_none():
     base = {"words": "as it is", "identifiable": 0, "gain": None, "message": ""}
     asked = {"base": base, "singles": [base | {"words": "a camera", "gain": 2.0}], "smallest": []}
     result = information(parameters={"a": judged("weak")}, what_if=asked, fit=None)
-    lines = told("identifiability_summary", result)
+    lines = told("yid-identifiability/1", result)
     assert "with no set of up to three changes can all of them be found" in lines
     assert lines[-1] == "none of 1 parameters can be found from these recordings"
     result["what_if"] = asked | {"smallest": [base | {"words": "a weld"}]}
-    assert "fewest changes with which all of them can be found: a weld" in told("identifiability_summary", result)
+    assert "fewest changes with which all of them can be found: a weld" in told("yid-identifiability/1", result)
 
 
 def test_a_simulation_that_failed_and_one_that_did_not():
-    assert told("simulate_summary", {"status": "failed", "message": "step 3"}) == ["failed: step 3"]
+    assert told("yid-simulate/1", {"status": "failed", "message": "step 3"}) == ["failed: step 3"]
     done = {"status": "done", "groups": {"joints": {"samples": 12}}, "duration": 0.5}
-    assert told("simulate_summary", done)[-1] == "0.5 s in recording.h5"
+    assert told("yid-simulate/1", done)[-1] == "0.5 s in recording.h5"
 
 
 def test_blocks_on_a_terminal():
@@ -216,15 +216,15 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
         "next_plan": None, "seconds": {"fit": 1.0},
         "which": [entry | {"p_value": 0.0}, entry | {"location": "T2", "p_value": 0.034}],
     }  # fmt: skip
-    lines = told("diagnose_summary", result)
+    lines = told("yid-diagnosis/2", result)
     assert line_of(lines, "kelvin_voigt@T1").endswith(" < 1e-12")
     assert line_of(lines, "kelvin_voigt@T2").endswith(" 0.034")
-    refitted = told("diagnose_summary", result | {"which": [entry | {"closure": 0.5, "p_value": 0.0}]})
+    refitted = told("yid-diagnosis/2", result | {"which": [entry | {"closure": 0.5, "p_value": 0.0}]})
     assert "tau = 0.05 s" in line_of(lines, "kelvin_voigt@T1")
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)
     section = {"goal": "information", "discriminate": ["density@T3", "point_mass@w_T3"], "parameter_run": "runs/mine"}
-    said = told("diagnose_summary", result | {"next_plan": section})
+    said = told("yid-diagnosis/2", result | {"next_plan": section})
     assert line_of([line.strip() for line in said], "yid-ocp plan").split() == [
         "yid-ocp", "plan", "runs/mine/config.yaml", "--set", "plan.goal=information", "--set",
         "'plan.discriminate=[density@T3,", "point_mass@w_T3]'", "--set", "plan.parameter_run=runs/mine",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import statistics
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,14 @@ from typing import Any
 from yid_ocp.inference.uncertainty import VERDICT_TABLE_TEXTS, value_and_uncertainty_text
 from yid_ocp.report.terminal import (
     CodeBlock,
-    SummaryBlock,
+    SummaryParts,
     SummaryStatement,
     SummaryTable,
     TableRows,
     format_error_value_and_unit,
     issue_summary_blocks,
-    nonempty_summary_statements,
-    nonempty_tables,
     p_value_text,
+    register_summary,
     torque_offset_table_rows,
 )
 
@@ -35,69 +34,58 @@ _FOUND_VERDICTS = ("identifiable", "weak", None)
 # -- one diagnosis ----------------------------------------------------------------------------------------------------
 
 
-def diagnose_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-diagnosis/2` result."""
+@register_summary("yid-diagnosis/2")
+def diagnose_summary(result: Mapping[str, Any]) -> SummaryParts:
+    """Summary of a diagnosis."""
+    yield from issue_summary_blocks(result)
+    yield SummaryStatement(result["summary"], "verdict")
+    yield SummaryTable([*_gap_error_rows(result)], "Errors on held-out recordings", is_key_table=True)
+    yield SummaryTable([*_gap_location_rows(result)], "Where")
+    yield SummaryTable([*_event_rows(result)], "Events")
+    yield SummaryTable([*_candidate_rows(result)], "Candidates")
     left = len(result["which"]) - _MAX_CANDIDATES
-    blocks = [
-        *issue_summary_blocks(result),
-        SummaryStatement(result["summary"], "verdict"),
-        *nonempty_tables(
-            SummaryTable(_gap_error_rows(result), "Errors on held-out recordings", is_key_table=True),
-            SummaryTable(_gap_location_rows(result), "Where"),
-            SummaryTable(_event_rows(result), "Events"),
-            SummaryTable(_candidate_rows(result), "Candidates"),
-        ),
-        *nonempty_summary_statements([
-            f"{left} more candidates are in result.json" if left > 0 else "",
-            f"these recordings could not show: {', '.join(result['unseen'])}" if result.get("unseen") else "",
-        ]),
-        *nonempty_tables(
-            SummaryTable(_baseline_rows(result), "Since the baseline"),
-            SummaryTable(_counterfactual_rows(result), "Without the effects, and with them"),
-            SummaryTable(torque_offset_table_rows(result), "How far the torques are off"),
-        ),
-    ]  # fmt: skip
+    yield f"{left} more candidates are in result.json" if left > 0 else ""
+    yield f"these recordings could not show: {', '.join(result['unseen'])}" if result.get("unseen") else ""
+    yield SummaryTable([*_baseline_rows(result)], "Since the baseline")
+    yield SummaryTable([*_counterfactual_rows(result)], "Without the effects, and with them")
+    yield SummaryTable(torque_offset_table_rows(result), "How far the torques are off")
     if result.get("doubts"):
-        blocks.append(SummaryStatement("what is in doubt about the recordings may be what the verdict is about"))
+        yield "what is in doubt about the recordings may be what the verdict is about"
     if result["next_plan"] is not None:
-        blocks.append(SummaryStatement("to separate what looks alike, plan a motion:"))
-        blocks.append(CodeBlock(_planning_command(result["next_plan"])))
-    ended = f"verdict: {result['verdict'].replace('_', ' ')} ({sum(result['seconds'].values()):.1f} s)"
-    return [*blocks, SummaryStatement(ended)]
+        yield "to separate what looks alike, plan a motion:"
+        yield CodeBlock(_planning_command(result["next_plan"]))
+    yield f"verdict: {result['verdict'].replace('_', ' ')} ({sum(result['seconds'].values()):.1f} s)"
 
 
-def _gap_error_rows(result: Mapping[str, Any]) -> TableRows:
+def _gap_error_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     before, steps = result["gap"]["before"], result.get("steps", ())
-    rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
+    yield "held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit"
     for channel, error in before["rmse"].items():
         errors = [error, *(step["rmse"].get(channel) for step in steps)]
         shown = [format_error_value_and_unit(value, before["unit"][channel]) for value in errors]
-        rows.append((channel, *(text for text, _ in shown), shown[0][1]))
-    return rows
+        yield channel, *(text for text, _ in shown), shown[0][1]
 
 
-def _gap_location_rows(result: Mapping[str, Any]) -> TableRows:
-    rows: TableRows = [("where", "share of the gap", "when [s]")]
+def _gap_location_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
+    yield "where", "share of the gap", "when [s]"
     for place in result.get("where", ()):
         if place["share"] > _MIN_GAP_SHARE:
             when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:_MAX_WINDOWS])
             more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
-            rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
-    return rows
+            yield place["location"], f"{100 * place['share']:.1f} %", when + more
 
 
-def _event_rows(result: Mapping[str, Any]) -> TableRows:
-    rows: TableRows = [("event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit")]
+def _event_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
+    yield "event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit"
     for own in result.get("events", ()):
         peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
         impulse += f" ± {own['std']:.2g}" if own["impulse"] is not None and own["std"] is not None else ""
         times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
-        rows.append((own["channel"], own["recording"], *times, peak, impulse, f"{own['unit']}, {own['unit']} s"))
-    return rows
+        yield own["channel"], own["recording"], *times, peak, impulse, f"{own['unit']}, {own['unit']} s"
 
 
-def _candidate_rows(result: Mapping[str, Any]) -> TableRows:
-    rows: TableRows = [("candidate", "parameters", "closure alone", "score", "p")]
+def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
+    yield "candidate", "parameters", "closure alone", "score", "p"
     for entry in result["which"][:_MAX_CANDIDATES]:
         values = []
         for name, own in entry["parameters"].items():
@@ -108,28 +96,24 @@ def _candidate_rows(result: Mapping[str, Any]) -> TableRows:
                 values.append(f"{name} = {own['value']:.3g}{unit}" if entry["closure"] is None else f"{name} unknown")
         closed = "" if entry["closure"] is None else f"{100 * entry['closure']:.3g} %"
         numbers = (f"{entry['score']:.3g}", p_value_text(entry["p_value"]))
-        rows.append((f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers))
-    return rows
+        yield f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers
 
 
-def _baseline_rows(result: Mapping[str, Any]) -> TableRows:
-    """Parameters in the baseline and now."""
-    rows: TableRows = [("parameter", "baseline", "now", "unit", "moved by", "")]
+def _baseline_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
+    yield "parameter", "baseline", "now", "unit", "moved by", ""
     for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
         values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
         moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
-        rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
-    return rows
+        yield name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""
 
 
-def _counterfactual_rows(result: Mapping[str, Any]) -> TableRows:
-    rows: TableRows = [("channel", "made", "without a diagnosis", "effects removed or added", "unit")]
+def _counterfactual_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
+    yield "channel", "made", "without a diagnosis", "effects removed or added", "unit"
     found = result.get("counterfactual") or {}
     for key, made in (("removed", "without the effects"), ("added", "with the effects")):
         for channel, entry in found.get(key, {"rmse": {}})["rmse"].items():
             errors = (f"{entry[part]:.3g}" for part in ("without_diagnosis", "counterfactual"))
-            rows.append((channel, made, *errors, entry["unit"]))
-    return rows
+            yield channel, made, *errors, entry["unit"]
 
 
 def _planning_command(section: Mapping[str, Any]) -> str:
@@ -143,17 +127,22 @@ def _planning_command(section: Mapping[str, Any]) -> str:
 # -- blind validation -------------------------------------------------------------------------------------------------
 
 
-def blind_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-blind/1` result."""
+@register_summary("yid-blind/1")
+def blind_summary(result: Mapping[str, Any]) -> SummaryParts:
+    """Summary of a blind validation."""
     score, *others, cases = _blind_tables(result)
+    yield replace(score, is_key_table=True)
+    yield from others
+    yield replace(cases, is_page_only=True)
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
-    said = [f"{count} {'case' if count == 1 else 'cases'} of seed {result['seed']}, drawn for {result['purpose']}"]
+    cases_text = f"{count} {'case' if count == 1 else 'cases'}"
+    yield SummaryStatement(f"{cases_text} of seed {result['seed']}, drawn for {result['purpose']}", "verdict")
     if right["of"]:
-        said.append(f"of {right['of']} gaps found, {right['count']} were named right: kind and place first")
+        said = f"of {right['of']} gaps found, {right['count']} were named right: kind and place first"
+        yield SummaryStatement(said, "verdict")
     if alarms["of"]:
-        said.append(f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm")
-    tables = nonempty_tables(*others, replace(cases, is_page_only=True))
-    return [replace(score, is_key_table=True), *tables, *nonempty_summary_statements(said, "verdict")]
+        said = f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm"
+        yield SummaryStatement(said, "verdict")
 
 
 def blind_tables_markdown(result: Mapping[str, Any]) -> list[str]:
@@ -239,8 +228,9 @@ def _rate(own: Mapping[str, Any]) -> str:
 # -- several runs -----------------------------------------------------------------------------------------------------
 
 
-def batch_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-batch/1` result."""
+@register_summary("yid-batch/1")
+def batch_summary(result: Mapping[str, Any]) -> SummaryParts:
+    """Summary of many runs."""
     runs = result["runs"]
     found: dict[str, list[Mapping[str, Any]]] = {}
     for entry in runs:
@@ -250,36 +240,36 @@ def batch_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
     names = sorted(found, key=lambda name: -len(found[name]))
     units = {name: entries[-1]["unit"] for name, entries in found.items()}
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
-    few, every = (_batch_rows(runs, names[:count], units) for count in (_MAX_TERMINAL_PARAMETERS, None))
+    few, every = ([*_batch_rows(runs, names[:count], units)] for count in (_MAX_TERMINAL_PARAMETERS, None))
+    yield SummaryTable(few, "Runs", is_key_table=True, links=links)
     spread: TableRows = [("parameter", "runs", "smallest", "median", "largest", "unit")]
     for name in names:
         values = [own["value"] for own in found[name] if own["verdict"] in _FOUND_VERDICTS]
         if len(values) > 1:
             numbers = (min(values), statistics.median(values), max(values))
             spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), found[name][0]["unit"]))
-    blocks: list[SummaryBlock] = [
-        SummaryTable(few, "Runs", is_key_table=True, links=links),
-        *nonempty_tables(SummaryTable(spread, "Parameters over all runs")),
-    ]
+    yield SummaryTable(spread, "Parameters over all runs")
     if len(names) > _MAX_TERMINAL_PARAMETERS:
-        blocks.append(SummaryTable(every, "Runs with all parameters", is_page_only=True, links=links))
+        yield SummaryTable(every, "Runs with all parameters", is_page_only=True, links=links)
     ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
     said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
     said += [f"{entry['name']}: {entry['message'].splitlines()[0]}." for entry in runs if not entry["ok"]]
     alike = result["history"]
     if alike is not None:
-        blocks.append(SummaryTable(_consistency_rows(alike), "Each run against the others"))
+        yield SummaryTable([*_consistency_rows(alike)], "Each run against the others")
         drifted, wrong = _drifted_and_distrusted(alike)
         verb = "is" if len(drifted) == 1 else "are"
         same = "No parameter differs among the runs by more than they state."
         said.append(f"{', '.join(drifted)} {verb} not the same in all runs." if drifted else same)
         said += [f"Distrust {', '.join(wrong)}: without it the others agree, or agree far better."] if wrong else []
-    return [*blocks, *nonempty_summary_statements(said, "verdict")]
+    yield from (SummaryStatement(text, "verdict") for text in said)
 
 
-def _batch_rows(runs: Sequence[Mapping[str, Any]], names: Sequence[str], units: Mapping[str, str]) -> TableRows:
+def _batch_rows(
+    runs: Sequence[Mapping[str, Any]], names: Sequence[str], units: Mapping[str, str]
+) -> Iterator[Sequence[str]]:
     heads = [f"{name} [{units[name]}]" if units[name] else name for name in names]
-    rows: TableRows = [("run", "status", "chi2/n", "effects", *heads, "time")]
+    yield "run", "status", "chi2/n", "effects", *heads, "time"
     for entry in runs:
         cells = []
         for own in (entry["parameters"].get(name, {"value": None}) for name in names):
@@ -291,12 +281,12 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], names: Sequence[str], units: 
                 cells.append(VERDICT_TABLE_TEXTS[own["verdict"]])
         fit = "" if entry["chi2_per_dof"] is None else f"{entry['chi2_per_dof']:.3g}"
         time = "" if entry["seconds"] is None else f"{entry['seconds']:.1f} s"
-        rows.append((entry["name"], entry["status"], fit, ", ".join(entry["effects"]), *cells, time))
-    return rows
+        yield entry["name"], entry["status"], fit, ", ".join(entry["effects"]), *cells, time
 
 
-def history_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks of a `yid-history/1` result."""
+@register_summary("yid-history/1")
+def history_summary(result: Mapping[str, Any]) -> SummaryParts:
+    """Summary of runs of one model, one after the other."""
     runs = [entry["name"] for entry in result["runs"]]
     rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
     for name, entry in result["parameters"].items():
@@ -307,21 +297,17 @@ def history_summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
         p = "" if len(known) < 2 else p_value_text(entry["p_value"])
         together = value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
         rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
-    return [
-        SummaryTable(rows, "Parameters", is_key_table=True),
-        SummaryTable(_consistency_rows(result), "Runs"),
-        *nonempty_summary_statements(_history_sentences(result), "verdict"),
-    ]
+    yield SummaryTable(rows, "Parameters", is_key_table=True)
+    yield SummaryTable([*_consistency_rows(result)], "Runs")
+    yield from (SummaryStatement(text, "verdict") for text in _history_sentences(result))
 
 
-def _consistency_rows(history: Mapping[str, Any]) -> TableRows:
+def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     """Each run of a `yid-history/1` tested against all others."""
-    rows: TableRows = [("run", "differs from the others", "p", "most in", "model explains it", "")]
+    yield "run", "differs from the others", "p", "most in", "model explains it", ""
     for entry in history["runs"]:
         apart = (f"chi2 {entry['chi2']:.3g} of {entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])
-        said = ("yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else "")
-        rows.append((entry["name"], *apart, *said))
-    return rows
+        yield entry["name"], *apart, "yes" if entry["explains"] else "no", "distrust" if entry["distrusted"] else ""
 
 
 def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list[str]]:
@@ -329,14 +315,13 @@ def _drifted_and_distrusted(history: Mapping[str, Any]) -> tuple[list[str], list
     return drifted, [entry["name"] for entry in history["runs"] if entry["distrusted"]]
 
 
-def _history_sentences(result: Mapping[str, Any]) -> list[str]:
+def _history_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     runs, (drifted, wrong) = result["runs"], _drifted_and_distrusted(result)
-    text = []
     if not drifted and result["p_value"] >= result["level"]:
         p = _relation(result["p_value"])
-        text.append(f"Nothing drifted: all {len(runs)} runs agree within what they state (p {p}).")
+        yield f"Nothing drifted: all {len(runs)} runs agree within what they state (p {p})."
     elif not drifted:
-        text.append(
+        yield (
             f"Together the runs differ (p {_relation(result['p_value'])}), though no parameter alone does: look at "
             "what they have in common."
         )
@@ -344,20 +329,19 @@ def _history_sentences(result: Mapping[str, Any]) -> list[str]:
         entry = result["parameters"][name]
         values = [own["value"] for own in entry["values"].values()]
         ends = f"{values[0]:.4g} in the first, {values[-1]:.4g} {entry['unit']} in the last"
-        text.append(f"{name} is not the same in all runs: {ends} (p {_relation(entry['p_value'])}).")
+        yield f"{name} is not the same in all runs: {ends} (p {_relation(entry['p_value'])})."
     if wrong:
-        text.append(f"Distrust {' and '.join(wrong)}: without it the others agree, or agree far better.")
+        yield f"Distrust {' and '.join(wrong)}: without it the others agree, or agree far better."
     elif drifted and len(runs) == 2:
-        text.append("Two runs that differ do not say which of them to distrust; a third one would.")
+        yield "Two runs that differ do not say which of them to distrust; a third one would."
     elif drifted:
-        text.append("No single run stands apart from the others.")
+        yield "No single run stands apart from the others."
     poor = [entry["name"] for entry in runs if not entry["explains"]]
     if poor:
-        text.append(
+        yield (
             f"The model did not explain the recordings of {', '.join(poor)}: the ± there counts the misfit and may "
             "still be too small."
         )
-    return text
 
 
 def _relation(p_value: float) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -55,14 +56,31 @@ class CodeBlock:
 SummaryBlock = SummaryStatement | SummaryTable | CodeBlock
 
 
-def nonempty_summary_statements(texts: Iterable[str], kind: _StatementKind = "note") -> list[SummaryBlock]:
-    """Summary statements of one kind, one per non-empty text."""
-    return [SummaryStatement(text, kind) for text in texts if text]
+SummaryParts = Iterator[SummaryBlock | str]
+"""Blocks of a summary as they are made: a string is a note, and some may be empty."""
+_Summary = Callable[[Mapping[str, Any]], list[SummaryBlock]]
+SUMMARY_BY_FORMAT: dict[str, _Summary] = {}
+"""The summary of every result, by its format."""
 
 
-def nonempty_tables(*tables: SummaryTable) -> list[SummaryBlock]:
-    """The tables that have at least one row below the header."""
-    return [table for table in tables if len(table.rows) > 1]
+def register_summary(result_format: str) -> Callable[[Callable[[Mapping[str, Any]], SummaryParts]], _Summary]:
+    """Decorator that registers the summary of a result format, and turns its parts into a list of blocks.
+
+    Texts without a word and tables without a row below the header are left out.
+    """
+
+    def enter(make: Callable[[Mapping[str, Any]], SummaryParts]) -> _Summary:
+        @functools.wraps(make)
+        def summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
+            blocks = [SummaryStatement(part) if isinstance(part, str) else part for part in make(result)]
+            return [
+                block for block in blocks if (len(block.rows) > 1 if isinstance(block, SummaryTable) else block.text)
+            ]
+
+        SUMMARY_BY_FORMAT[result_format] = summary
+        return summary
+
+    return enter
 
 
 # -- shared by several summaries ---------------------------------------------------------------------------------------
@@ -89,26 +107,26 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
-def issue_summary_blocks(result: Mapping[str, Any]) -> list[SummaryBlock]:
-    """Summary blocks on issues of the recordings: a table and advice; empty without issues."""
+def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryParts:
+    """Summary blocks on issues of the recordings: a table and advice."""
     doubts = result.get("doubts", ())
     rows: TableRows = [("in doubt", "where", "how sure", "times its limit")]
-    advice: list[SummaryBlock] = []
+    advice: list[SummaryBlock | str] = []
     for cause in dict.fromkeys(entry["cause"] for entry in doubts):
         alike, words = [entry for entry in doubts if entry["cause"] == cause], ISSUE_CAUSE_DESCRIPTIONS[cause]
-        more = [""] * (_MAX_ISSUES_PER_CAUSE - 1) + [f" and {len(alike) - _MAX_ISSUES_PER_CAUSE} more"]
-        shown = alike[:_MAX_ISSUES_PER_CAUSE]
-        for entry, others in zip(shown, more if len(alike) > len(shown) else [""] * len(shown), strict=True):
-            rows.append((words, entry["where"] + others, entry["sure"], f"{entry['evidence']:.3g}"))
-            advice.append(SummaryStatement(f"{words}: {entry['what']}; {entry['advice']}"))
-            advice += [CodeBlock(entry["setting"])] if entry["setting"] else []
+        for i, entry in enumerate(alike[:_MAX_ISSUES_PER_CAUSE], start=1):
+            left = len(alike) - i if i == _MAX_ISSUES_PER_CAUSE else 0
+            where = entry["where"] + (f" and {left} more" if left else "")
+            rows.append((words, where, entry["sure"], f"{entry['evidence']:.3g}"))
+            advice += [f"{words}: {entry['what']}; {entry['advice']}", CodeBlock(entry["setting"])]
+    yield SummaryTable(rows, "In doubt")
+    yield from advice
     if any(entry["weight"] != "warning" for entry in doubts):
         text = "no number is said to be found while a recording of the run is in doubt"
-        advice.append(SummaryStatement(text, "verdict"))
-    return [*nonempty_tables(SummaryTable(rows, "In doubt")), *advice]
+        yield SummaryStatement(text, "verdict")
 
 
-def misfit_summary_blocks(fit: Mapping[str, Any]) -> list[SummaryBlock]:
+def misfit_summary_blocks(fit: Mapping[str, Any]) -> SummaryParts:
     """Conclusions on a poor fit: a model-free guess predicts better, or the model does not explain the recordings."""
     worse, said = fit.get("worse_than_guess", ()), []
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
@@ -119,9 +137,9 @@ def misfit_summary_blocks(fit: Mapping[str, Any]) -> list[SummaryBlock]:
         said.append(f"worse than a guess without a model: {where}, {own} against {other} ({entry['baseline']})")
     if len(worse) > MAX_CHANNELS_SHOWN_SINGLY:
         said.append(f"and so for {len(worse) - MAX_CHANNELS_SHOWN_SINGLY} more channels, in result.json")
-    return nonempty_summary_statements(
-        [*said, "" if fit["explains"] else goodness_of_fit_message(fit["chi2_per_dof"], False)], "conclusion"
-    )
+    if not fit["explains"]:
+        said.append(goodness_of_fit_message(fit["chi2_per_dof"], False))
+    yield from (SummaryStatement(text, "conclusion") for text in said)
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:

@@ -22,9 +22,9 @@ from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_hint
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_json
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.report.diagnosis_summaries import batch_summary
 from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import ReportData
-from yid_ocp.report.summaries import batch_summary
 from yid_ocp.version import installed_versions
 from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print, workers_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose

@@ -29,11 +29,10 @@ from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
+from yid_ocp.report.diagnosis_summaries import blind_summary, blind_tables_markdown
 from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
-from yid_ocp.report.summaries import blind_summary
 from yid_ocp.version import installed_versions, package_source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions

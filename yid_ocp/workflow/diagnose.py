@@ -26,7 +26,7 @@ from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, make_animation
-from yid_ocp.report.summaries import diagnose_summary
+from yid_ocp.report.diagnosis_summaries import diagnose_summary
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Iterate

@@ -20,7 +20,7 @@ from yid_ocp.files import file_sha256, is_file, read_input_json
 from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
-from yid_ocp.report.summaries import history_summary
+from yid_ocp.report.diagnosis_summaries import history_summary
 from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import resolve_recording_path

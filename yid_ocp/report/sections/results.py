@@ -12,12 +12,11 @@ import numpy as np
 
 from yid_ocp.analysis.compare import MethodComparison
 from yid_ocp.analysis.profile import CHI2_QUANTILE_95
-from yid_ocp.report import categorical_charts, figures
+from yid_ocp.report import categorical_charts, diagnosis_summaries, figures, summaries  # noqa: F401, they register
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import BLIND_CALIBRATION_LABELS
 from yid_ocp.report.sections import ReportData, figures_by_unit, joint_channel_unit, register_report_section
-from yid_ocp.report.summaries import SUMMARY_BY_FORMAT
-from yid_ocp.report.terminal import SummaryBlock, SummaryStatement, SummaryTable
+from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, SummaryBlock, SummaryStatement, SummaryTable
 
 
 @register_report_section("verdict", 0, "What was found")
