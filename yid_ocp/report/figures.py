@@ -1,8 +1,8 @@
-"""Plotly figures over time and colors of the report (the extra `report`)."""
+"""Plotly figures of the report (the extra `report`): over time, as curves, and with one row per name."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -17,27 +17,32 @@ if TYPE_CHECKING:
 
 
 # on a dark page each becomes what templates/dark.json says; figures use no other colors
-TEXT_COLOR, GRID_COLOR, BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
+_TEXT_COLOR, _GRID_COLOR, _BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
 LINE_COLORS = ("#0b6e99", "#c2571a", "#5b8c2a", "#8a4f9e")
-_LINE_DASHES = ("solid", "dash", "dot", "dashdot")
+_LINE_DASHES, _SYMBOLS = ("solid", "dash", "dot", "dashdot"), ("circle", "diamond", "square", "cross")
 BEFORE_COLOR, AFTER_COLOR, MEASURED_COLOR = LINE_COLORS[1], LINE_COLORS[0], "#8d99a4"
-DIVERGING_COLORSCALE = (
-    (0.0, "#2166ac"),
-    (0.25, "#92c5de"),
-    (0.5, BACKGROUND_COLOR),
-    (0.75, "#f4a582"),
-    (1.0, "#b2182b"),
-)
-SEQUENTIAL_COLORSCALE = ((0.0, BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
+_DIVERGING_COLORS = ("#2166ac", "#92c5de", _BACKGROUND_COLOR, "#f4a582", "#b2182b")
+_SEQUENTIAL_COLORSCALE = ((0.0, _BACKGROUND_COLOR), (0.5, "#b9d9e6"), (0.9, "#0b6e99"), (1.0, "#06405a"))
 _MAX_CURVE_POINTS = 1200  # points of a curve; beyond this the page grows and the eye sees no more
 _MAX_SINGLE_PRECISION_TIME = 1e4  # times from which single precision loses milliseconds [s]
 _ROW_HEIGHT, _LOW_ROW_HEIGHT, _ROW_GAP = 130, 76, 30  # in a figure of rows [px]
 _TOP_MARGIN, _BOTTOM_MARGIN = 64, 44  # [px]
-_SHADE = {"fillcolor": GRID_COLOR, "opacity": 0.7, "line": {"width": 0}, "layer": "below"}
-_AXIS_STYLE = {"gridcolor": GRID_COLOR, "zeroline": False, "linecolor": GRID_COLOR}
+_SHADE = {"fillcolor": _GRID_COLOR, "opacity": 0.7, "line": {"width": 0}, "layer": "below"}
+_AXIS_STYLE = {"gridcolor": _GRID_COLOR, "zeroline": False, "linecolor": _GRID_COLOR}
+_POWERS = {"type": "log", "exponentformat": "power"}
+_LAYOUT: dict[str, Any] = {
+    "margin": {"l": 70, "r": 20, "t": 30, "b": 45},
+    "paper_bgcolor": "rgba(0,0,0,0)",
+    "plot_bgcolor": "rgba(0,0,0,0)",
+    "font": {"family": "system-ui, sans-serif", "size": 13, "color": _TEXT_COLOR},
+    "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0},
+    "hovermode": "closest",
+    "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_COLORS[0]},
+}
+_MIN_CLOSURE_PERCENT = -50.0  # lower end of an axis of closures [%]
 
 
-def line_color(i: int) -> str:
+def _line_color(i: int) -> str:
     """Color of the i-th line of a figure; the colors repeat."""
     return LINE_COLORS[i % len(LINE_COLORS)]
 
@@ -52,44 +57,38 @@ def figure_html(figure: plotly.graph_objects.Figure) -> str:
     )
 
 
-def styled_report_figure(
-    height: int, x: str, y: str, log_y: bool = False, base: plotly.graph_objects.Figure | None = None
+def _styled_figure(
+    height: int, x: str, y: str, base: plotly.graph_objects.Figure | None = None
 ) -> plotly.graph_objects.Figure:
     """A plotly figure (`base` or an empty one) with height [px], axis titles, and the report's colors and fonts."""
     import plotly.graph_objects as go
 
     figure = go.Figure() if base is None else base
-    figure.update_layout(_report_layout(height))
+    figure.update_layout(_LAYOUT, height=height)
     figure.update_xaxes(title_text=x or None, **_AXIS_STYLE)
     figure.update_yaxes(title_text=y or None, **_AXIS_STYLE)
-    if log_y:
-        figure.update_yaxes(type="log", exponentformat="power")
     return figure
 
 
-def _report_layout(height: int) -> dict[str, Any]:
-    """Layout that all figures of a page share, without their axes."""
-    return {
-        "height": height,
-        "margin": {"l": 70, "r": 20, "t": 30, "b": 45},
-        "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "rgba(0,0,0,0)",
-        "font": {"family": "system-ui, sans-serif", "size": 13, "color": TEXT_COLOR},
-        "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom", "x": 0},
-        "hovermode": "closest",
-        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_COLORS[0]},
-    }
+def _add_curves(
+    figure: plotly.graph_objects.Figure,
+    curves: Iterable[tuple[str, Sequence[float], Sequence[float]]],
+    later_dash: str = "solid",
+) -> None:
+    """Add one line with markers for each (name, x, y), each in its own color; `later_dash` once the colors repeat."""
+    for i, (name, x, y) in enumerate(curves):
+        line = {"color": _line_color(i), "dash": "solid" if i < len(LINE_COLORS) else later_dash}
+        if len(x):
+            figure.add_scatter(x=list(x), y=list(y), mode="lines+markers", name=name, line=line)
 
 
 def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_objects.Figure:
     """Figure of the cost at every accepted point, one curve per intermediate horizon."""
-    figure = styled_report_figure(320, "accepted point", "cost", log_y=True)
+    figure = _styled_figure(320, "accepted point", "cost")
+    figure.update_yaxes(**_POWERS)
     ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
-    for stage, (begin, end) in enumerate(zip([0, *ends], ends, strict=False)):
-        figure.add_scatter(
-            x=list(range(begin, end)), y=list(costs[begin:end]), mode="lines+markers",
-            name=notes[begin] or "whole recordings", line={"color": line_color(stage)},
-        )  # fmt: skip
+    spans = zip([0, *ends], ends, strict=False)
+    _add_curves(figure, ((notes[i] or "whole recordings", range(i, j), costs[i:j]) for i, j in spans))
     return figure
 
 
@@ -161,7 +160,7 @@ def time_plots_figure(
     import plotly.graph_objects as go
 
     names = dict.fromkeys(name for curve in curves for name in curve.lines)
-    colors = lines or {name: line_color(i) for i, name in enumerate(names)}
+    colors = lines or {name: _line_color(i) for i, name in enumerate(names)}
     heights = [_LOW_ROW_HEIGHT if curve.is_low_row else _ROW_HEIGHT for curve in curves]
     inner = sum(heights) + _ROW_GAP * (len(curves) - 1)
     # all at once: a figure that grows by one trace after the other is checked anew each time
@@ -199,12 +198,10 @@ def time_plots_figure(
         titles.append(_axis_title(curve, top))
         top -= (height + _ROW_GAP) / inner
     axes[f"xaxis{last}"]["title"] = {"text": "time [s]"}
-    figure = go.Figure(traces, {**axes, "shapes": shapes, "annotations": titles})
+    figure = go.Figure(traces, {**_LAYOUT, **axes, "shapes": shapes, "annotations": titles})
     margin = {"l": 54, "r": 12, "t": _TOP_MARGIN, "b": _BOTTOM_MARGIN}
-    layout = _report_layout(inner + _TOP_MARGIN + _BOTTOM_MARGIN)
-    legend = {**layout["legend"], "y": 1 + 22 / inner}
-    figure.update_layout({**layout, "margin": margin, "legend": legend})
-    return figure
+    height = inner + _TOP_MARGIN + _BOTTOM_MARGIN
+    return figure.update_layout(height=height, margin=margin, legend_y=1 + 22 / inner)
 
 
 def _shade(number: str, x: tuple[float, float], y: tuple[float, float], *, along_time: bool = False) -> dict[str, Any]:
@@ -221,10 +218,10 @@ def _axis_title(curve: TimePlotData, y: float) -> dict[str, Any]:
 
 def lines_over_time_figure(curve: TimePlotData) -> plotly.graph_objects.Figure:
     """Figure of the lines of one plot, each in its own color."""
-    figure = styled_report_figure(320 + 8 * len(curve.lines), "time [s]", "")
+    figure = _styled_figure(320 + 8 * len(curve.lines), "time [s]", "")
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
         dash = _LINE_DASHES[i // len(LINE_COLORS) % len(_LINE_DASHES)]
-        style = {"color": line_color(i), "width": 1.5, "dash": dash}
+        style = {"color": _line_color(i), "width": 1.5, "dash": dash}
         figure.add_scatter(**_thinned(t, value), mode="lines", name=name, line=style)
     if curve.band_half_height is not None:
         figure.add_shape(_shade("", (0, 1), (-curve.band_half_height, curve.band_half_height)))
@@ -237,18 +234,18 @@ def lines_over_time_figure(curve: TimePlotData) -> plotly.graph_objects.Figure:
 
 def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:
     """Histogram figure of whitened residuals per sensor group, with the standard normal density."""
-    figure = styled_report_figure(340, "residual in standard deviations", "density")
+    figure = _styled_figure(340, "residual in standard deviations", "density")
     edge = max([4.0, *(float(np.quantile(np.abs(r), 0.995)) for r in residuals.values() if len(r))])
     for i, (name, values) in enumerate(residuals.items()):
         bins = np.linspace(-edge, edge, int(np.clip(2 * np.sqrt(len(values)), 8, 60)) + 1)
         density, _ = np.histogram(np.clip(values, -edge, edge), bins=bins, density=True)
         figure.add_scatter(
             x=(0.5 * (bins[1:] + bins[:-1])).tolist(), y=density.tolist(), mode="lines",
-            line={"color": line_color(i), "shape": "hvh"}, name=f"{name} ({len(values)} values)",
+            line={"color": _line_color(i), "shape": "hvh"}, name=f"{name} ({len(values)} values)",
         )  # fmt: skip
     even = np.linspace(-edge, edge, 121)
     normal = np.exp(-0.5 * even**2) / np.sqrt(2 * np.pi)
-    line = {"color": TEXT_COLOR, "dash": "dot"}
+    line = {"color": _TEXT_COLOR, "dash": "dot"}
     figure.add_scatter(x=even.tolist(), y=normal.tolist(), mode="lines", line=line, name="standard normal")
     return figure
 
@@ -257,20 +254,15 @@ def excess_cost_over_time_figure(
     costs: Mapping[str, tuple[Sequence[float], Sequence[float]]],
 ) -> plotly.graph_objects.Figure:
     """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
-    figure = styled_report_figure(340, "wall time [s]", "cost over its lowest, less one", log_y=True)
-    for i, (name, (seconds, cost)) in enumerate(costs.items()):
-        known = [(s, c) for s, c in zip(seconds, cost, strict=True) if np.isfinite(c)]
-        if known:
-            figure.add_scatter(
-                x=[s for s, _ in known], y=relative_excess_costs([c for _, c in known]),
-                mode="lines+markers", name=name, line={"color": line_color(i)},
-            )  # fmt: skip
+    figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
+    figure.update_yaxes(**_POWERS)
+    _add_curves(figure, ((name, seconds, relative_excess_costs(cost)) for name, (seconds, cost) in costs.items()))
     return figure
 
 
 def relative_excess_costs(costs: Sequence[float]) -> list[float]:
     """Relative excess of costs over the lowest of them, cost / min(costs) - 1; at least 1e-9."""
-    least = max(min(costs), 1e-300)
+    least = max(min(costs, default=0.0), 1e-300)
     return [max(cost / least - 1.0, 1e-9) for cost in costs]
 
 
@@ -287,7 +279,7 @@ def rate_intervals_figure(
 
     A calibration has its diagonal, all others a logarithmic axis.
     """
-    figure = styled_report_figure(340, x, y)
+    figure = _styled_figure(340, x, y)
     if is_calibration:
         line = {"color": MEASURED_COLOR, "dash": "dot"}
         figure.add_scatter(x=[0, 1], y=[0, 1], mode="lines", line=line, showlegend=False, hoverinfo="skip")
@@ -297,7 +289,7 @@ def rate_intervals_figure(
         rates, low, high = ([entry[key] for entry in known.values()] for key in ("rate", "low", "high"))
         figure.add_scatter(
             x=list(known), y=rates, mode="lines+markers", name=name, error_y=asymmetric_error_bars(rates, low, high),
-            line={"color": line_color(i)},
+            line={"color": _line_color(i)},
         )  # fmt: skip
     figure.update_yaxes(range=[-0.03, 1.03])
     return figure
@@ -307,22 +299,19 @@ def profile_likelihood_figure(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float
 ) -> plotly.graph_objects.Figure:
     """Profile-likelihood figure: increase of chi2 over the parameter's value relative to the estimate."""
-    figure = styled_report_figure(380, "value over best value", "chi2 above the best")
-    for i, (name, (ratio, delta)) in enumerate(curves.items()):
-        line = {"color": line_color(i), "dash": "solid" if i < len(LINE_COLORS) else "dash"}
-        figure.add_scatter(x=list(ratio), y=list(delta), mode="lines+markers", name=name, line=line)
-    figure.add_hline(y=level, line={"color": TEXT_COLOR, "dash": "dot"}, annotation_text="95 %")
+    figure = _styled_figure(380, "value over best value", "chi2 above the best")
+    _add_curves(figure, ((name, ratio, delta) for name, (ratio, delta) in curves.items()), "dash")
+    figure.add_hline(y=level, line={"color": _TEXT_COLOR, "dash": "dot"}, annotation_text="95 %")
     figure.update_xaxes(type="log", range=[-1.0, 1.0])
-    figure.update_yaxes(range=[-0.2, 2.5 * level])
-    return figure
+    return figure.update_yaxes(range=[-0.2, 2.5 * level])
 
 
 def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) -> plotly.graph_objects.Figure:
     """Figure of points (x, y) by name."""
-    figure = styled_report_figure(340, x, y)
+    figure = _styled_figure(340, x, y)
     for i, (name, (across, up)) in enumerate(clouds.items()):
         points = {"x": np.asarray(across, np.float32), "y": np.asarray(up, np.float32)}
-        figure.add_scatter(**points, mode="markers", name=name, marker={"size": 3, "color": line_color(i)})
+        figure.add_scatter(**points, mode="markers", name=name, marker={"size": 3, "color": _line_color(i)})
     return figure
 
 
@@ -332,3 +321,245 @@ def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
     keep = np.unique(np.linspace(0, count - 1, min(count, _MAX_CURVE_POINTS)).astype(np.int64))
     is_late = count and np.nanmax(np.abs(t[keep])) > _MAX_SINGLE_PRECISION_TIME
     return {"x": np.asarray(t[keep], float if is_late else np.float32), "y": np.asarray(values[keep], np.float32)}
+
+
+# -- one row per name -------------------------------------------------------------------------------------------------
+
+
+def _rows_figure(height: int, names: Sequence[str], title: str) -> plotly.graph_objects.Figure:
+    """An empty figure with one named row for each name, the first on top."""
+    figure = _styled_figure(height, title, "")
+    figure.update_yaxes(autorange="reversed", categoryorder="array", categoryarray=list(names), automargin=True)
+    return figure
+
+
+def estimates_figure(
+    values: Mapping[str, tuple[float, float | None, float, bool]], unit: str
+) -> plotly.graph_objects.Figure:
+    """Figure of estimates ± 2 std and initial values, one row per parameter: (value, std, initial, found)."""
+    names = list(values)
+    figure = _rows_figure(110 + 34 * len(names), names, unit)
+    marker = {"color": _GRID_COLOR, "size": 10, "symbol": "diamond", "line": {"color": _TEXT_COLOR, "width": 1}}
+    figure.add_scatter(x=[values[name][2] for name in names], y=names, mode="markers", name="start", marker=marker)
+    labels = {True: "estimate", False: "estimate that cannot be trusted"}
+    for (found, label), color in zip(labels.items(), LINE_COLORS, strict=False):
+        chosen = [name for name in names if values[name][3] == found]
+        figure.add_scatter(
+            x=[values[name][0] for name in chosen], y=chosen, mode="markers", name=label, showlegend=bool(chosen),
+            marker={"color": color, "size": 10},
+            error_x={"type": "data", "array": [2 * (values[name][1] or 0.0) for name in chosen], "color": color},
+        )  # fmt: skip
+    largest = max([abs(number) for value, _, initial, _ in values.values() for number in (value, initial)] or [1.0])
+    lowest = min(0.0, *(value for value, *_ in values.values()))
+    figure.update_xaxes(range=[lowest - 0.05 * largest, 1.6 * largest])
+    figure.update_yaxes(tickfont={"size": 11})
+    return figure
+
+
+def parameter_values_by_source_figure(
+    rows: Mapping[str, Mapping[str, tuple[float, float | None]]], unit: str
+) -> plotly.graph_objects.Figure:
+    """Figure of values ± 2 std from several sources, one row per parameter and one color per source."""
+    sources = list(dict.fromkeys(source for row in rows.values() for source in row))
+    names = list(rows)
+    figure = _styled_figure(110 + max(36, 14 * len(sources)) * len(names), unit, "")
+    spread = 0.6 / max(len(sources), 1)
+    for i, source in enumerate(sources):
+        own = [(k, *rows[name][source]) for k, name in enumerate(names) if source in rows[name]]
+        color, symbol = _line_color(i), _SYMBOLS[i // len(LINE_COLORS) % len(_SYMBOLS)]
+        figure.add_scatter(
+            x=[value for _, value, _ in own], y=[k + spread * (i - (len(sources) - 1) / 2) for k, *_ in own],
+            mode="markers", name=source, marker={"color": color, "size": 8, "symbol": symbol},
+            error_x={"type": "data", "array": [2 * (std or 0.0) for *_, std in own], "color": color, "thickness": 1.2},
+        )  # fmt: skip
+    numbers = [0.0, *(value for row in rows.values() for value, _ in row.values())]
+    low, high = min(numbers), max(numbers)
+    # bars of what cannot be told would squeeze all others
+    figure.update_xaxes(range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
+    figure.update_yaxes(
+        tickvals=list(range(len(names))), ticktext=names, range=[len(names) - 0.5, -0.5], automargin=True
+    )
+    return figure
+
+
+def _heat_figure(
+    height: int, names: tuple[Sequence[str], Sequence[str]], parts: Array, titles: tuple[str, str], tickangle: int
+) -> plotly.graph_objects.Figure:
+    """Figure of numbers between 0 and 1 for each pair of a row's and a column's name."""
+    rows, columns = (list(own) for own in names)
+    figure = _styled_figure(height, titles[1], titles[0])
+    figure.add_heatmap(
+        x=columns, y=rows, z=parts.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
+        colorscale=_SEQUENTIAL_COLORSCALE, texttemplate="%{text}",
+    )  # fmt: skip
+    every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
+    figure.update_xaxes(tickangle=tickangle, tickvals=columns, **every)
+    figure.update_yaxes(autorange="reversed", tickvals=rows, **every)
+    return figure
+
+
+def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts: Array) -> plotly.graph_objects.Figure:
+    """Confusion-matrix figure of counts of what was said of what is true, colored by the fraction of their row."""
+    parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
+    figure = _heat_figure(200 + 24 * len(rows), (rows, columns), parts, ("true", "said first"), -50)
+    text = [[f"{n:.0f}" if n else "" for n in line] for line in counts]
+    return figure.update_traces(text=text, hovertemplate="%{y}: said %{x}<extra></extra>")
+
+
+def explained_fraction_matrix_figure(names: Sequence[str], values: Array) -> plotly.graph_objects.Figure:
+    """Heat-map figure of explained fractions `values` (n, n), row explained by column, shown in per cent."""
+    figure = _heat_figure(190 + 27 * len(names), (names, names), values, ("trace of", "explained by [%]"), -40)
+    text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]
+    return figure.update_traces(text=text, hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>")
+
+
+@dataclass(frozen=True)
+class ValueBeforeAfter:
+    """A value before and after a change, with standard deviations and an optional reference value."""
+
+    before: float
+    after: float | None = None
+    before_std: float = 0.0
+    after_std: float = 0.0
+    reference: float | None = None
+
+
+def values_before_after_figure(
+    rows: Mapping[str, ValueBeforeAfter], axis: str, words: tuple[str, str, str]
+) -> plotly.graph_objects.Figure:
+    """Figure of values before and after, one row each; error bars are two standard deviations.
+
+    `axis` says what the numbers are, with their unit; `words` name before, after and the marks.
+    """
+    figure = _rows_figure(110 + 32 * len(rows), list(rows), axis)
+    moved = [(name, row.before, row.after) for name, row in rows.items() if row.after is not None]
+    figure.add_scatter(
+        x=[x for _, before, after in moved for x in (before, after, None)],
+        y=[y for name, *_ in moved for y in (name, name, None)],
+        mode="lines", line={"color": _GRID_COLOR, "width": 6}, hoverinfo="skip", showlegend=False,
+    )  # fmt: skip
+    hollow = {"color": _BACKGROUND_COLOR, "size": 11, "line": {"color": BEFORE_COLOR, "width": 2.5}}
+    full = {"color": AFTER_COLOR, "size": 11}
+    tick = {"symbol": "line-ns", "size": 16, "line": {"color": _TEXT_COLOR, "width": 2.5}}
+    numbers: list[float] = []
+    for entries, word, marker, color in (
+        ([(n, r.before, r.before_std) for n, r in rows.items()], words[0], hollow, BEFORE_COLOR),
+        ([(n, r.after, r.after_std) for n, r in rows.items()], words[1], full, AFTER_COLOR),
+        ([(n, r.reference, 0.0) for n, r in rows.items()], words[2], tick, _TEXT_COLOR),
+    ):
+        known = [(name, value, std) for name, value, std in entries if value is not None]
+        spread = [2 * std if np.isfinite(std) else 0.0 for *_, std in known]
+        bars = {"type": "data", "array": spread, "color": color, "thickness": 1.2} if any(spread) else None
+        x, y = [value for _, value, _ in known], [name for name, *_ in known]
+        numbers += x
+        if known:
+            figure.add_scatter(x=x, y=y, mode="markers", name=word, marker=marker, error_x=bars)
+    if min(numbers) > 0 and max(numbers) > 30 * min(numbers):
+        figure.update_xaxes(type="log", exponentformat="power", dtick="D2" if max(numbers) < 1e3 * min(numbers) else 1)
+    else:
+        # bars of what cannot be told would squeeze all others
+        figure.update_xaxes(range=[min(0.0, 1.1 * min(numbers)), 1.15 * max([*numbers, 1e-12])])
+    return figure
+
+
+@dataclass(frozen=True)
+class TimeHeatMapRow:
+    """One row of a heat map over time; rows of one group stand together."""
+
+    name: str
+    group: str
+    values: Array  # shape (J,), NaN where there is nothing to show
+    hover_texts: Sequence[str]  # J
+
+
+def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> plotly.graph_objects.Figure:
+    """Heat-map figure over time, one row per quantity; grey: not informed by the data.
+
+    Parameters
+    ----------
+    edges : ndarray, shape (J + 1,) [s]
+    axis : str
+        What the colors are.
+    """
+    values = np.array([row.values for row in rows])
+    seen = np.abs(values[np.isfinite(values)])
+    # even to the eye from one standard deviation to thousands
+    limit = max(3.0, float(np.quantile(seen, 0.98))) if seen.size else 3.0
+    marks = [m for m in ((0, 1, 3, 10) if limit < 20 else (0, 10, 100, 1000, 10000)) if m <= limit]
+    marks = sorted({-m for m in marks} | set(marks))
+    bar = {"thickness": 14, "x": 1.2, "tickvals": _even(marks).tolist(), "ticktext": [str(m) for m in marks]}
+    figure = _styled_figure(120 + max(17 * len(rows), 100), "time [s]", "")
+    figure.add_heatmap(
+        x=edges.tolist(), y=list(range(len(rows))),
+        z=[[v if np.isfinite(v) else None for v in row.tolist()] for row in _even(values)],
+        text=[list(row.hover_texts) for row in rows], hoverinfo="text", zmin=-_even(limit), zmax=_even(limit),
+        colorscale=_DIVERGING_COLORS, colorbar=bar,
+    )  # fmt: skip
+    figure.update_layout(plot_bgcolor=_GRID_COLOR, margin={"r": 150, "t": 40})
+    figure.add_annotation(
+        x=0, xref="paper", xanchor="left", y=1, yref="paper", yanchor="bottom", text=f"color: {axis}", showarrow=False
+    )
+    figure.update_xaxes(showgrid=False, range=[float(edges[0]), float(edges[-1])])
+    figure.update_yaxes(
+        showgrid=False, range=[len(rows) - 0.5, -0.5], tickvals=list(range(len(rows))),
+        ticktext=[row.name for row in rows], automargin=True, tickfont={"size": 11},
+    )  # fmt: skip
+    groups = [row.group for row in rows]
+    for group in dict.fromkeys(groups):
+        own = [i for i, entry in enumerate(groups) if entry == group]
+        at = {"x": 1.01, "xref": "paper", "y": (own[0] + own[-1]) / 2, "xanchor": "left"}
+        figure.add_annotation(text=group, showarrow=False, font={"size": 11}, **at)
+        if own[0]:
+            figure.add_hline(y=own[0] - 0.5, line={"color": _TEXT_COLOR, "width": 1})
+    return figure
+
+
+def _even(value: Any) -> Any:
+    return np.arcsinh(np.asarray(value, float) / 2)
+
+
+@dataclass(frozen=True)
+class RankedCandidate:
+    """A candidate effect in a ranking."""
+
+    name: str
+    closure_interval_percent: tuple[float, float, float] | None  # what it was found to close, and its interval [%]
+    predicted_decrease: float
+
+
+def candidate_ranking_figure(
+    entries: Sequence[RankedCandidate], closed: str, promised: str
+) -> plotly.graph_objects.Figure:
+    """Figure that ranks candidates by refitted closure (where refitted) and by first-order predicted decrease.
+
+    `closed` and `promised` are the titles of the two axes.
+    """
+    from plotly.subplots import make_subplots
+
+    done = {entry.name: entry.closure_interval_percent for entry in entries if entry.closure_interval_percent}
+    last = 2 if done else 1
+    figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.08)
+    figure = _styled_figure(100 + 28 * len(entries), "", "", base=figure)
+    figure.add_bar(
+        x=[entry.predicted_decrease for entry in entries], y=[entry.name for entry in entries], orientation="h",
+        width=0.55, marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last,
+    )  # fmt: skip
+    figure.update_xaxes(title_text=promised, rangemode="tozero", row=1, col=last)
+    if done:
+        values, lows, highs = zip(*done.values(), strict=True)
+        figure.add_scatter(
+            x=values, y=list(done), mode="markers", showlegend=False, row=1, col=1,
+            marker={"color": LINE_COLORS[0], "size": 11}, error_x=asymmetric_error_bars(values, lows, highs),
+        )  # fmt: skip
+        # what makes a prediction worse can do so without end
+        left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for low in lows)]) - 6
+        figure.update_xaxes(title_text=closed, range=[left, 108], row=1, col=1)
+        figure.add_vline(x=0, line={"color": _TEXT_COLOR, "width": 1}, row=1, col=1)
+        for name, (value, *_) in done.items():
+            if value < left:
+                text = f"◀ {value:.0f}"
+                figure.add_annotation(x=left, y=name, text=text, showarrow=False, xanchor="left", row=1, col=1)
+    names = [entry.name for entry in entries][::-1]
+    figure.update_yaxes(type="category", categoryorder="array", categoryarray=names, automargin=True)
+    figure.update_yaxes(range=[-0.6, len(names) - 0.4])
+    return figure

@@ -16,9 +16,8 @@ from yid_ocp.diagnosis.localise import smoothed_unknown_units, smoothed_unknown_
 from yid_ocp.inference.null_test import residual_channel_samples
 from yid_ocp.inference.smoother import SmootherResult
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.report import categorical_charts, figures
-from yid_ocp.report.categorical_charts import RankedCandidate, TimeHeatMapRow, ValueBeforeAfter
-from yid_ocp.report.figures import TimePlotData
+from yid_ocp.report import figures
+from yid_ocp.report.figures import RankedCandidate, TimeHeatMapRow, TimePlotData, ValueBeforeAfter
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
 from yid_ocp.report.terminal import display_scale_and_unit, format_error_value_and_unit
 
@@ -101,7 +100,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
 def _changes(
     rows: Sequence[tuple[str, str, ValueBeforeAfter]], axis: str, words: tuple[str, str, str]
 ) -> list[tuple[str, Any]]:
-    draw = categorical_charts.values_before_after_figure
+    draw = figures.values_before_after_figure
     return figures_by_unit(rows, lambda own, unit: draw(own, f"{axis} [{unit}]", words))
 
 
@@ -185,7 +184,7 @@ def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: 
         ]
         group = f"{groups[k].location} {groups[k].kind} [{units[k]}]"
         rows.append(TimeHeatMapRow(names[k], group, values[:, k], texts))
-    return categorical_charts.time_heat_map_figure(edges, rows, axis), sentence
+    return figures.time_heat_map_figure(edges, rows, axis), sentence
 
 
 def _side(smoothed: SmootherResult) -> str:
@@ -268,7 +267,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     # beside each other on a phone there is room for a word
     axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
-    return _Chapter(title, sentences, [("", categorical_charts.candidate_ranking_figure(entries, *axes))])
+    return _Chapter(title, sentences, [("", figures.candidate_ranking_figure(entries, *axes))])
 
 
 def _promised(finding: DiagnosisResult) -> tuple[dict[str, float], bool]:
@@ -301,7 +300,7 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         "can; 100 % cannot be told apart by these motions and sensors, whatever the residual is.",
         f"Alike: {listed}." if close else f"No two of them are alike; the closest are {said[0][1]}.",
     ]
-    figure = categorical_charts.explained_fraction_matrix_figure(names, values)
+    figure = figures.explained_fraction_matrix_figure(names, values)
     return _Chapter("What could be mistaken for what", sentences, [("", figure)])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from yid_ocp.analysis.compare import MethodComparison
 from yid_ocp.analysis.profile import CHI2_QUANTILE_95
-from yid_ocp.report import categorical_charts, diagnosis_summaries, figures, summaries  # noqa: F401, they register
+from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import BLIND_CALIBRATION_LABELS
 from yid_ocp.report.sections import ReportData, figures_by_unit, joint_channel_unit, register_report_section
@@ -57,7 +57,7 @@ def _estimates(findings: ReportData) -> Mapping[str, Any] | None:
         if entry.get("free") and "initial" in entry:
             found = entry["verdict"] not in lost and result["status"] != "failed"
             rows.append((name, entry["unit"], (entry["value"], entry["std"], entry["initial"], found)))
-    return {"figures": figures_by_unit(rows, categorical_charts.estimates_figure)} if rows else None
+    return {"figures": figures_by_unit(rows, figures.estimates_figure)} if rows else None
 
 
 @register_report_section("search", 40, "How it was found")
@@ -96,7 +96,7 @@ def _parameter_history(findings: ReportData) -> Mapping[str, Any] | None:
         (name, entry["unit"], {run: (own["value"], own["std"]) for run, own in entry["values"].items()})
         for name, entry in result["parameters"].items()
     ]
-    return {"figures": figures_by_unit(rows, categorical_charts.parameter_values_by_source_figure)}
+    return {"figures": figures_by_unit(rows, figures.parameter_values_by_source_figure)}
 
 
 @register_report_section("methods", 10, "Methods")
@@ -112,9 +112,9 @@ def _method_comparison(findings: ReportData) -> Mapping[str, Any] | None:
             rows.append((name, entry["unit"], {method: (e["value"], e["std"]) for method, e in own.items()}))
     costs = {}
     for run in comparison.method_results:
-        history = [entry for entry in run.solution.history if not entry.note]
+        history = [entry for entry in run.solution.history if math.isfinite(entry.cost) and not entry.note]
         costs[run.method] = ([entry.seconds for entry in history], [entry.cost for entry in history])
-    shown = figures_by_unit(rows, categorical_charts.parameter_values_by_source_figure, "Estimates")
+    shown = figures_by_unit(rows, figures.parameter_values_by_source_figure, "Estimates")
     return {"figures": [*shown, ("Cost over time", figures.excess_cost_over_time_figure(costs))]}
 
 
@@ -135,7 +135,7 @@ def _blind_validation(findings: ReportData) -> Mapping[str, Any] | None:
     said = result["confusion"]
     counts = np.array(said["counts"], float).reshape(len(said["true"]), len(said["said"]))
     if counts.size:
-        figure = categorical_charts.confusion_matrix_figure(said["true"], said["said"], counts)
+        figure = figures.confusion_matrix_figure(said["true"], said["said"], counts)
         shown.append(("What was said of what", figure))
     kept = {
         label: {entry["level"]: entry for entry in result["calibration"][key] if entry["of"]}
