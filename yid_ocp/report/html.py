@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import functools
 import gzip
+import inspect
 import logging
 import os
 import re
@@ -39,8 +40,9 @@ def write_report(path: Path, findings: ReportData) -> bool:
         return False
     import jinja2
 
-    beside = {str(REPORT_SECTIONS[name].template_folder) for name in REPORT_SECTIONS}
-    loader = jinja2.ChoiceLoader([jinja2.PackageLoader("yid_ocp.report"), jinja2.FileSystemLoader(sorted(beside))])
+    # a plug-in's template stands beside its function
+    folders = {str(Path(inspect.getfile(REPORT_SECTIONS[name].prepare_context)).parent) for name in REPORT_SECTIONS}
+    loader = jinja2.ChoiceLoader([jinja2.PackageLoader("yid_ocp.report"), jinja2.FileSystemLoader(sorted(folders))])
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,18 +32,16 @@ _EVENT_COLORS = {
 }
 
 
-@dataclass(frozen=True)
-class _Chapter:
-    """A titled part of the section: sentences and titled figures."""
+class _Chapter(NamedTuple):
+    """A titled part of the section: sentences, of which empty ones are not shown, and titled figures."""
 
     title: str
     sentences: Sequence[str]
-    figures: Sequence[tuple[str, Any]] = ()
+    figures: Sequence[tuple[str, Any]]
 
 
 @register_report_section("diagnosis", 5, "The gap and what makes it")
 def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
-    """Chapters on gap, events, locations, candidates, curves and changed parameters."""
     result = findings.result
     finding: DiagnosisResult | None = findings.section_data.get("finding")
     if result.get("format") != "yid-diagnosis/2" or finding is None:
@@ -66,14 +63,13 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
 
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
-    floor, changed = _floor(finding), bool(finding.accepted_effects)
+    floor, changed = _noise_rmse(finding), bool(finding.accepted_effects)
     rows = []
     for channel, (error, unit) in before.items():
         factor, shown = display_scale_and_unit(unit)
         later = factor * after[channel][0] if changed and channel in after else None
         reference = factor * floor[channel] if channel in floor else None
         rows.append((channel, shown, ValueBeforeAfter(factor * error, later, reference=reference)))
-    shown_figures = _changes(rows, "held-out error (rms)", (_NOMINAL_LABEL, _EXTENDED_LABEL, "noise alone"))
     first, last = finding.nominal_held_out_test.chi2_per_dof, finding.remaining_test.chi2_per_dof
     sentences = [
         "Errors on recordings that no fit has touched, channel by channel; the tick is what noise alone gives."
@@ -94,24 +90,20 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             f"No effect is named, so no error is shown after it; chi² per degree of freedom is {first:.3g} (one is "
             "noise alone)."
         )
-    return _Chapter("How large the gap is", sentences, shown_figures)
+    words = (_NOMINAL_LABEL, _EXTENDED_LABEL, "noise alone")
+    return _Chapter("How large the gap is", sentences, _before_after_figures(rows, "held-out error (rms)", words))
 
 
-def _changes(
+def _before_after_figures(
     rows: Sequence[tuple[str, str, ValueBeforeAfter]], axis: str, words: tuple[str, str, str]
 ) -> list[tuple[str, Any]]:
-    draw = figures.values_before_after_figure
-    return figures_by_unit(rows, lambda own, unit: draw(own, f"{axis} [{unit}]", words))
+    return figures_by_unit(rows, lambda own, unit: figures.values_before_after_figure(own, f"{axis} [{unit}]", words))
 
 
-def _floor(finding: DiagnosisResult) -> dict[str, float]:
+def _noise_rmse(finding: DiagnosisResult) -> dict[str, float]:
     """Error of every channel that noise alone gives; for points that of a distance."""
-    width = {
-        channel: samples.sensor.outputs_per_channel
-        for episode in finding.nominal_model.problem.held_out
-        for samples in episode.measurements
-        for channel in samples.sensor.channel_names
-    }
+    sensors = [samples.sensor for own in finding.nominal_model.problem.held_out for samples in own.measurements]
+    width = {channel: sensor.outputs_per_channel for sensor in sensors for channel in sensor.channel_names}
     return {entry.channel: math.sqrt(width.get(entry.channel, 1)) * entry.noise_std for entry in finding.noise_floor}
 
 
@@ -126,16 +118,15 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         ", ".join(place.location for place in finding.gap_locations if place.is_observable == seen)
         for seen in (True, False)
     )
+    left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
     sentences = [
         "Every coordinate was given an unknown force, every grasp an unknown offset and every measured point an "
         "unknown bias, free to change in time; the fewest groups of them that explain the residual were kept.",
         _side(smoothed),
         f"A gap would have shown at {noticed}." if noticed else "",
         f"It would not have shown at {silent}: these motions and sensors cannot tell." if silent else "",
+        f"What the effects leave lies in {', '.join(left)}." if finding.accepted_effects and left else "",
     ]
-    left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
-    if finding.accepted_effects and left:
-        sentences.append(f"What the effects leave lies in {', '.join(left)}.")
     maps = []
     for i, trace in enumerate(smoothed.smoothed_unknowns[:_MAX_MAPS]):
         kept = [k for k, source in enumerate(trace.unknown_groups) if smoothed.group_variance[source] > 0]
@@ -150,7 +141,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         sentences.append("No group of unknowns explains the residual better than chance, so there is no map.")
     if len(smoothed.smoothed_unknowns) > _MAX_MAPS:
         sentences.append(f"{len(smoothed.smoothed_unknowns) - _MAX_MAPS} more recordings are in trajectories.h5.")
-    return _Chapter("Where it is, and when", [text for text in sentences if text], maps)
+    return _Chapter("Where it is, and when", sentences, maps)
 
 
 def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: list[int]) -> tuple[Any, str]:
@@ -162,11 +153,15 @@ def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: 
     units = smoothed_unknown_units(finding.nominal_model.problem.system, trace)
     mean, std = trace.posterior_mean * trace.reference_std, trace.posterior_std * trace.reference_std
     axis = "value in its standard deviations"
+
+    def said(j: int, k: int) -> str:
+        return f"{mean[j, k]:.3g} ± {std[j, k]:.2g} {units[k]}"
+
     if np.any(np.isfinite(values)):
         j, k = divmod(int(np.nanargmax(np.abs(values))), values.shape[1])
         sentence = (
             f"Grey is where the data do not say; the surest value is that of {names[k]} between {edges[j]:.2f} and "
-            f"{edges[j + 1]:.2f} s, {mean[j, k]:.3g} ± {std[j, k]:.2g} {units[k]}."
+            f"{edges[j + 1]:.2f} s, {said(j, k)}."
         )
     else:
         prior = np.sqrt([smoothed.group_variance[source] for source in groups])
@@ -178,12 +173,11 @@ def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: 
         )
     rows = []
     for k in kept:
-        texts = [
-            f"{names[k]}, {edges[j]:.2f} to {edges[j + 1]:.2f} s: {mean[j, k]:.3g} ± {std[j, k]:.2g} {units[k]}"
-            for j in range(len(mean))
-        ]
-        group = f"{groups[k].location} {groups[k].kind} [{units[k]}]"
-        rows.append(TimeHeatMapRow(names[k], group, values[:, k], texts))
+        spans = [f"{edges[j]:.2f} to {edges[j + 1]:.2f} s" for j in range(len(mean))]
+        texts = [f"{names[k]}, {span}: {said(j, k)}" for j, span in enumerate(spans)]
+        rows.append(
+            TimeHeatMapRow(names[k], f"{groups[k].location} {groups[k].kind} [{units[k]}]", values[:, k], texts)
+        )
     return figures.time_heat_map_figure(edges, rows, axis), sentence
 
 
@@ -230,11 +224,14 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         title, spans = f"{force.coordinate} [{force.unit}]", [(begin, end) for _, begin, end in pulses]
         plot = TimePlotData(title, lines, force.t, force.max_likelihood_forces, marked_intervals=spans)
         by_recording.setdefault(force.recording, []).append(plot)
-    shown = [
-        (f"Recording {name}", figures.time_plots_figure(plots, figures.BEFORE_COLOR, _EVENT_COLORS))
-        for name, plots in by_recording.items()
-    ]
-    return _Chapter("What happened beside it", [text for text in sentences if text], shown)
+    shown = _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
+    return _Chapter("What happened beside it", sentences, shown)
+
+
+def _recording_figures(
+    plots: Mapping[str, Sequence[TimePlotData]], words: str, dots: str, lines: Mapping[str, str]
+) -> list[tuple[str, Any]]:
+    return [(f"Recording {name}{words}", figures.time_plots_figure(own, dots, lines)) for name, own in plots.items()]
 
 
 # -- which ------------------------------------------------------------------------------------------------------------
@@ -242,28 +239,26 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
 
 def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
     promised, percent = _promised(finding)
-    entries = []
+    entries, done = [], []
     for entry in result["which"][:_MAX_CANDIDATES]:
         name, closed = f"{entry['kind']}@{entry['location']}", None
         if entry["closure"] is not None and None not in entry["closure_ci"]:
-            low, high = entry["closure_ci"]
-            closed = (100 * entry["closure"], 100 * low, 100 * high)
+            closed = tuple(100 * value for value in (entry["closure"], *entry["closure_ci"]))
+            done.append((name, closed))
         entries.append(RankedCandidate(name, closed, promised.get(name, 0.0)))
     if not entries:
         return None
-    done = {e.name: e.closure_interval_percent for e in entries if e.closure_interval_percent is not None}
     unit = "as a part of the excess over noise" if percent else "as a fall of the sum of squares; 7 is chance at 1 %"
     promise = f"hat each promises to first order where the model was fitted, {unit}."
+    sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
     if done:
-        best = sorted(done.items(), key=lambda entry: -entry[1][0])[:3]
+        best = sorted(done, key=lambda entry: -entry[1][0])[:3]
         said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
         sentences = [
             "Left: refitted together with the stiffnesses, each alone, and judged on held-out motions, with the 95 % "
             f"interval; 100 % closes the gap, less than zero predicts worse. Closed by {said}.",
             f"Right: w{promise}",
         ]
-    else:
-        sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
     # beside each other on a phone there is room for a word
     axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
@@ -288,11 +283,8 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         return None
     at = [labels.index(name) for name in names]
     values = finding.confusability.overlap_fractions[np.ix_(at, at)]
-    pairs = sorted(
-        ((min(values[i, j], values[j, i]), names[i], names[j]) for i, j in combinations(range(len(names)), 2)),
-        reverse=True,
-    )
-    said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in pairs]
+    pairs = ((min(values[i, j], values[j, i]), names[i], names[j]) for i, j in combinations(range(len(names)), 2))
+    said = [(v, f"{a} and {b} ({100 * v:.0f} %)") for v, a, b in sorted(pairs, reverse=True)]
     close = [text for v, text in said if v >= finding.thresholds.signature_overlap]
     listed = ", ".join(close[:5]) + (f" and {len(close) - 5} more" if len(close) > 5 else "")
     sentences = [
@@ -311,16 +303,16 @@ def _curves(
     finding: DiagnosisResult, predicted: Sequence[tuple[Episode, EpisodePrediction, EpisodePrediction]]
 ) -> _Chapter | None:
     changed = bool(finding.accepted_effects)
+    labels = (_NOMINAL_LABEL, _EXTENDED_LABEL) if changed else (_NOMINAL_LABEL,)
     found: list[tuple[float, str, tuple[TimePlotData, TimePlotData]]] = []
-    for episode, before, after in predicted:
+    for episode, *outcomes in predicted:
         for k, samples in enumerate(episode.measurements):
             sensor = samples.sensor
             t = episode.grid.start_time + episode.grid.time_step * (samples.node + samples.fraction)
             for column, channel in enumerate(samples.output_channel_names):
                 y, std = samples.value[:, column], samples.std[:, column]
-                lines = {_NOMINAL_LABEL: before.predicted_outputs[k][:, column]}
-                if changed:
-                    lines[_EXTENDED_LABEL] = after.predicted_outputs[k][:, column]
+                own = (outcome.predicted_outputs[k][:, column] for outcome in outcomes)
+                lines = dict(zip(labels, own, strict=False))
                 seen = np.isfinite(y) & np.isfinite(std)
                 if seen.any():
                     squares = [float(np.sum(((line - y)[seen] / std[seen]) ** 2)) for line in lines.values()]
@@ -337,10 +329,7 @@ def _curves(
     by_recording: dict[str, list[TimePlotData]] = {}
     for recording, pair in list(best.values())[:_MAX_CHANNELS]:
         by_recording.setdefault(recording, []).extend(pair)
-    shown = [
-        (f"Recording {name}, held out", figures.time_plots_figure(plots, figures.MEASURED_COLOR, _MODEL_COLORS))
-        for name, plots in by_recording.items()
-    ]
+    shown = _recording_figures(by_recording, ", held out", figures.MEASURED_COLOR, _MODEL_COLORS)
     what, count = "change most with the effects" if changed else "the nominal model misses most", len(best)
     sentences = [
         f"The {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}, measured and predicted; below "
@@ -359,7 +348,7 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
         if abs(after - before) > 0.1 * max(abs(before), 1e-9):
             text = f"{entry.name} goes from {before:.3g} to {after:.3g} {entry.unit}"
             moved.append((abs(after - before) / max(abs(before), 1e-9), text))
-    shown = _changes(rows, "value", ("fitted without the effects", _EXTENDED_LABEL, ""))
+    shown = _before_after_figures(rows, "value", ("fitted without the effects", _EXTENDED_LABEL, ""))
     said = ", ".join(text for _, text in sorted(moved, key=lambda entry: -entry[0])[:4])
     sentences = [
         "A missing effect hides in the parameters that are free: this is how they move when it is added. Bars are two "

@@ -1,22 +1,44 @@
-"""Sections that show a result in words, tables and figures, whatever the command."""
+"""Sections on what a result says and found, on what moved and what was measured, whatever the command."""
 
 from __future__ import annotations
 
 import base64
+import json
 import math
-from collections.abc import Mapping
-from functools import partial
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from yid_ocp.analysis.compare import MethodComparison
 from yid_ocp.analysis.profile import CHI2_QUANTILE_95
+from yid_ocp.arrays import Array
+from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.model.system import System
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
+from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import BLIND_CALIBRATION_LABELS
-from yid_ocp.report.sections import ReportData, figures_by_unit, joint_channel_unit, register_report_section
+from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
 from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, SummaryBlock, SummaryStatement, SummaryTable
+
+_MAX_ANIMATIONS = 4  # a page with more is slow to open
+_MAX_FIT_FIGURES = 24  # a page with more is too heavy to open; result.json and trajectories.h5 have them all
+_MAX_LISTED_RECORDINGS = 3  # recordings that are drawn
+_MAX_POINTS = 6  # points of a group; more are in the recording
+_ESTIMATED, _HELD_OUT = "estimated on", "held out"
+_JOINT_CHANNEL_UNITS = {
+    "position": ("rad", "m"),
+    "velocity": ("rad/s", "m/s"),
+    "effort": ("N m", "N"),
+    "position_command": ("rad", "m"),
+}
+"""Units of a revolute and of a prismatic joint."""
+
+
+# -- in words and tables -----------------------------------------------------------------------------------------------
 
 
 @register_report_section("verdict", 0, "What was found")
@@ -114,7 +136,8 @@ def _method_comparison(findings: ReportData) -> Mapping[str, Any] | None:
     for run in comparison.method_results:
         history = [entry for entry in run.solution.history if math.isfinite(entry.cost) and not entry.note]
         costs[run.method] = ([entry.seconds for entry in history], [entry.cost for entry in history])
-    shown = figures_by_unit(rows, figures.parameter_values_by_source_figure, "Estimates")
+    estimates = figures_by_unit(rows, figures.parameter_values_by_source_figure)
+    shown = [("Estimates", figure) for _, figure in estimates]
     return {"figures": [*shown, ("Cost over time", figures.excess_cost_over_time_figure(costs))]}
 
 
@@ -179,31 +202,158 @@ def _friction_torque(findings: ReportData) -> Mapping[str, Any] | None:
 
 @register_report_section("information", 10, "The motion that tells most")
 def _informative_motion(findings: ReportData) -> Mapping[str, Any] | None:
-    """Joint positions, velocities and efforts over time."""
     return _motion_figures(findings, "information")
 
 
 @register_report_section("plan", 10, "The planned motion")
 def _planned_motion(findings: ReportData) -> Mapping[str, Any] | None:
-    """Distance of the point from its target, joint positions and efforts over time."""
     return _motion_figures(findings, "plan")
 
 
 def _motion_figures(findings: ReportData, key: str) -> Mapping[str, Any] | None:
+    """Distance of a plan's point from its target; joint positions, velocities and efforts over time."""
     found = findings.section_data.get(key)
     if found is None:
         return None
-    unit = partial(joint_channel_unit, found.simulator.step.system, found.joint_names)
+    system, names = found.simulator.step.system, found.joint_names
     curves = []
     if key == "plan" and (where := found.point_trajectories.get(findings.result["point"])) is not None:
-        off = 1e3 * (where - found.target_position)
-        lines = {axis: (found.t, off[:, i]) for i, axis in enumerate("xyz")}
-        tolerance = 1e3 * findings.result["tolerance"]
-        curves.append(TimePlotData("from the place [mm]", lines, band_half_height=tolerance))
-    courses = {f"joints, from the start [{unit('position')}]": found.joint_positions - found.joint_positions[0]}
-    if key == "information":
-        courses[f"velocity [{unit('velocity')}]"] = found.joint_velocities
-    courses[f"effort [{unit('effort')}]"] = found.joint_efforts
-    for words, values in courses.items():
-        curves.append(TimePlotData(words, {name: (found.t, values[:, i]) for i, name in enumerate(found.joint_names)}))
+        lines = _lines(found.t, "xyz", 1e3 * (where - found.target_position))
+        curves.append(TimePlotData("from the place [mm]", lines, band_half_height=1e3 * findings.result["tolerance"]))
+    courses = [("joints, from the start", "position", found.joint_positions - found.joint_positions[0])]
+    courses += [("velocity", "velocity", found.joint_velocities)] if key == "information" else []
+    for words, channel, values in (*courses, ("effort", "effort", found.joint_efforts)):
+        title = f"{words} [{_joint_channel_unit(system, names, channel)}]"
+        curves.append(TimePlotData(title, _lines(found.t, names, values)))
     return {"figures": [("", lines_over_time_figure(curve)) for curve in curves]}
+
+
+def _lines(t: Array, names: Sequence[str], values: Array) -> dict[str, tuple[Array, Array]]:
+    return {name: (t, values[:, i]) for i, name in enumerate(names)}
+
+
+def _joint_channel_unit(system: System | None, names: Sequence[str], channel: str) -> str:
+    """Unit of a joint channel, or both; joints unknown to the system count as revolute."""
+    kinds = {} if system is None else {joint.name: joint.kind for joint in system.mechanism.joints}
+    is_prismatic = {kinds.get(name) == "prismatic" for name in names} or {False}
+    return ", ".join(_JOINT_CHANNEL_UNITS[channel][kind] for kind in sorted(is_prismatic))
+
+
+# -- what moved and what was measured ----------------------------------------------------------------------------------
+
+
+class _PredictedEpisode(NamedTuple):
+    """A recording and its prediction with the parameters (ntheta,) found for it."""
+
+    role: str
+    problem: EstimationProblem
+    theta: Array
+    episode: Episode
+    prediction: EpisodePrediction
+
+    @property
+    def title(self) -> str:
+        return f"{self.episode.name} ({self.role})"
+
+
+def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
+    """Every recording with a prediction, those fitted first."""
+    problem, solution = findings.problem, findings.solution
+    if problem is None or solution is None:
+        return
+    fitted = zip(problem.episodes, solution.episode_predictions, strict=False)
+    entries = [(_ESTIMATED, i, *own) for i, own in enumerate(fitted)]
+    for role, i, episode, prediction in entries + [(_HELD_OUT, 0, *own) for own in findings.held_out]:
+        if not isinstance(prediction, str):
+            theta = problem.predictor.theta_with_episode_values(episode, problem.split(solution.x, i)[0])
+            yield _PredictedEpisode(role, problem, theta, episode, prediction)
+
+
+@register_report_section("scene", 3, "In motion")
+def _animation(findings: ReportData) -> Mapping[str, Any] | None:
+    """The command's animations, else the predicted motion of each recording, held-out first."""
+    scenes = [entry for entry in findings.animations or _predicted_motions(findings) if len(entry.t) > 1]
+    told = json.dumps([entry.to_dict() for entry in scenes[:_MAX_ANIMATIONS]], separators=(",", ":"))
+    names = [[motion.name for motion in entry.motions] for entry in scenes]
+    both = any("measured" in own and len(own) > 1 for own in names)
+    return {"scenes": told.replace("<", "\\u003c"), "both": both} if scenes else None
+
+
+def _predicted_motions(findings: ReportData) -> Sequence[Animation]:
+    result = []
+    for own in sorted(_predicted_episodes(findings), key=lambda own: own.role != _HELD_OUT)[:_MAX_ANIMATIONS]:
+        system = own.problem.system
+        q = own.prediction.rollout.state[:, : system.n_coordinates]
+        told = ModelTrajectory("predicted", system, own.theta, own.episode.grid.node_times, q)
+        result.append(make_animation(own.title, [told], own.episode.recording))
+    return result
+
+
+@register_report_section("fit", 20, "How well it fits")
+def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
+    """Measured and predicted values with residuals over time, and a residual histogram."""
+    found: list[tuple[str, list[TimePlotData]]] = []
+    whitened: dict[str, list[Array]] = {}
+    for own in _predicted_episodes(findings):
+        found += [(f"{name} in {own.title}", curves) for name, curves in _fitted_curves(own)]
+        for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
+            if own.role == _ESTIMATED:
+                ratio = (predicted - samples.value) / samples.std
+                whitened.setdefault(samples.sensor.group_name, []).append(ratio[np.isfinite(ratio)])
+    if not found:
+        return None
+    residuals = {group: np.concatenate(parts) for group, parts in whitened.items() if any(map(len, parts))}
+    return {
+        "figures": [(title, figures.time_plots_figure(curves)) for title, curves in found[:_MAX_FIT_FIGURES]],
+        "left": max(len(found) - _MAX_FIT_FIGURES, 0),
+        "histogram": figures.whitened_residual_histogram_figure(residuals) if residuals else None,
+    }
+
+
+def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotData]]]:
+    """Title and curves of each point, or of all joints of a group together."""
+    grid = own.episode.grid
+    for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
+        sensor, course = samples.sensor, None
+        t = grid.start_time + grid.time_step * (samples.node + samples.fraction)
+        if sensor.point_names and len(t) < grid.steps / 2:
+            # what a sensor that looks seldom would have seen at every node
+            values = own.problem.predictor.node_values(own.prediction.rollout)
+            course = own.problem.model_functions.compiled_sensor_function(sensor)(values, own.theta).output
+        names, width = sensor.channel_names, sensor.outputs_per_channel
+        parts = {name: range(width * c, width * (c + 1)) for c, name in enumerate(names)} if width > 1 else {}
+        for title, columns in (parts or {sensor.group_name: range(len(names))}).items():
+            curves: list[TimePlotData] = []
+            for i in columns:
+                name = sensor.output_names[i].rsplit(".", 1)[1]
+                told = (t, samples.value[:, i], samples.std[:, i], {"predicted": predicted[:, i]})
+                smooth = None if course is None else (grid.node_times, course[:, i])
+                curves += figures.prediction_and_residual_plots(name, sensor.unit, *told, smooth)
+            yield title, curves
+
+
+@register_report_section("recorded", 30, "What was recorded")
+def _recorded_signals(findings: ReportData) -> Mapping[str, Any] | None:
+    """Recorded joint channels and points over time."""
+    system: System | None = findings.section_data.get("system")
+    shown = [
+        (f"{title} of {recording.name}", lines_over_time_figure(curve))
+        for recording in findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]
+        for title, curve in _recorded_curves(recording, system)
+    ]
+    return {"figures": shown} if shown else None
+
+
+def _recorded_curves(recording: Recording, system: System | None) -> Iterator[tuple[str, TimePlotData]]:
+    for group in recording.groups:
+        if isinstance(group, JointGroup):
+            for channel in _JOINT_CHANNEL_UNITS:
+                values = group.channels.get(channel)
+                if values is not None:
+                    words, unit = channel.replace("_", " "), _joint_channel_unit(system, group.names, channel)
+                    curve = TimePlotData(f"{words} [{unit}]", _lines(group.t, group.names, values))
+                    yield f"Joints: {words}", curve
+        else:
+            names = [f"{name}.{axis}" for name in group.names[:_MAX_POINTS] for axis in "xyz"]
+            lines = _lines(group.t, names, group.position.reshape(len(group.t), -1))
+            yield f"Points: {group.name}", TimePlotData("position [m]", lines)
