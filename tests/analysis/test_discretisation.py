@@ -138,7 +138,9 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     ids=["not tried", "within it", "links", "time step", "both"],
 )
 def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_is(links, time_step, std):
-    assert DiscretisationEstimateShift(links, time_step)._inflated_std(0.1) == pytest.approx(std)
+    shifts = {"a": DiscretisationEstimateShift(links, time_step)}
+    found = inflate_estimates_by_discretisation({"a": estimate(10.0, 0.1)}, shifts, {})
+    assert found["a"].std == pytest.approx(std)
 
 
 @pytest.mark.parametrize(

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from made_recordings import holding_pendulum
 
-from yid_ocp.analysis.sparsity_patterns import (
+from yid_ocp.analysis.step_diagnostics import (
     NamedIndexRange,
     SparsityPattern,
     full_nlp_size,
     kkt_sparsity_pattern,
+    linearise_step_equations,
     nlp_stage_sparsity,
     step_sparsity_patterns,
 )
-from yid_ocp.analysis.step_diagnostics import linearise_step_equations
 from yid_ocp.analysis.step_symbols import StepSymbols
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect

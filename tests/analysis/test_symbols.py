@@ -27,7 +27,7 @@ def point(symbols):
     values = rng.uniform(0.2, 0.6, len(symbols.column_names))
     span = symbols.block_slice("theta")
     values[span] = symbols.equations.system.parameters.vector() + 0.1
-    values[symbols._column_index("h")] = 0.02
+    values[symbols.column_names.index("h")] = 0.02
     return values
 
 
@@ -58,10 +58,10 @@ def test_rows_and_columns_stand_where_the_equations_have_them(symbols):
     for block in (*symbols.row_blocks, *symbols.column_blocks):
         span = symbols.block_slice(block.name)
         assert span.stop - span.start == len(block.labels) == block.expressions.numel()
-    assert symbols._column_index("q1[T1_0_x]") == symbols.block_slice("q1").start + 2
-    assert symbols._row_index("p1[elbow]") == symbols.block_slice("p1").start + 1
+    assert symbols.column_names.index("q1[T1_0_x]") == symbols.block_slice("q1").start + 2
+    assert symbols.row_names.index("p1[elbow]") == symbols.block_slice("p1").start + 1
     for name in ("lam[hand.tilt_y]", "T1.bend", "h", "u[shoulder]"):
-        assert symbols.column_names[symbols._column_index(name)] == name
+        assert symbols.column_names[symbols.column_names.index(name)] == name
 
 
 @pytest.mark.parametrize("kind", ["point", "axis", "weld"])
@@ -76,7 +76,7 @@ def test_every_equation_of_a_grasp_has_a_name(kind):
 def test_an_entry_is_the_row_as_text(symbols, row):
     """The printed lines are all that is needed to work the row out."""
     at, entry = point(symbols), symbols.equation_entry(row)
-    expected = value(symbols, symbols._row_expressions, at)[symbols._row_index(row)]
+    expected = value(symbols, symbols._row_expressions, at)[symbols.row_names.index(row)]
     assert worked_out(symbols, entry, at) == pytest.approx(expected, rel=1e-9)
     assert entry.numeric_value(symbols.column_symbols, at) == pytest.approx(expected, rel=1e-12)
     assert entry.title == row
@@ -96,7 +96,7 @@ def worked_out(symbols, entry, at):
             text = text.replace(name, f"v[{i}]") if name != "h" else text
         return read(text)
 
-    known |= {"v": at, "h": at[symbols._column_index("h")]}
+    known |= {"v": at, "h": at[symbols.column_names.index("h")]}
     for name, text in entry.formula.shared_subexpressions:
         known[name] = eval(numbers(text), {"__builtins__": {}}, known)
     return eval(numbers(entry.formula.expression_texts[0]), {"__builtins__": {}}, known)
@@ -114,7 +114,7 @@ def worked_out(symbols, entry, at):
     ],
 )
 def test_an_entry_with_a_column_is_the_slope(symbols, row, column):
-    at, i, j = point(symbols), symbols._row_index(row), symbols._column_index(column)
+    at, i, j = point(symbols), symbols.row_names.index(row), symbols.column_names.index(column)
     width = 1e-6 * max(1.0, abs(at[j]))
     ends = []
     for sign in (1, -1):

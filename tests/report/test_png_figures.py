@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from yid_ocp.analysis.sparsity_patterns import NamedIndexRange, SparsityPattern
+from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
 from yid_ocp.errors import OutputError
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
 

@@ -12,7 +12,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.linearized_residual import is_stationary_point, predicted_cost_reduction
 from yid_ocp.problem.unknown_vector import soft_logarithm_and_slope
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.solvers.gauss_newton import _PATIENCE_STEPS
+from yid_ocp.solvers.gradient_methods import _PATIENCE_STEPS
 
 
 def with_weak_prior(target, std=0.1, start=3.0):

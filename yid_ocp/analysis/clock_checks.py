@@ -27,34 +27,31 @@ from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
 
+# From times on the joints' clock (N,) to places (N, np, 3) [m].
 PositionFunction = Callable[[Array], Array]
-"""From times on the joints' clock (N,) to places (N, np, 3) [m]."""
 
 _MIN_Z = 5.0  # standard deviations from which on a clock's error counts
+# No sensor takes longer for one sample: a slow camera knows when a frame was taken better than to its period [s].
 _MAX_EXPOSURE_TIME = 0.04
-"""No sensor takes longer for one sample: a slow camera knows when a frame was taken better than to its period [s]."""
 _N_TIME_BLOCKS = 10  # blocks of time whose errors count as independent of each other
 _MAX_DRIFT = 0.05  # part by which clocks that were meant to agree may run apart
 _DRIFT_SEARCH_STEP = 0.2  # how far clocks run apart between two drifts that are tried first [s]
 _N_RELINEARIZATIONS = 3  # so many times a fit is repeated at the times that the last one found
 _MIN_EXPLAINED_FRACTION = 0.5  # part of what a fit leaves beyond noise that a drift has to explain
+# Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not pass for a clock's.
 _FRAME_ERROR_STD, _ENCODER_ZERO_STD = 0.02, 0.02
-"""Usual errors of a frame [m, rad] and of an encoder's zero [rad], which must not pass for a clock's."""
 
 
 @dataclass(frozen=True)
 class _ClockError:
-    """Stamp minus true time [s] in the middle of a group, and the relative rate by which its clock runs faster.
-
-    `explained` is the fraction of the residual's squares above the noise level that both explain; NaN where none is.
-    """
+    """Stamp minus true time [s] in the middle of a group, and the relative rate by which its clock runs faster."""
 
     span: tuple[float, float]
     delay: float
     delay_std: float
     drift: float
     drift_std: float
-    explained: float
+    explained: float  # part of the residual's squares above noise that both explain; NaN where none is
 
     @property
     def whole_drift(self) -> float:
@@ -142,10 +139,8 @@ def check_robot_held_point_clock(
     if found.drifts_beyond(limit):
         yield _drift_issue(found, group.name, limit, severity)
     elif abs(late) > _MIN_Z * found.delay_std and abs(late) > limit:
-        words = (
-            f"{group.name} is stamped {1e3 * late:+.3g} ± {1e3 * found.delay_std:.2g} ms from the joints; "
-            f"{1e3 * limit:.3g} ms are in doubt anyway, as samples stand for a period"
-        )
+        words = f"{group.name} is stamped {1e3 * late:+.3g} ± {1e3 * found.delay_std:.2g} ms from the joints"
+        words = f"{words}; {1e3 * limit:.3g} ms are in doubt anyway, as samples stand for a period"
         camera = "camera" in f"{group.name} {group.sensor}".lower() or group.pose is not None
         setting = f"sensors.{group.name}.use: false"
         if camera and late > 0:
@@ -168,9 +163,6 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: Severit
 def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:
     """Advice on how to correct time stamps with an offset and a drift."""
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
-
-
-# -- clocks that are far apart ----------------------------------------------------------------------------------------
 
 
 def search_clock_offset_and_drift(
@@ -205,9 +197,6 @@ def search_clock_offset_and_drift(
         lambda x: min(error(x[0], x[1] / span), 1e300), [late, drift * span], method="Nelder-Mead"
     )
     return float(fine.x[0]), float(fine.x[1]) / span
-
-
-# -- residuals of a fit ------------------------------------------------------------------------------------------------
 
 
 def check_fit_residuals(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
@@ -290,10 +279,8 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
         own = (s for e in problem.episodes for s in e.measurements if s.sensor.group_name == group)
         usual = float(np.median(np.concatenate([s.std[s.used_output_mask] for s in own])))
         unit, least = units[group], QUALITY_LIMITS.max_overstatement_ratio
-        words = (
-            f"the fit leaves {seen * usual:.2g} {unit} of {group}, all slow errors counted; "
-            f"{usual:.2g} {unit} is stated"
-        )
+        leaves = f"the fit leaves {seen * usual:.2g} {unit} of {group}, all slow errors counted"
+        words = f"{leaves}; {usual:.2g} {unit} is stated"
         advice = "state the noise that is there: as stated every ± is too wide, and a small gap is not seen"
         setting = "" if problem.has_process_noise else f"sensors.{group}.std: {seen * usual:.2g}"
         severity = 1 / (least * max(seen, 1e-9))

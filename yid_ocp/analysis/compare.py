@@ -8,15 +8,14 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
 from yid_ocp.analysis.profile import with_profile_intervals
-from yid_ocp.arrays import Array
-from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
+from yid_ocp.inference.linearized_residual import step_within_unknown_sizes
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
@@ -57,31 +56,16 @@ class _MethodResult:
 
 @dataclass(frozen=True)
 class MethodComparison:
-    """Results of all methods on one problem, and where they disagree.
-
-    Attributes
-    ----------
-    reference_method : str
-        Method of the lowest cost, with which the others are compared.
-    has_process_noise : bool
-        Whether the problem has process noise, which the methods are compared without.
-    verdict_solution, verdict_held_out_predictions
-        Solution whose verdicts are reported, and its predictions: the reference's or, with process noise, that of a
-        method that models it.
-    disagreements : mapping of method to list of str
-        One sentence for each identifiable parameter on which the method differs, with the likely reason; empty where
-        it agrees.
-    explanations : tuple of str
-        Sentences on the estimates of unidentifiable parameters and, where the truth is known, on the parameters that
-        steepest descent left far from it.
-    """
+    """Results of all methods on one problem, and where they disagree."""
 
     method_results: tuple[_MethodResult, ...]
-    reference_method: str
-    has_process_noise: bool
+    reference_method: str  # of the lowest cost, with which the others are compared
+    has_process_noise: bool  # of the problem, which the methods are compared without
+    # solution whose verdicts are reported: the reference's or, with process noise, that of a method that models it
     verdict_solution: Solution
     verdict_held_out_predictions: list[tuple[Episode, EpisodePrediction | str]]
-    disagreements: Mapping[str, list[str]]
+    disagreements: Mapping[str, list[str]]  # a sentence for each identifiable parameter, with the reason
+    # on estimates of unidentifiable parameters, and on what steepest descent left far from a known truth
     explanations: tuple[str, ...]
 
     @property
@@ -101,15 +85,13 @@ def compare_methods(
 
     Steepest descent gets the paper's cost (points in metres, no noise levels, no weak prior), the others the problem's,
     without process noise, whose covariance not every method can carry. With process noise, the verdicts come from one
-    more run of a method that can.
-
-    `truth` are known parameter values; `callback` is called with the method's name and every `Iterate`; `limits` say
-    when a residual is more than noise.
+    more run of a method that can. `truth` are known parameter values; `callback` is called with the method's name and
+    every `Iterate`; `limits` say when a residual is more than noise.
     """
     runs, whole, problem = [], problem, problem_without_input_errors(problem)
 
     def listener(name: str) -> Callable[[Iterate], None] | None:
-        return None if callback is None else lambda entry: callback(name, entry)
+        return None if callback is None else partial(callback, name)
 
     for solver in solvers:
         own = problem
@@ -119,11 +101,9 @@ def compare_methods(
         with _Memory() as memory:
             told = listener(solver.name)
             solution = solve(own, solver, callback=told, limits=limits, restarts=not whole.has_process_noise)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        taken = time.perf_counter() - wall, time.process_time() - cpu, memory.peak
         cost = problem.evaluate(solution.x, derivatives=False).cost
-        runs.append(
-            _MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), wall, cpu, memory.peak)
-        )
+        runs.append(_MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), *taken))
     best = min(runs, key=lambda run: run.whitened_cost)
     if best.method != "steepest_descent":
         shown = replace(best, solution=with_profile_intervals(problem, best.solution))
@@ -226,16 +206,12 @@ class _Memory:
 def _resident() -> float:
     """Resident memory [MiB]; the peak so far where the system does not tell the present one."""
     status = Path("/proc/self/status")
-    if status.is_file():
-        for line in status.read_text(encoding="ascii", errors="replace").splitlines():
-            if line.startswith("VmRSS:"):
-                return float(line.split()[1]) / 1024.0
+    lines = status.read_text(encoding="ascii", errors="replace").splitlines() if status.is_file() else []
+    for line in (line for line in lines if line.startswith("VmRSS:")):
+        return float(line.split()[1]) / 1024.0
     import resource  # not on Windows
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024.0**2 if sys.platform == "darwin" else 1024.0)
-
-
-# -- a cable with and without memory ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -271,10 +247,8 @@ def decide_cable_memory(
         words = "memory is not kept: too few recordings start in motion to bear it out"
         return CableMemoryDecision(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
-    errors = (
-        "recordings that start in motion, each predicted from the others, have the root mean square error "
-        f"{kept:.3g} with it and {dropped:.3g} without, in standard deviations"
-    )
+    told = "recordings that start in motion, each predicted from the others, have the root mean square error"
+    errors = f"{told} {kept:.3g} with it and {dropped:.3g} without, in standard deviations"
     if kept < dropped:
         return CableMemoryDecision(problem, solution, f"memory is kept: {errors}")
     return CableMemoryDecision(without, other, f"memory is not kept: {errors}")
@@ -293,12 +267,9 @@ def _memory_parameters(problem: EstimationProblem) -> list[str]:
 
 def _moving(problem: EstimationProblem) -> list[int]:
     """Recordings that start in motion."""
-    return [
-        i
-        for i, episode in enumerate(problem.episodes)
-        if episode.fixed_initial_state is not None
-        and episode.fixed_initial_state.fitted_parameters.get(START_SPEED_PARAMETER_NAME, 0.0) > _MAX_REST_SPEED
-    ]
+    starts = [episode.fixed_initial_state for episode in problem.episodes]
+    speeds = [0.0 if s is None else s.fitted_parameters.get(START_SPEED_PARAMETER_NAME, 0.0) for s in starts]
+    return [i for i, speed in enumerate(speeds) if speed > _MAX_REST_SPEED]
 
 
 def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int]) -> float:
@@ -310,7 +281,10 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
     for i in moving:
         own = np.concatenate([np.arange(rows.start, rows.stop) for rows in problem.residual_rows.measurements[i]])
         kept = np.setdiff1d(np.arange(len(evaluation.residual)), own)
-        x = _stepped(problem, solution.x, evaluation.residual[kept], evaluation.jacobian[kept])
+        step = step_within_unknown_sizes(
+            problem, solution.x, evaluation.jacobian[kept], evaluation.residual[kept], 1e-10
+        )
+        x = np.clip(solution.x + step, *problem.bounds)
         found = problem.predictor.predict_episode(problem.episodes[i], *problem.split(x, i), False)
         if isinstance(found, str):
             return np.inf
@@ -318,15 +292,6 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
             total += float(np.sum(samples.whitened_residual(predicted) ** 2))
             count += samples.n_residuals
     return float(np.sqrt(total / max(count, 1)))
-
-
-def _stepped(problem: EstimationProblem, x: Array, residual: Array, jacobian: Array) -> Array:
-    """One Gauss-Newton step within the bounds, of at most the unknowns' size."""
-    lower, upper = problem.bounds
-    size = np.maximum(np.abs(x), problem.unknown_scales)
-    low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
-    step = bounded_levenberg_marquardt_step(jacobian * size, residual, 1e-10, low, high)
-    return np.asarray(np.clip(x + step * size, lower, upper))
 
 
 # -- the paper's estimates --------------------------------------------------------------------------------------------
@@ -378,16 +343,14 @@ def explain_paper_estimates(
     judged = {name: estimates[name] for name in _PAPER_PARAMETERS if name in estimates and estimates[name].free}
     if any(entry.verdict == "not_trusted" for entry in judged.values()):
         return ()
-    sentences = []
-    for name, entry in judged.items():
-        value = PAPER_ESTIMATES[experiment][name]
-        words = _discrepancy(experiment, name, value, entry, truth.get(name))
-        sentences.append(f"{name} = {value:.4g} of the paper: {words}")
-    return tuple(sentences)
+    words = {name: _discrepancy(experiment, name, entry, truth.get(name)) for name, entry in judged.items()}
+    return tuple(
+        f"{name} = {PAPER_ESTIMATES[experiment][name]:.4g} of the paper: {said}" for name, said in words.items()
+    )
 
 
-def _discrepancy(experiment: str, name: str, value: float, entry: ParameterEstimate, truth: float | None) -> str:
-    ensemble = _load_torque_ensemble()[experiment]
+def _discrepancy(experiment: str, name: str, entry: ParameterEstimate, truth: float | None) -> str:
+    value, ensemble = PAPER_ESTIMATES[experiment][name], _load_torque_ensemble()[experiment]
     stopped, offsets = ensemble["none"][name][0], ensemble["offsets"][name]
     interval = None if entry.verdict != "weak" or entry.interval in (None, (None, None)) else entry.interval
     if entry.verdict == "not_identifiable" or (entry.verdict != "identifiable" and _holds(entry, value)):
@@ -400,10 +363,8 @@ def _discrepancy(experiment: str, name: str, value: float, entry: ParameterEstim
         return f"near the truth of these recordings, {truth:.4g}" + (", which was chosen from it" if chosen else "")
     low, high = sorted((_DESCENT_INITIAL_VALUE, stopped))
     if truth is not None and not _near(stopped, truth) and (low <= value <= high or _near(value, stopped)):
-        return (
-            f"slow; without torque errors the paper's method goes from {_DESCENT_INITIAL_VALUE:.3g} to {stopped:.3g} "
-            f"in {_DESCENT_ITERATIONS} iterations"
-        )
+        goes = f"goes from {_DESCENT_INITIAL_VALUE:.3g} to {stopped:.3g} in {_DESCENT_ITERATIONS} iterations"
+        return f"slow; without torque errors the paper's method {goes}"
     many = f"{min(offsets):.3g} to {max(offsets):.3g} in {len(offsets)} twins"
     led = f"constant torque errors of {_TORQUE_BIAS_STD:g} N m lead the paper's method to {many}"
     if is_within_ensemble_range(value, offsets):

@@ -27,9 +27,9 @@ from yid_ocp.problem.unknown_vector import INITIAL_STATE_PREFIX
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."
 _NORMAL_QUANTILE_95 = 1.96
+# Distance to the limit of many links or short steps over the move of one halving, where the error falls as their size:
+# m + m/2 + m/4 + ... What falls faster has less to go.
 _EXTRAPOLATION_FACTOR = 2.0
-"""Distance to the limit of many links or short steps over the move of one halving, where the error falls as their size:
-m + m/2 + m/4 + ... What falls faster has less to go."""
 
 
 @dataclass(frozen=True)
@@ -42,22 +42,13 @@ class DiscretisationEstimateShift:
     links: float | None = None
     time_step: float | None = None
 
-    def _inflated_std(self, std: float) -> float:
-        """Standard deviation combined, in quadrature, with `_EXTRAPOLATION_FACTOR` times the shifts that exceed it."""
-        found = [move for move in (self.links, self.time_step) if move is not None and abs(move) > std]
-        return math.hypot(std, *(_EXTRAPOLATION_FACTOR * move for move in found)) if found else std
-
 
 @dataclass(frozen=True)
 class FinerDiscretisationProblem:
     """An estimation problem with a finer discretisation, and how its unknowns map to the coarse ones.
 
-    Attributes
-    ----------
-    parameter_factors : mapping of str to float
-        Factor from a coarse parameter to the same physical object in the finer model; 1 for absent names.
-    subdivided_joints : mapping of str to tuple of str
-        For each joint of a divided link, the fine joints that share its angle.
+    `parameter_factors` lead from a coarse parameter to the same physical object in the finer model, 1 for absent names;
+    `subdivided_joints` are, for each joint of a divided link, the fine joints that share its angle.
     """
 
     problem: EstimationProblem
@@ -65,7 +56,6 @@ class FinerDiscretisationProblem:
     subdivided_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def _factor(self, name: str) -> float:
-        """Coarse-to-fine factor of an unknown, whose name may include its recording."""
         return float(self.parameter_factors.get(name.split("[")[0], 1.0))
 
     def _unknowns(self, names: Sequence[str], x: Array) -> Array:
@@ -149,7 +139,8 @@ def inflate_estimates_by_discretisation(
     counted, ranks = dict(estimates), ("identifiable", "weak", "not_identifiable")
     for name, own in found.items():
         entry = counted[name]
-        std = own._inflated_std(entry.std)
+        shifts = [move for move in (own.links, own.time_step) if move is not None and abs(move) > entry.std]
+        std = math.hypot(entry.std, *(_EXTRAPOLATION_FACTOR * move for move in shifts))
         if not entry.free or not std > entry.std:
             continue
         verdict, said = entry.verdict, verdict_by_relative_std(entry.value, std, sizes.get(name, 0.0))
@@ -172,14 +163,13 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 class NaturalFrequencies:
     """Natural frequencies of one step map about an equilibrium, its robot held still.
 
-    The frequencies (k,) are undamped and ascending [Hz]; unstable modes are damped ones that still grow from step to
-    step: the equilibrium is unstable, or the time step is too long for the tension that the grasps put on the object.
-    The message says why there are no frequencies.
+    Unstable modes are damped ones that still grow from step to step: the equilibrium is unstable, or the time step is
+    too long for the tension that the grasps put on the object.
     """
 
-    frequencies_hz: Array
+    frequencies_hz: Array  # undamped, ascending, shape (k,)
     n_unstable_modes: int = 0
-    message: str = ""
+    message: str = ""  # why there are no frequencies
 
 
 def step_map_natural_frequencies(
@@ -198,9 +188,8 @@ def step_map_natural_frequencies(
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
-        return NaturalFrequencies(
-            np.zeros(0), message="every coordinate is driven or prescribed: with these held still nothing can swing"
-        )
+        held = "every coordinate is driven or prescribed: with these held still nothing can swing"
+        return NaturalFrequencies(np.zeros(0), message=held)
     step = compile_step(still, time_step, force_split, constraint_force, use_compiler=False)
     known = np.array([posture[name] for name in still.prescribed])
     rest = EquilibriumSolver(step).solve(known, theta, guess=guess)
@@ -265,11 +254,10 @@ def min_grasp_closure_errors(system: System, posture: Mapping[str, float], theta
     return {grasp.name: float(distance) for grasp, distance in zip(system.grasps, distances, strict=True)}
 
 
+# Nodes at which the linearised step is looked at: of all motions together, and of one at least.
 _N_CHECKED_NODES, _MIN_CHECKED_NODES = 24, 4
-"""Nodes at which the linearised step is looked at: of all motions together, and of one at least."""
-
+# Powers of ten by which an alternating error may grow: from the rounding of a step (1e-12) to what no sensor sees.
 _MAX_GROWTH_DECADES = 6.0
-"""Powers of ten by which an alternating error may grow: from the rounding of a step (1e-12) to what no sensor sees."""
 
 
 @dataclass(frozen=True)
@@ -279,15 +267,12 @@ class AlternatingErrorGrowth:
     What a body does by itself goes on in one direction for several steps; a mode of the linearised step whose
     eigenvalue has a negative real part turns back at every step, and is the method's own. Where its magnitude exceeds
     one, the equations no longer follow the body, however well Newton solves them.
-
-    `growth_decades` are the powers of ten by which such an error grows over the stretch on which it grows most,
-    `max_step_factor` is the largest growth in one step, at `max_growth_time` from the start of the motion [s].
     """
 
     recording_name: str
-    growth_decades: float
-    max_step_factor: float
-    max_growth_time: float
+    growth_decades: float  # powers of ten, over the stretch on which it grows most
+    max_step_factor: float  # largest growth in one step
+    max_growth_time: float  # of that, from the start of the motion [s]
     time_step: float
 
     @property
@@ -302,10 +287,8 @@ class AlternatingErrorGrowth:
         if self.is_stable:
             return f"{step} stable along the motion"
         grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % in a step at {self.max_growth_time:.3g} s"
-        return (
-            f"{step} not stable: an error that alternates from step to step {grows}; "
-            f"take a shorter problem.time_step ({self.time_step / 2:g} s, say)"
-        )
+        remedy = f"take a shorter problem.time_step ({self.time_step / 2:g} s, say)"
+        return f"{step} not stable: an error that alternates from step to step {grows}; {remedy}"
 
 
 def _error_growth_along(
@@ -314,8 +297,7 @@ def _error_growth_along(
     """Growth of alternating errors along a rollout, up to its first failed step or singular derivatives.
 
     The eigenvalues of A_k - B_k K_k are taken at some nodes (A_k by the implicit function theorem, so that the
-    constraints are in it), their largest alternating magnitude counts for the steps in between in its logarithm, and
-    the stretch of the largest sum is what grows.
+    constraints are in it); the largest alternating magnitude counts for the steps in between in its logarithm.
     """
     failed = np.flatnonzero(~np.isfinite(rollout.state).all(axis=1))
     steps = (int(failed[0]) if len(failed) else len(rollout.state)) - 1

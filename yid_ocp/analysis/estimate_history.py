@@ -20,32 +20,23 @@ from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.inference.null_test import chi2_p_value
 
-_MIN_CORRELATION_EIGENVALUE = 1e-12
-"""Smallest eigenvalue of a correlation matrix; what is known better than that follows from rounding."""
+_MIN_CORRELATION_EIGENVALUE = 1e-12  # what is known better than that follows from rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RunEstimates(ReprMixin):
-    """Estimates of parameters from one run, with their covariance.
+    """Estimates of n parameters from one run, with their covariance.
 
-    Attributes
-    ----------
-    parameter_names : tuple of str, length n
-    values : ndarray, shape (n,)
-    covariance : ndarray, shape (n, n)
-    is_fit_adequate : bool
-        Whether the model explains the run's recordings; where not, the covariance includes the misfit.
-    effects : mapping of label to mapping of quantity to value
-        Effects that the run's model had beyond the nominal one, as `kind@location`.
+    Where a fit is not adequate, the model does not explain the run's recordings; the covariance includes the misfit.
     """
 
     run_name: str
     parameter_names: tuple[str, ...]
-    values: Array
-    covariance: Array
+    values: Array  # shape (n,)
+    covariance: Array  # shape (n, n)
     units: Mapping[str, str] = field(default_factory=dict)
     is_fit_adequate: bool = True
-    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by label `kind@location`
 
     def _summary(self) -> ReprSummary:
         rows = [("parameter", "value", "unit")]
@@ -68,10 +59,7 @@ class RunEstimates(ReprMixin):
 
 @dataclass(frozen=True)
 class _ParameterDrift:
-    """Test whether one parameter has the same value in all runs that have it: pooled mean, chi2 of the differences.
-
-    It has drifted where p is below the requested level, Bonferroni-corrected for the number of parameters.
-    """
+    """Test whether one parameter has the same value in all runs that have it: pooled mean, chi2 of the differences."""
 
     name: str
     unit: str
@@ -82,23 +70,20 @@ class _ParameterDrift:
     mean_std: float
     chi2: float
     p_value: float
-    has_drifted: bool
+    has_drifted: bool  # p is below the requested level, Bonferroni-corrected for the number of parameters
 
 
 @dataclass(frozen=True)
 class RunConsistency:
-    """Test of one run against the pooled estimates of all others; its parameter that differs most is the worst.
-
-    It is an outlier where it alone disagrees with the others, which agree without it.
-    """
+    """Test of one run against the pooled estimates of all others."""
 
     run_name: str
     chi2: float
     degrees_of_freedom: int
     p_value: float
-    worst_parameter: str
+    worst_parameter: str  # that differs most
     is_fit_adequate: bool
-    is_outlier: bool
+    is_outlier: bool  # it alone disagrees with the others, which agree without it
 
 
 @dataclass(frozen=True)
@@ -170,11 +155,9 @@ def assess_drift(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateH
 def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterDrift:
     own = [run._only((name,)) for run in runs if name in run.parameter_names]
     mean, chi2, degrees = pool_estimates(own)
-    p = chi2_p_value(chi2, degrees)
-    values, std = (
-        tuple(float(x[0]) for x in part) for part in zip(*((run.values, run.std) for run in own), strict=True)
-    )
-    pooled, places = (float(mean.values[0]), float(mean.std[0])), tuple(run.run_name for run in own)
+    p, places = chi2_p_value(chi2, degrees), tuple(run.run_name for run in own)
+    values, std = tuple(float(run.values[0]) for run in own), tuple(float(run.std[0]) for run in own)
+    pooled = float(mean.values[0]), float(mean.std[0])
     return _ParameterDrift(name, mean.units.get(name, ""), places, values, std, *pooled, chi2, p, p < level)
 
 

@@ -48,26 +48,23 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 @dataclass(frozen=True)
 class FrameObservationSchedule:
-    """Times (M,) since a recording's start [s] and standard deviations (M, 3) [m] of one frame measured by a group."""
+    """Times and standard deviations of one frame measured by a group."""
 
     point_group: str
     frame: str
-    times: Array
-    std: Array
+    times: Array  # since the recording's start, shape (M,) [s]
+    std: Array  # shape (M, 3) [m]
 
 
 @dataclass(frozen=True)
 class RecordedExperiment:
-    """The recorded experiment, and what its variants may use.
-
-    The information is evaluated at the unknowns `x` (nx,); `two_arm_system` has a second arm and its grasp.
-    """
+    """The recorded experiment, and what its variants may use."""
 
     problem: EstimationProblem
-    x: Array
+    x: Array  # unknowns at which the information is evaluated, shape (nx,)
     initial_state_knowledge: InitialStateKnowledge = "assumed"
     grasp_offset_prior_std: float | None = None
-    two_arm_system: System | None = None
+    two_arm_system: System | None = None  # with a second arm and its grasp
 
     @property
     def parameter_values(self) -> dict[str, float]:
@@ -126,9 +123,6 @@ def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
     return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
 
 
-# -- what could be seen -----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _ObservableFrame:
     """A frame that a camera, or also an arm, could measure; `added_frame` where it must be added to the mechanism."""
@@ -179,35 +173,22 @@ def add_observable_frames_to_step(step: Step) -> tuple[Step, list[_ObservableFra
     return replace(step, model=replace(step.model, system=system)), seen
 
 
-# -- layouts ----------------------------------------------------------------------------------------------------------
-
-
 @dataclass
 class CandidateExperiment:
     """One variant of an experiment, with the sensitivities of all frames that could be measured.
 
-    Attributes
-    ----------
-    problem : EstimationProblem
-        With nuisances, and with every measurable frame observed at every node.
-    position_sensitivities : mapping of (episode, group, frame) to ndarray, shape (N + 1, 3, nx + q)
-        Sensitivity of a frame's position at every node by the unknowns, then by what stands for the errors of the
-        torques that drive this episode (`episode_sensitivities_and_information`).
-    prior_information : ndarray, shape (nx, nx)
-        Fisher information of the priors of nuisances.
-    joint_information : mapping of episode to ndarray, shape (nx + q, nx + q)
-        Fisher information of measured torques or angles, and of the prior of the torque errors.
-    feasibility_notes : tuple of str
-        Obstacles on a real robot, such as joint limits.
+    Sensitivities of a frame's position at every node, by (episode, group, frame), are by the unknowns, then by the q
+    that stand for the errors of the torques that drive this episode (`episode_sensitivities_and_information`).
     """
 
-    problem: EstimationProblem
+    problem: EstimationProblem  # with nuisances, and every measurable frame observed at every node
     x: Array
     free_parameters: tuple[str, ...]
-    position_sensitivities: Mapping[tuple[int, str, str], Array]
-    prior_information: Array
+    position_sensitivities: Mapping[tuple[int, str, str], Array]  # shape (N + 1, 3, nx + q)
+    prior_information: Array  # of nuisances, shape (nx, nx)
+    # by episode: of measured torques or angles, and of the prior of the torque errors, shape (nx + q, nx + q)
     joint_information: Mapping[int, Array] = field(default_factory=dict)
-    feasibility_notes: tuple[str, ...] = ()
+    feasibility_notes: tuple[str, ...] = ()  # obstacles on a real robot, such as joint limits
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
     def fisher_information(self, views: Sequence[Sequence[FrameObservationSchedule]]) -> Array:
@@ -256,15 +237,14 @@ class CandidateExperimentBuilder:
 
     def build_experiment(self, mechanics: frozenset[str]) -> CandidateExperiment | str:
         """The experiment with a set of mechanical changes, or a message why it cannot be built."""
-        if mechanics in self._layouts:
-            return self._layouts[mechanics]
-        if mechanics:
-            words = " and ".join(MECHANICAL_EXPERIMENT_CHANGES[name] for name in sorted(mechanics))
-            self._progress.begin_stage(f"working out {words}")
-        try:
-            self._layouts[mechanics] = self._build(mechanics)
-        except YidError as error:
-            self._layouts[mechanics] = error.what
+        if mechanics not in self._layouts:
+            if mechanics:
+                words = " and ".join(MECHANICAL_EXPERIMENT_CHANGES[name] for name in sorted(mechanics))
+                self._progress.begin_stage(f"working out {words}")
+            try:
+                self._layouts[mechanics] = self._build(mechanics)
+            except YidError as error:
+                self._layouts[mechanics] = error.what
         return self._layouts[mechanics]
 
     def applicable_mechanical_changes(self) -> list[str]:
@@ -346,27 +326,25 @@ class CandidateExperimentBuilder:
             return None
         sensors = dict(problem.options.sensors)
         sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
-        recordings = [
-            replace(e.recording, points=tuple(group for group in e.recording.points if not is_measured_by_arm(group)))
-            for e in problem.episodes
-        ]
+        recordings = []
+        for recording in (episode.recording for episode in problem.episodes):
+            seen = tuple(group for group in recording.points if not is_measured_by_arm(group))
+            recordings.append(replace(recording, points=seen))
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         options = replace(problem.options, sensors=sensors)
         return EstimationProblem(problem.step, recordings, problem.free, options, values)
 
     def _experiment(self, mechanics: frozenset[str]) -> tuple[System, list[Recording], list[str]]:
         """System and motion, driven as in the recordings."""
-        setting = self.setting
-        base = setting.problem
-        recordings = [self._cut(episode) for episode in self._corrected.episodes]
+        base = self.setting.problem
         system = base.system
         if "second_arm" in mechanics:
-            assert setting.two_arm_system is not None
-            system = setting.two_arm_system
+            assert self.setting.two_arm_system is not None
+            system = self.setting.two_arm_system
         if "weld" in mechanics:
             system = self._welded(system, mechanics - {"weld", "torque", "motion", "travel"})
         if not mechanics & {"motion", "travel", "second_arm"}:
-            return system, recordings, []
+            return system, [self._cut(episode) for episode in self._corrected.episodes], []
         made: list[Recording] = []
         notes: list[str] = []
         for i, episode in enumerate(base.episodes):
@@ -434,9 +412,7 @@ class CandidateExperimentBuilder:
         joints = JointGroup(system.driven, run.t, q, effort=run.effort, effort_kind="command")
         joints = replace(joints, position_std=noise[0], effort_std=noise[1], effort_bias_std=noise[2])
         limits = [system.mechanism.joints[i] for i in driven]
-        low, high, most = (
-            np.array([getattr(joint, f"{name}_limit") for joint in limits]) for name in ("lower", "upper", "effort")
-        )
+        low, high, most = np.array([(joint.lower_limit, joint.upper_limit, joint.effort_limit) for joint in limits]).T
         beyond = {"range": (q.min(0) < low) | (q.max(0) > high), "torque": np.abs(run.effort).max(0) > most}
         names = {what: ", ".join(np.array(system.driven)[over]) for what, over in beyond.items() if over.any()}
         notes = [f"beyond the {what} of {joints_beyond}" for what, joints_beyond in names.items()]

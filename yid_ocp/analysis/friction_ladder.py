@@ -14,7 +14,6 @@ from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.system import MidpointState
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.prediction_errors import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles
 from yid_ocp.problem.signal_filters import LowPassFilter
@@ -29,17 +28,12 @@ _MAX_CLOUD_POINTS = 1500
 class FrictionLawFit:
     """One law fitted to all recordings, and its errors on those left out in turn.
 
-    Attributes
-    ----------
-    parameters : mapping of str to ParameterEstimate
-        Of the fit to all recordings.
-    left_out_errors : mapping of recording to float
-        Root mean square error of each recording, predicted by a fit without its kind of motion; NaN where that failed.
-        In the channels' unit, or in standard deviations where units differ.
+    Each recording's root mean square error is that of a prediction by a fit without its kind of motion; NaN where that
+    failed. It is in the channels' unit, or in standard deviations where units differ.
     """
 
     law: str
-    parameters: Mapping[str, ParameterEstimate]
+    parameters: Mapping[str, ParameterEstimate]  # of the fit to all recordings
     left_out_errors: Mapping[str, float]
     unit: str
     is_converged: bool
@@ -47,7 +41,9 @@ class FrictionLawFit:
 
 def motion_kinds(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
     """Recordings by kind of motion: names up to a number, or each by itself; without those whose motors are off."""
-    names = [e.name for e in problem.episodes if not _is_motor_off(problem, e)]
+    joints = {e.name: e.recording.joints for e in problem.episodes}
+    commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
+    names = [name for name in joints if not problem.system.servos or name in commanded]
     found: dict[str, list[str]] = {}
     for name in names:
         found.setdefault(re.sub(r"[_-]?\d+$", "", name), []).append(name)
@@ -56,31 +52,20 @@ def motion_kinds(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
     return {kind: tuple(own) for kind, own in found.items()}
 
 
-def _is_motor_off(problem: EstimationProblem, episode: Episode) -> bool:
-    joints = episode.recording.joints
-    return bool(problem.system.servos) and (joints is None or joints.position_command is None)
-
-
 def fit_friction_law(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> FrictionLawFit:
     """Errors of a law on every kind of motion left out in turn, each fit begun at the fit to all recordings.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-        On all recordings, with the law in its model.
-    solution : Solution
-        Of `problem`.
+    The `solution` is that of `problem`, which is on all recordings, with the law in its model.
     """
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
+    pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
     for own in kinds.values():
-        inside = [(e, f) for e, f in zip(problem.episodes, problem.whitening_filters, strict=True) if e.name not in own]
-        outside = [(e, f) for e, f in zip(problem.episodes, problem.whitening_filters, strict=True) if e.name in own]
-        (episodes, filters), (left, left_filters) = (zip(*pairs, strict=True) for pairs in (inside, outside))
+        inside, outside = ([pair for pair in pairs if (pair[0].name in own) == out] for out in (False, True))
+        (episodes, filters), (left, left_filters) = zip(*inside, strict=True), zip(*outside, strict=True)
         fold = problem.with_episodes(episodes, left, filters, left_filters)
-        known = problem.named_values(solution.x)
         start = fold.vector({name: known[name] for name in fold.unknown_names})
         found = GaussNewton(max_iterations=_MAX_FOLD_ITERATIONS).minimize_cost(fold, start, None)
         for episode, outcome in fold.predict_held_out(found.x):
@@ -105,8 +90,6 @@ def mean_and_standard_error(errors: Mapping[str, float], kinds: Mapping[str, Seq
 def warranted_law(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
     """The first law of the ladder whose error is within one standard error of the least one's.
 
-    References
-    ----------
     Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, section 7.10,
     doi:10.1007/978-0-387-84858-7.
     """
@@ -117,20 +100,13 @@ def warranted_law(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[s
 
 @dataclass(frozen=True)
 class FrictionTorqueCloud:
-    """Friction torque of one joint over a recording's measured motion.
-
-    Attributes
-    ----------
-    speed, load, measured, predicted : ndarray, shape (M,)
-        Joint speed [rad/s]; motor torque less that from outside [N m]; the torque against the motion that the model
-        without friction lacks; that of the fitted law [N m].
-    """
+    """Friction torque of one joint at M points of the recordings' measured motion."""
 
     joint: str
-    speed: Array
-    load: Array
-    measured: Array
-    predicted: Array
+    speed: Array  # shape (M,) [rad/s]
+    load: Array  # motor torque less that from outside, shape (M,) [N m]
+    measured: Array  # against the motion, that the model without friction lacks, shape (M,) [N m]
+    predicted: Array  # that of the fitted law, shape (M,) [N m]
 
 
 def friction_torque_clouds(

@@ -65,77 +65,45 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # by which a combination may move the data, of 
 class ParameterIdentifiability:
     """Uncertainty and verdict of one parameter, in `unit`.
 
-    Attributes
-    ----------
-    std : float
-        Standard deviation with all other unknowns free; infinite where nothing informs it.
-    std_relative : float
-        `std` divided by the value, or by its typical size where the value is zero.
-    std_alone : float
-        Relative standard deviation if all other unknowns were known.
-    verdict : str
-        That of a solution at the same point (`inference.uncertainty.parameter_verdict`), consistent with the interval.
-    interval : (float or None, float or None), or None
-        95 % interval by profile likelihood about the best fit of all unknowns, None for an open end; None as a whole
-        where not requested.
+    The verdict is that of a solution at the same point (`inference.uncertainty.parameter_verdict`), consistent with the
+    95 % interval by profile likelihood about the best fit of all unknowns; this is None where not requested.
     """
 
     value: float
     unit: str
-    std: float
-    std_relative: float
-    std_alone: float
+    std: float  # with all other unknowns free; infinite where nothing informs it
+    std_relative: float  # divided by the value, or by its typical size where that is zero
+    std_alone: float  # relative standard deviation if all other unknowns were known
     verdict: str
-    interval: tuple[float | None, float | None] | None = None
+    interval: tuple[float | None, float | None] | None = None  # None for an open end
 
 
 @dataclass(frozen=True)
 class _ParameterDirection:
     """A direction of relative parameter changes and its uncertainty, with limits of the verdict as for a parameter.
 
-    Attributes
-    ----------
-    singular_value : float
-        Of the whitened sensitivity to relative changes, nuisances eliminated: standard deviations of the data per
-        unit change; `std_relative` is its reciprocal.
-    components : mapping of parameter to float
-        The direction, of unit length.
+    The singular value is that of the whitened sensitivity to relative changes, nuisances eliminated: standard
+    deviations of the data per unit change.
     """
 
     singular_value: float
-    std_relative: float
-    components: Mapping[str, float]
+    std_relative: float  # reciprocal of the singular value
+    components: Mapping[str, float]  # the direction by parameter, of unit length
     verdict: str
     words: str
 
 
 @dataclass(frozen=True, repr=False)
 class IdentifiabilityResult(ReprMixin):
-    """Identifiability of the free parameters from a set of recordings.
-
-    Attributes
-    ----------
-    parameter_names : tuple of str, length p
-        In the order of the matrices.
-    correlations : ndarray, shape (p, p)
-        NaN in rows of parameters that nothing informs.
-    fisher_information : ndarray, shape (p, p)
-        Of relative changes, nuisances eliminated.
-    directions : tuple of _ParameterDirection
-        Least observable first.
-    nuisance_names : tuple of str
-        Further unknowns, estimated together with the parameters.
-    chi2_per_dof : float
-        At the evaluated point; at a fit, standard deviations are scaled by its square root where it exceeds one.
-    """
+    """Identifiability of the p free parameters from a set of recordings."""
 
     parameters: Mapping[str, ParameterIdentifiability]
-    parameter_names: tuple[str, ...]
-    correlations: Array
-    fisher_information: Array
-    directions: tuple[_ParameterDirection, ...]
-    nuisance_names: tuple[str, ...]
-    chi2_per_dof: float
+    parameter_names: tuple[str, ...]  # in the order of the matrices
+    correlations: Array  # shape (p, p), NaN in rows of parameters that nothing informs
+    fisher_information: Array  # of relative changes, nuisances eliminated, shape (p, p)
+    directions: tuple[_ParameterDirection, ...]  # least observable first
+    nuisance_names: tuple[str, ...]  # further unknowns, estimated together with the parameters
+    chi2_per_dof: float  # at the point; above one, its root scales standard deviations at a fit
     profiles: Mapping[str, ParameterProfileLikelihood] = field(default_factory=dict)
 
     def _summary(self) -> ReprSummary:
@@ -165,7 +133,8 @@ def identifiability(
     """Fisher-information analysis of which free parameters the problem's recordings determine.
 
     The Fisher information of independent Gaussian noise is I = J' J, J = d r/d x the whitened sensitivities; the
-    standard deviation of one unknown is the root of the diagonal of its inverse, with all nuisances in it.
+    standard deviation of one unknown is the root of the diagonal of its inverse, with all nuisances in it (Ljung 1999,
+    System Identification, section 7.4; Raue et al. 2009, Bioinformatics 25:1923, doi:10.1093/bioinformatics/btp358).
 
     Parameters
     ----------
@@ -188,11 +157,6 @@ def identifiability(
         The model cannot be rolled out at the point.
     ConfigError
         An interval is wanted of what is not a free parameter.
-
-    References
-    ----------
-    Ljung (1999), System Identification, section 7.4; Raue et al. (2009), Bioinformatics 25:1923,
-    doi:10.1093/bioinformatics/btp358.
     """
     names = parameter_unknown_names(problem)
     wanted = names if intervals == "all" else tuple(intervals)
@@ -228,9 +192,8 @@ def identifiability(
     parameters = {}
     for name, value, scale, alone in zip(names, x[view.chosen], view.scale, view.alone, strict=True):
         entry, relative = judged[name], 1.0 / float(alone) if alone > 0 else math.inf
-        parameters[name] = ParameterIdentifiability(
-            float(value), view.unit(name), entry.std, entry.std / float(scale), relative, entry.verdict, entry.interval
-        )
+        sizes = entry.std, entry.std / float(scale), relative
+        parameters[name] = ParameterIdentifiability(float(value), entry.unit, *sizes, entry.verdict, entry.interval)
     return IdentifiabilityResult(parameters, names, correlations, information, directions, nuisances, chi2, profiles)
 
 
@@ -250,9 +213,6 @@ def _profiles(
     pairs = map_parameters_at_optimum(one, problem, view.x, wanted, progress)
     judged.update({name: said for name, (_, said) in pairs.items()})
     return {name: profile for name, (profile, _) in pairs.items()}
-
-
-# -- nuisances --------------------------------------------------------------------------------------------------------
 
 
 def with_grasp_offset_effects(system: System) -> System:
@@ -284,13 +244,12 @@ def with_nuisance_unknowns(
     problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
     """The problem with initial states, where `start` is "unknown", and grasp offsets (prior in m) as unknowns."""
-    options = problem.options
+    options, grasps, priors = problem.options, [], dict(problem.options.prior_stds)
     initial = "estimated" if start == "unknown" else options.initial_state
-    grasps = [
-        entry.name
-        for entry in problem.system.parameters
-        if grasp_std is not None and entry.name.startswith(_GRASP_OFFSET_PREFIX) and entry.name not in problem.free
-    ]
+    if grasp_std is not None:
+        fixed = (name for name in problem.system.parameters.names if name not in problem.free)
+        grasps = [name for name in fixed if name.startswith(_GRASP_OFFSET_PREFIX)]
+        priors |= dict.fromkeys(grasps, float(grasp_std))
     if initial == options.initial_state and not grasps:
         return problem
     known = dict(options.known_initial_states)
@@ -301,7 +260,6 @@ def with_nuisance_unknowns(
             if episode.name not in known and episode.fixed_initial_state is not None:
                 known[episode.name] = episode.fixed_initial_state.state
                 values.setdefault(episode.name, {}).update(episode.fixed_initial_state.fitted_parameters)
-    priors = dict(options.prior_stds) | {name: float(grasp_std) for name in grasps if grasp_std is not None}
     changed = replace(
         options, initial_state=initial, known_initial_states=known, parameters_by_recording=values, prior_stds=priors
     )
@@ -317,16 +275,9 @@ def transfer_unknowns_by_name(x: Array, names: Sequence[str], other: EstimationP
     return np.array([known.get(name, initial) for name, initial in own])
 
 
-# -- sensitivities ----------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Sensitivities:
-    """What the sensors see of the named parameters at one point.
-
-    `by_alone` is the whitened sensitivity (nr, p) to relative changes with everything else known, `relative` that with
-    nuisances eliminated, `nuisance` that of all other unknowns in their scales.
-    """
+    """What the sensors see of the named parameters at one point."""
 
     problem: EstimationProblem
     x: Array
@@ -335,9 +286,9 @@ class _Sensitivities:
     chosen: IntArray
     scale: Array
     inflation: float
-    by_alone: Array
-    relative: Array
-    nuisance: Array
+    by_alone: Array  # whitened, of relative changes with everything else known, shape (nr, p)
+    relative: Array  # the same with nuisances eliminated
+    nuisance: Array  # of all other unknowns in their scales
 
     @staticmethod
     def of(
@@ -389,10 +340,7 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, 
     relative, count = view.relative, len(view.names)
     hidden = view.alone * MAX_WEAK_RELATIVE_STD < 1.0
     found = [
-        _direction(
-            view, float(np.linalg.norm(relative[:, i])), np.eye(count)[i], f"{view.names[i]} is not seen by any sensor"
-        )
-        for i in np.flatnonzero(hidden)
+        _direction(view, np.eye(count)[i], f"{view.names[i]} is not seen by any sensor") for i in np.flatnonzero(hidden)
     ]
     rest = np.flatnonzero(~hidden)
     if len(rest):
@@ -404,27 +352,22 @@ def _directions(view: _Sensitivities, std: Array) -> tuple[_ParameterDirection, 
             # an orthonormal basis of what the seen directions leave
             seen, left = wide[~blind][:, rest], np.zeros((int(blind.sum()), count))
             left[:, rest] = np.linalg.svd(np.eye(len(rest)) - seen.T @ seen)[0][:, : len(left)].T
-            for vector in _sparse_basis(left):
-                found.append(
-                    _direction(view, float(np.linalg.norm(relative @ vector)), vector, _unseen_words(view, vector))
-                )
+            found += [_direction(view, vector, _unseen_words(view, vector)) for vector in _sparse_basis(left)]
         for size, vector in zip(sizes[~blind], wide[~blind], strict=True):
-            found.append(_direction(view, float(size), vector, _seen_words(view, float(size), vector, std)))
+            found.append(_direction(view, vector, _seen_words(view, float(size), vector, std)))
     return tuple(sorted(found, key=lambda entry: entry.singular_value))
 
 
-def _direction(view: _Sensitivities, size: float, vector: Array, words: str) -> _ParameterDirection:
+def _direction(view: _Sensitivities, vector: Array, words: str) -> _ParameterDirection:
     vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
+    size = float(np.linalg.norm(view.relative @ vector))
     std = 1.0 / size if size > 0 else math.inf
     components = dict(zip(view.names, map(float, vector), strict=True))
     return _ParameterDirection(size, std, components, parameter_verdict(1.0, std), words)
 
 
 def _sparse_basis(vectors: Array) -> list[Array]:
-    """Sparse basis, of unit vectors, of the space spanned by row vectors (d, p).
-
-    Row echelon form with complete pivoting: as many components as there are vectors stand in one vector only.
-    """
+    """Sparse basis of unit vectors of the space spanned by row vectors (d, p): row echelon form, complete pivoting."""
     rows, open_columns = vectors.copy(), list(range(vectors.shape[1]))
     for i in range(len(rows)):
         block = np.abs(rows[i:][:, open_columns])
@@ -438,9 +381,6 @@ def _sparse_basis(vectors: Array) -> list[Array]:
     return [row / np.linalg.norm(row) for row in rows]
 
 
-# -- words ------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Component:
     """One parameter's coefficient in a direction of relative parameter changes, with its value and unit."""
@@ -451,15 +391,11 @@ class _Component:
     unit: str
 
 
+_SERIES = "1/{a} + 1/{b}, as springs in series are"
 # what may be seen of a and b: words, slope of a relative change that leaves it, b that does with a new a, like units
 _Combination = tuple[str, Callable[[float, float], tuple[float, float]], Callable[[float, float, float], float], bool]
 _COMBINATIONS: tuple[_Combination, ...] = (
-    (
-        "1/{a} + 1/{b}, as springs in series are",
-        lambda a, b: (a, -b),
-        lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n),
-        True,
-    ),
+    (_SERIES, lambda a, b: (a, -b), lambda a, b, n: 1 / (1 / a + 1 / b - 1 / n), True),
     ("{a} + {b}, as springs side by side are", lambda a, b: (b, -a), lambda a, b, n: a + b - n, True),
     ("the ratio {a} / {b}", lambda a, b: (1.0, 1.0), lambda a, b, n: b * n / a, False),
     ("the product {a} x {b}", lambda a, b: (1.0, -1.0), lambda a, b, n: b * a / n, False),

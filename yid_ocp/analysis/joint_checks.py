@@ -25,14 +25,12 @@ from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import expand_to_joint_values
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 
-_ANGLE_LIMIT_MARGIN = 0.1
-"""How far angles may be beyond a joint's limits, where a robot's own model differs from its URDF [rad or m]."""
+_ANGLE_LIMIT_MARGIN = 0.1  # beyond a joint's limits, where a robot's own model differs from its URDF [rad or m]
 _MAX_SPEED_RATIO = 1.5  # factor by which joints may turn faster than the URDF says that they can
 _SPEED_SAMPLE_STRIDE = 5  # samples over which a speed is taken, so that neither noise nor steps of encoders count
 _MOTION_BANDWIDTH_HZ = 5.0  # where motion of a robot's arm ends; what is faster is left out [Hz]
 _MAX_MOTION_SAMPLES = 300  # about so many samples of a motion are looked at
-_VISCOUS_FRICTION_FRACTION = 0.04
-"""Usual viscous friction beside a joint's largest effort [per rad/s]."""
+_VISCOUS_FRICTION_FRACTION = 0.04  # usual viscous friction beside a joint's largest effort [per rad/s]
 _MIN_SIGNAL_STDS = 5.0  # standard deviations from which on a signal counts as seen, all samples and joints together
 
 
@@ -59,7 +57,7 @@ class RecordedJointsModel:
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """The joints, in the order of `joint_names`."""
+        """In the order of `joint_names`."""
         mechanism = self.system.mechanism
         return tuple(mechanism.joints[mechanism.joint_index(name)] for name in self.joint_names)
 
@@ -70,10 +68,8 @@ class RecordedJointsModel:
 
     def is_frame_determined_by_angles(self, frame: str) -> bool:
         """Whether a frame's position follows from the recorded angles alone."""
-        mechanism = self.system.mechanism
-        return set(mechanism.ancestor_joint_indices(mechanism.frame(frame).joint_index)) <= set(
-            self.joint_configuration_indices
-        )
+        tree = self.system.mechanism
+        return {*tree.ancestor_joint_indices(tree.frame(frame).joint_index)} <= {*self.joint_configuration_indices}
 
     @cached_property
     def _has_no_unknown_descendants(self) -> bool:
@@ -133,10 +129,10 @@ class RecordedJointsModel:
 
 @dataclass(frozen=True)
 class _SmoothedMotion:
-    """Smoothed recorded motion at times t (N,): q, v, a and the effort [N m], each (N, k); both ends are left out."""
+    """Smoothed recorded motion at N times; both ends are left out."""
 
-    t: Array
-    q: Array
+    t: Array  # shape (N,) [s]
+    q: Array  # shape (N, k), as `v`, `a` and the effort [N m]
     v: Array
     a: Array
     effort: Array | None
@@ -210,9 +206,6 @@ def known_effect_config_line(kind: str, location: str, quantity: str, value: flo
     return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"
 
 
-# -- excitation --------------------------------------------------------------------------------------------------------
-
-
 def check_inertial_effort_excitation(
     arm: RecordedJointsModel, recording: Recording, effort: SensorOptions
 ) -> Iterator[Issue]:
@@ -242,10 +235,8 @@ def check_inertial_effort_excitation(
     seen = float(np.sqrt(samples * np.sum((size / band) ** 2)))
     if seen < _MIN_SIGNAL_STDS:
         j = int(np.argmax(size / band))
-        words = (
-            f"speed and acceleration ask {arm.joint_names[j]} for {size[j]:.2g} N m (rms), beside noise of "
-            f"{noise[j]:.2g} N m from sample to sample; no joint tells more"
-        )
+        asked = f"speed and acceleration ask {arm.joint_names[j]} for {size[j]:.2g} N m (rms)"
+        words = f"{asked}, beside noise of {noise[j]:.2g} N m from sample to sample; no joint tells more"
         advice = "move faster; from postures alone weight and stiffness can be found, no damping, friction or inertia"
         depth = _MIN_SIGNAL_STDS / max(seen, 1e-9)
         yield Issue("weak_excitation", words, "warning", depth, advice, recording.name, "joints", "position")
@@ -280,10 +271,8 @@ def check_joint_excitation(
             if not name or width > widest:
                 widest, name = width, recording.name
         if name and widest < limit:
-            words = (
-                f"{joint} turns by {widest:.2g} rad at most, in {name}; {limit:.2g} rad is the least that tells "
-                f"{', '.join(parameters)} from a constant effort"
-            )
+            least = f"{limit:.2g} rad is the least that tells {', '.join(parameters)} from a constant effort"
+            words = f"{joint} turns by {widest:.2g} rad at most, in {name}; {least}"
             advice, depth = f"record a motion that turns {joint}, or fix {parameters[0]}", limit / max(widest, 1e-9)
             line = "; ".join(f"parameters.{parameter}.free: false" for parameter in parameters)
             where = name, "joints", f"position.{joint}"
@@ -300,27 +289,24 @@ def check_joint_excitation(
 # which the recording says nothing keeps g = 1. Nothing is said of a joint whose effort is not explained: a
 # counterbalance that the URDF does not have is no wrong sign.
 
+# What a robot's model is off by: part of the joint's largest effort, part of the spread of what it needs.
 _EFFORT_LIMIT_ERROR_FRACTION, _EFFORT_SPREAD_ERROR_FRACTION = 0.02, 0.1
-"""What a robot's model is off by: part of the joint's largest effort, part of the spread of what it needs."""
+# Usual sizes beside a joint's largest effort: of a zero's error, of dry friction, of a spring [per rad].
 _OFFSET_FRACTION, _COULOMB_FRICTION_FRACTION, _JOINT_SPRING_FRACTION = 0.05, 0.02, 0.02
-"""Usual sizes beside a joint's largest effort: of a zero's error, of dry friction, of a spring [per rad]."""
+# Usual sizes of the force on a grasp [N], and by which it changes [N/m, N/m^2, N s/m].
 _GRASP_FORCE_STD, _GRASP_STIFFNESS_STD, _GRASP_QUADRATIC_STIFFNESS_STD, _GRASP_DAMPING_STD = 30.0, 150.0, 1500.0, 30.0
-"""Usual sizes of the force on a grasp [N], and by which it changes [N/m, N/m^2, N s/m]."""
 _WRONG_GAIN_FACTOR = 3.0  # usual size of 1/g, and the factor from which a gain counts as wrong
-_MAX_EXPLAINED_RMS = 1.5
-"""Root mean square of what is left, in sizes of the model's error, up to which a joint's effort is explained."""
+_MAX_EXPLAINED_RMS = 1.5  # of what is left, in sizes of the model's error, up to which a joint's effort is explained
 _WELL_EXPLAINED_RMS = 0.5  # the same up to which nothing is left to be explained by a lag
 _WRONG_ROBOT_RMS = 3.0  # the same from which on it is not this robot's
 _MIN_FITTED_STD, _MAX_FITTED_EFFORT = 1e-12, 1e12  # where numbers end that a fit can be made of
 _MIN_Z = 5.0  # standard deviations from which on a number counts
 _INDEPENDENT_SAMPLE_BANDWIDTH = 1.0  # samples further apart than half of its inverse count as independent [Hz]
 _MIN_EFFORT = 1e-3  # efforts below this tell nothing [N m]
-_LAG_SEARCH_STEP = 0.1
-"""Steps in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]."""
+_LAG_SEARCH_STEP = 0.1  # in which a lag of efforts behind the motion is looked for; a shorter one is no gross error [s]
+# Part of the largest effort that a joint of which nothing is asked may seem to need: it swings, and has friction.
 _IDLE_COMMAND_FRACTION = 0.2
-"""Part of the largest effort that a joint of which nothing is asked may seem to need: it swings, and has friction."""
-_MAX_EFFORT_RATIO = 1.3
-"""Factor by which an effort may exceed the URDF's limit, which some makers state for continuous use."""
+_MAX_EFFORT_RATIO = 1.3  # by which an effort may exceed the URDF's limit, which some makers state for continuous use
 
 
 @dataclass(frozen=True)
@@ -342,19 +328,15 @@ class _Data:
 
 @dataclass(frozen=True)
 class _Fit:
-    """`inverse` 1/g and its `std`, `offset` [N m], what is `left` in sizes of the model's error, each (k,); `cost`.
+    """What a fit of each joint's effort says, shape (k,)."""
 
-    `direct` is the gain by which an effort's variation follows what is needed, `shift` by how much it is off in the
-    mean [N m]: without the prior, and not made smaller by noise of what was measured.
-    """
-
-    inverse: Array
+    inverse: Array  # 1/g
     std: Array
-    offset: Array
+    offset: Array  # [N m]
     offset_std: Array
-    left: Array
-    direct: Array
-    shift: Array
+    left: Array  # what is not explained, in sizes of the model's error
+    direct: Array  # gain by which an effort's variation follows what is needed, without prior and noise
+    shift: Array  # by how much it is off in the mean, without prior and noise [N m]
     cost: float
 
 
@@ -436,10 +418,8 @@ def _by_joint(data: _Data) -> Iterator[Issue]:
     lost = fit.left > _WRONG_ROBOT_RMS
     if arm._has_no_unknown_descendants and lost.sum() > len(names) / 2:
         left = float(np.median(fit.left[lost]))
-        words = (
-            f"efforts of {lost.sum()} of {len(names)} joints are not what this robot needs for this motion: "
-            f"{left:.2g} times what a robot's model is off by"
-        )
+        strange = f"efforts of {lost.sum()} of {len(names)} joints are not what this robot needs for this motion"
+        words = f"{strange}: {left:.2g} times what a robot's model is off by"
         advice = "check that the recording is this robot's, its unit of time, and the order of joints"
         yield _issue("effort_unlike", words, left / _WRONG_ROBOT_RMS, advice)
 
@@ -488,12 +468,9 @@ def _late(data: _Data) -> Iterator[Issue]:
     lag = float(trials[at])
     # twice over, so that what friction and grasp take up of a lag does not count
     if abs(lag) > 0.5 * _LAG_SEARCH_STEP and costs[at] < 0.4 * costs[len(trials) // 2]:
-        words = (
-            f"efforts fit the motion best {abs(lag):.2g} s {'earlier' if lag > 0 else 'later'} than they were recorded"
-        )
-        lines = [
-            known_effect_config_line("effort_delay", name, "delay", lag) for name in joint_names_by_arm(data.arm.system)
-        ]
+        when, arms = "earlier" if lag > 0 else "later", joint_names_by_arm(data.arm.system)
+        words = f"efforts fit the motion best {abs(lag):.2g} s {when} than they were recorded"
+        lines = [known_effect_config_line("effort_delay", name, "delay", lag) for name in arms]
         setting = "; ".join(lines) if abs(lag) <= _LAG_SEARCH_STEP else ""
         yield _issue("effort_lag", words, abs(lag) / _LAG_SEARCH_STEP, "shift their times", setting=setting)
 

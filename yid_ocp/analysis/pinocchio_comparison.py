@@ -36,14 +36,13 @@ _N_RANDOM_CONFIGURATIONS = 3  # at which both are compared, besides the one that
 class _PinocchioComparison:
     """Relative differences between a model and Pinocchio's model of the same bodies.
 
-    `mass`, `weight` and `motion` are the largest difference of mass matrix, gravity forces and inverse dynamics, each
-    divided by its largest entry; `of` is the compared model, in words.
+    Each is the largest difference divided by the largest entry.
     """
 
-    of: str
-    mass: float
-    weight: float
-    motion: float
+    of: str  # the compared model, in words
+    mass: float  # of mass matrices
+    weight: float  # of gravity forces
+    motion: float  # of inverse dynamics
 
     @property
     def agrees_within_rounding(self) -> bool:

@@ -28,13 +28,12 @@ from yid_ocp.sensors import SensorOptions
 
 _SensorChoices = Callable[[str], SensorOptions]
 
-_HELD_POINT_TOLERANCE = 0.01
-"""How far a point may be from where the arm holds it: what calibration and a tool's measures leave [m]."""
+_HELD_POINT_TOLERANCE = 0.01  # from where the arm holds a point: what calibration and a tool's measures leave [m]
+# Part of the object's length by which points may be elsewhere than a model with unknown stiffness says.
 _MAX_OBJECT_ERROR_FRACTION = 0.25
-"""Part of the object's length by which points may be elsewhere than a model with unknown stiffness says."""
 _MAX_REMAINING_FRACTION = 0.5  # a change explains points where it leaves less than this part of their distance
+# By what lengths are wrong that are in another unit, or read so, and a power of ten for what was typed wrongly.
 _UNIT_SCALES = (1e-3, 1e-2, 0.0254, 0.1, 0.3048, 1 / 0.3048, 10.0, 1 / 0.0254, 100.0, 1e3)
-"""By what lengths are wrong that are in another unit, or read so, and a power of ten for what was typed wrongly."""
 _MIN_CLOCK_OFFSET = 0.05  # offset between two clocks that explains points far from where they should be [s]
 _PATH_SAMPLE_RATE = 50.0  # rate at which the way of the held points is worked out; splines join what lies between [Hz]
 _LENGTH_RTOL = 0.2  # part by which lengths that cannot change may seem to
@@ -59,9 +58,6 @@ def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> d
     return {name: frame for name, frame in frames.items() if system.mechanism.has_frame(frame)}
 
 
-# -- points that the arm holds ----------------------------------------------------------------------------------------
-
-
 def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
     """Issues of points whose positions disagree with the forward kinematics of the recorded angles."""
     joints, tree = recording.joints, arm.system.mechanism
@@ -70,15 +66,11 @@ def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choi
     holders = {grasp.held_frame: grasp.holder_frame for grasp in arm.system.grasps}
     for group in recording.points:
         # of a grasped point, the frame of the arm that holds it
-        frames = {
-            name: holders.get(frame, frame)
-            for name, frame in _point_frames(arm.system, group, choice(group.name)).items()
-        }
-        frames = {
-            name: frame
-            for name, frame in frames.items()
-            if arm.is_frame_determined_by_angles(frame) and tree.ancestor_joint_indices(tree.frame(frame).joint_index)
-        }
+        marked = _point_frames(arm.system, group, choice(group.name))
+        held = {name: holders.get(frame, frame) for name, frame in marked.items()}
+        known = filter(arm.is_frame_determined_by_angles, dict.fromkeys(held.values()))
+        moved = {frame for frame in known if tree.ancestor_joint_indices(tree.frame(frame).joint_index)}
+        frames = {name: frame for name, frame in held.items() if frame in moved}
         inside = (group.t >= joints.t[0]) & (group.t <= joints.t[-1])
         if not frames or inside.sum() < 3:
             continue
@@ -139,17 +131,14 @@ def _changed_lengths(seen: Array, place: Array) -> Iterator[_Change]:
     for scale in _UNIT_SCALES:
         words = f"divided by {scale:g}"
         yield _Change("point_scale", words, f"divide positions by {scale:g}", _rms(seen / scale - place))
-    best: _Change | None = None
-    for order, signs in itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3)):
-        axes = ", ".join(("" if s > 0 else "-") + "xyz"[i] for i, s in zip(order, signs, strict=True))
-        error = _rms(seen[..., list(order)] * np.array(signs) - place)
-        if axes == "x, y, z" or (best is not None and not error <= best.error):
-            continue
-        mirror = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) < 0
-        words = f"with ({axes}) for (x, y, z){', a mirror image,' if mirror else ''}"
-        best = _Change("point_mirrored", words, f"use ({axes}) for (x, y, z)", error)
-    if best is not None:
-        yield best
+    turns = itertools.product(itertools.permutations(range(3)), itertools.product((1.0, -1.0), repeat=3))
+    errors = {turn: _rms(seen[..., list(turn[0])] * np.array(turn[1]) - place) for turn in list(turns)[1:]}
+    # of several that do equally well the last
+    order, signs = min(reversed(errors), key=lambda turn: errors[turn])
+    axes = ", ".join(("" if s > 0 else "-") + "xyz"[i] for i, s in zip(order, signs, strict=True))
+    mirror = np.linalg.det(np.eye(3)[list(order)] * np.array(signs)[:, None]) < 0
+    words = f"with ({axes}) for (x, y, z){', a mirror image,' if mirror else ''}"
+    yield _Change("point_mirrored", words, f"use ({axes}) for (x, y, z)", errors[order, signs])
 
 
 def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[_Change]:
@@ -225,9 +214,6 @@ def _moved(seen: Array, place: Array) -> Iterator[_Change]:
     yield _Change("point_frame", words, f"give positions in the robot's frame: {words}", left)
 
 
-# -- points of the object ---------------------------------------------------------------------------------------------
-
-
 def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, frame: str) -> dict[int, float] | None:
     """Distances from a frame along its chain to every joint's origin, as far as the chain is neither known nor fixed.
 
@@ -251,10 +237,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
 def check_point_distances(
     arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, choice: _SensorChoices
 ) -> Iterator[Issue]:
-    """Issues of object points that are farther from the root or from each other than the length along the object.
-
-    The object bends but does not stretch.
-    """
+    """Issues of object points farther from root or each other than the length along the object, which only bends."""
     mechanism = system.mechanism
     for group in recording.points:
         frames = _point_frames(system, group, choice(group.name))
@@ -331,9 +314,6 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
         flip[i, i] = -1
         words = f"with the camera's {axis} axis turned round"
         yield _Change("point_mirrored", words, words, _rms(moved(pose @ flip @ back) - place))
-
-
-# -- a cable's points -------------------------------------------------------------------------------------------------
 
 
 def check_cable_point_geometry(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:

@@ -13,8 +13,10 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, linearization_without_weak_priors
 from yid_ocp.inference.uncertainty import (
+    CHI2_95_TWO_SIDED,
     ConfidenceInterval,
     ParameterEstimate,
+    cost_without_weak_priors,
     is_std_sufficient,
     parameter_unknown_names,
     typical_parameter_magnitudes,
@@ -25,19 +27,17 @@ from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.progress import NULL_PROGRESS, ParallelProgress, Progress
-from yid_ocp.solvers import Solution
-from yid_ocp.solvers.gauss_newton import GaussNewton
+from yid_ocp.solvers import GaussNewton, Solution
 
 log = logging.getLogger(__name__)
 _Found = TypeVar("_Found")
 
-# quantiles 0.95 and 0.999 of chi2 with one degree of freedom
-CHI2_QUANTILE_95, _CHI2_QUANTILE_999 = 3.841458820694124, 10.827566170662733
+_CHI2_QUANTILE_999 = 10.827566170662733  # of one degree of freedom
 _SMALL_VALUE_FRACTION = 0.3  # a value below this part of its typical size is small
 _MAX_LOG_DISTANCE = math.log(1e3)  # up to which a positive unknown is followed before its interval counts as open
 _LOG_PRIOR_STD = math.log(1e3)  # standard deviation that keeps other positive unknowns in place that nothing informs
 _REFIT_CHI2_ATOL = 1e-3  # chi2 that a refit may leave on the table
-_TARGET_HEIGHT = math.sqrt(CHI2_QUANTILE_95)  # root of delta chi2 at the ends of an interval
+_TARGET_HEIGHT = math.sqrt(CHI2_95_TWO_SIDED)  # root of delta chi2 at the ends of an interval
 _ROOT_RTOL = 0.01  # of the root of delta chi2 against the target
 _MAX_REFIT_ITERATIONS, _MAX_REJECTED_STEPS, _MAX_PROFILE_POINTS = 30, 8, 12
 _MAX_AUTOMATIC_INTERVALS, _MAX_UNKNOWNS = 12, 300  # beyond, profiles take long and are worked out only where asked for
@@ -49,26 +49,15 @@ _MAX_STEP_GROWTH, _STEP_OVERSHOOT = 3.0, 1.3
 
 @dataclass(frozen=True)
 class ParameterProfileLikelihood:
-    """Profile likelihood of one unknown, whose best fit is at `value`.
-
-    Attributes
-    ----------
-    lower, upper : float or None
-        Ends of the 95 % interval; None where it is open.
-    values, delta_chi2 : ndarray, shape (k,)
-        Points at which the others were refitted, in order, and chi2 above the best, over max(1, chi2 per degree of
-        freedom).
-    notes : tuple of str
-        Why an end is open where that is not for lack of information, or that a better fit was met on the way.
-    """
+    """Profile likelihood of one unknown, whose best fit is at `value`."""
 
     name: str
     value: float
-    lower: float | None
+    lower: float | None  # end of the 95 % interval; None where it is open, as `upper`
     upper: float | None
-    values: Array
-    delta_chi2: Array
-    notes: tuple[str, ...] = ()
+    values: Array  # points at which the others were refitted, in order, shape (k,)
+    delta_chi2: Array  # chi2 above the best, over max(1, chi2 per dof), shape (k,)
+    notes: tuple[str, ...] = ()  # why an end is open if not for lack of information; a better fit met
 
     @property
     def interval(self) -> ConfidenceInterval:
@@ -83,21 +72,18 @@ def compute_profile_likelihood_interval(
 
     Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
     Unknowns that are positive by nature move in their logarithm. The weak prior does not count. An end is open where
-    the level is not reached before the unknown's bound, or before it has changed by a factor of 1000.
+    the level is not reached before the unknown's bound, or before it has changed by a factor of 1000 (Venzon and
+    Moolgavkar 1988, Applied Statistics 37:87, doi:10.2307/2347496).
 
     `x` (nx,) is the best fit, `evaluation` that at it, with the Jacobian, `std` the unknown's standard deviation, for
     the first guess; it may be infinite.
-
-    References
-    ----------
-    Venzon and Moolgavkar (1988), Applied Statistics 37:87, doi:10.2307/2347496.
     """
     walk = _Walk(problem, x, index, evaluation)
     size = min(std / abs(x[index]), 0.5) if walk.logarithmic else min(std, 10 * float(problem.unknown_scales[index]))
     lower, upper = walk.end(-1, size), walk.end(1, size)
     points = sorted(walk.points, key=lambda point: point.value)
     deltas = np.array([point.chi2 for point in points]) - walk.base
-    if walk.base < -0.1 * CHI2_QUANTILE_95:
+    if walk.base < -0.1 * CHI2_95_TWO_SIDED:
         walk.notes.append(f"a fit better by {-walk.base:.2g} in chi2 was met; the point was not the best one")
     values, name = np.array([point.value for point in points]), problem.unknown_names[index]
     return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
@@ -205,18 +191,14 @@ class _Walk:
             self.upper = np.where(self.positive, np.log(np.maximum(upper, 0.0)), upper)
         self.others = np.setdiff1d(np.arange(len(x)), index)
         self.anchored = self.others[self.positive[self.others]]
-        self.centre = self._coordinates(x)
+        self.centre = np.where(self.positive, np.log(np.where(self.positive, x, 1.0)), x)
         self.scale = max(1.0, unknowns_covariance_and_reduced_chi2(problem, best)[1])
-        self.first = self._chi2(best)
+        self.first = cost_without_weak_priors(problem, best)
         self.base = 0.0
         self.notes: list[str] = []
         self.points = [_Point(float(x[index]), self.centre, 0.0, *self._rows(best, self.centre))]
 
-    def _coordinates(self, x: Array) -> Array:
-        return np.where(self.positive, np.log(np.where(self.positive, x, 1.0)), x)
-
     def _unknowns(self, s: Array) -> Array:
-        """The inverse of `_coordinates`."""
         return np.where(self.positive, np.exp(np.where(self.positive, s, 0.0)), s)
 
     def end(self, sign: int, size: float) -> float | None:
@@ -348,14 +330,8 @@ class _Walk:
         evaluation = self.problem.evaluate(x)
         if not evaluation.ok or evaluation.jacobian is None:
             return None
-        chi2 = (self._chi2(evaluation) - self.first) / self.scale
+        chi2 = 2.0 * (cost_without_weak_priors(self.problem, evaluation) - self.first) / self.scale
         return _Point(float(x[self.index]), s.copy(), chi2, *self._rows(evaluation, s))
-
-    def _chi2(self, evaluation: Evaluation) -> float:
-        """Twice the cost without the weak priors, in units of the noise."""
-        rows = self.problem.residual_rows
-        stated, weak = (float(np.sum(evaluation.residual[own] ** 2)) for own in (rows.stated_priors, rows.weak_priors))
-        return (2.0 * evaluation.cost - weak - stated) / self.problem.data_residual_noise_std**2 + stated
 
     def _rows(self, evaluation: Evaluation, s: Array) -> tuple[Array, Array]:
         """Residual and Jacobian by the coordinates, with anchors of positive unknowns in place of the weak priors."""

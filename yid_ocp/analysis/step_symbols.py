@@ -74,16 +74,12 @@ class _SymbolName:
 
 @dataclass(frozen=True)
 class FormulaText:
-    """Expressions written as text, with their shared subexpressions.
+    """Expressions written as text, with their shared subexpressions."""
 
-    Name and expression of each part that occurs more than once, which may use those before it; the number of operations
-    counts each shared one once; the indices are of the variables that occur.
-    """
-
-    shared_subexpressions: tuple[tuple[str, str], ...]
+    shared_subexpressions: tuple[tuple[str, str], ...]  # name and expression, which may use those before it
     expression_texts: tuple[str, ...]
-    n_operations: int
-    variable_indices: tuple[int, ...]
+    n_operations: int  # each shared one counted once
+    variable_indices: tuple[int, ...]  # of the variables that occur
 
 
 def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
@@ -109,7 +105,9 @@ def format_expressions(
             name = names[int(value)]
             written.append((name.latex if latex else name.text, _ATOM))
         elif op == ca.OP_CONST:
-            written.append((_number(value, latex), _SUM if value < 0 else _ATOM))
+            mantissa, _, exponent = (text := f"{value:.12g}").partition("e")
+            text = rf"{mantissa} \cdot 10^{{{int(exponent)}}}" if latex and exponent else text
+            written.append((text, _SUM if value < 0 else _ATOM))
         else:
             text, tightness = _written(op, [written[part] for part in parts], layouts, latex)
             simple = op == ca.OP_NEG and nodes[parts[0]][0] in _LEAF_OPERATIONS
@@ -128,8 +126,8 @@ def _function(expressions: Sequence[ca.SX], variables: ca.SX) -> ca.Function:
     return ca.Function("formula", [variables], [together])
 
 
+# Operation, nodes that it takes, and the index of a variable or the value of a constant.
 _Node = tuple[int, tuple[int, ...], float]
-"""Operation, nodes that it takes, and the index of a variable or the value of a constant."""
 
 
 def _nodes(function: ca.Function, count: int) -> tuple[list[_Node], list[int]]:
@@ -163,12 +161,6 @@ def _written(
     template, tightness, asked = (_TEXT_TEMPLATES if long else layouts)[op]
     texts = [text if has >= wants else f"({text})" for (text, has), wants in zip(parts, asked, strict=True)]
     return template.format(*texts), tightness
-
-
-def _number(value: float, latex: bool) -> str:
-    text = f"{value:.12g}"
-    mantissa, _, exponent = text.partition("e")
-    return rf"{mantissa} \cdot 10^{{{int(exponent)}}}" if latex and exponent else text
 
 
 _MAX_PRINTED_OPERATIONS = 80  # operations up to which an equation is written out without being asked for
@@ -233,13 +225,9 @@ class EquationEntry:
 class StepSymbols(ReprMixin):
     """Equations of one step with named rows and columns.
 
-    Attributes
-    ----------
-    row_blocks : tuple of SymbolBlock
-        `del` (DEL equations; at a prescribed coordinate what is left is -h times its effort), `internal`,
-        `constraint`, and `p1`, the momentum after the step.
-    column_blocks : tuple of SymbolBlock
-        `q0`, `p0`, `z0`, `u`, `theta`, `time_step`, and the unknowns `q1`, `z1`, `lam`.
+    Rows are in the blocks `del` (DEL equations; at a prescribed coordinate what is left is -h times its effort),
+    `internal`, `constraint`, and `p1`, the momentum after the step; columns in `q0`, `p0`, `z0`, `u`, `theta`,
+    `time_step`, and the unknowns `q1`, `z1`, `lam`.
     """
 
     equations: DiscreteEquations
@@ -290,7 +278,6 @@ class StepSymbols(ReprMixin):
 
     @cached_property
     def _row_expressions(self) -> ca.SX:
-        """Expressions of all rows, shape (n + nz + m + n, 1)."""
         return ca.vertcat(*(block.expressions for block in self.row_blocks))
 
     @cached_property
@@ -321,33 +308,21 @@ class StepSymbols(ReprMixin):
         at = names.index(block)
         return slice(ends[at], ends[at + 1])
 
-    def _row_index(self, name: str) -> int:
-        """Index of a row by its full name; raises `ConfigError` with the nearest name where it does not exist."""
-        return _place(name, self.row_names, "row", self.row_blocks)
-
-    def _column_index(self, name: str) -> int:
-        """As `_row_index`, of a column."""
-        return _place(name, self.column_names, "column", self.column_blocks)
-
     def equation_entry(self, text: str) -> EquationEntry:
         """The equation with a given name or, for `ROW, COLUMN`, its derivative by a variable.
 
-        `text` is such as `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]` or `constraint[left.x], T2.length`.
-
-        Raises
-        ------
-        ConfigError
-            Neither one name nor two, or one that does not exist.
+        `text` is such as `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]` or `constraint[left.x], T2.length`. Raises
+        `ConfigError` for neither one name nor two, or one that does not exist.
         """
         said = [part.strip() for part in text.split(",")]
         if len(said) > 2 or not all(said):
             allowed = "the name of a row, or of a row and a column with a comma between them"
             hint = "--entry 'del[T1_0_x], q1[T1_0_x]'"
             raise ConfigError(f"'{text}' is no entry", where="--entry", allowed=allowed, hint=hint)
-        row, column = self._row_index(said[0]), ""
+        row, column = _place(said[0], self.row_names, "row", self.row_blocks), ""
         expression = self._row_expressions[row]
         if len(said) == 2:
-            at = self._column_index(said[1])
+            at = _place(said[1], self.column_names, "column", self.column_blocks)
             expression, column = ca.jacobian(expression, self.column_symbols[at]), self.column_names[at]
         made = format_expressions([expression], self.column_symbols, self.column_display_names)
         used = self._summarize_columns(made.variable_indices)
@@ -374,11 +349,15 @@ class StepSymbols(ReprMixin):
             else:
                 used = self._summarize_columns(place[symbol.element_hash()] for symbol in ca.symvar(row))
                 said.append(_headline(name, count, used))
-        head = (
-            "equations of one step; `inspect --entry 'NAME'` prints any of them whole, with ', COLUMN' its derivative"
-        )
+        whole = "`inspect --entry 'NAME'` prints any of them whole, with ', COLUMN' its derivative"
         blocks = [block for block in self.column_blocks if block.labels]
-        return [head, "", *said, "", *(f"{b.name} ({b.meaning}): {', '.join(b.full_names)}" for b in blocks)]
+        return [
+            f"equations of one step; {whole}",
+            "",
+            *said,
+            "",
+            *(f"{b.name} ({b.meaning}): {', '.join(b.full_names)}" for b in blocks),
+        ]
 
 
 def escape_latex(name: str) -> str:
@@ -391,6 +370,7 @@ def _headline(title: str, count: int, variables: Sequence[str]) -> str:
 
 
 def _place(name: str, known: tuple[str, ...], kind: str, blocks: tuple[SymbolBlock, ...]) -> int:
+    """Index of a row or column by its full name; raises `ConfigError` with the nearest name where there is none."""
     if name in known:
         return known.index(name)
     shapes = [f"{b.name}[{b.labels[0]}]" if b.full_names[0] != b.labels[0] else b.labels[0] for b in blocks if b.labels]

@@ -25,12 +25,11 @@ from yid_ocp.integrator.tracking_feedback import applied_torque_error_feedthroug
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.sensors import Sensor
 from yid_ocp.sensors.joints import PositionSensor
 
 _NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a reading's noise
+# Random samples of all errors at first, twice as many as long as they are too few, and at most.
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
-"""Random samples of all errors at first, twice as many as long as they are too few, and at most."""
 
 
 def episode_sensitivities_and_information(
@@ -65,7 +64,10 @@ def episode_sensitivities_and_information(
             told.append(block)
     course = nominal_trajectory(problem.predictor, episode, result, problem.split(x, i)[0])
     units = [finest[sensor.group_name] for sensor, block in shown for _ in range(block.shape[1])]
-    by_state = [_by_state(course, sensor) for sensor, _ in shown]
+    by_state = []
+    for sensor, _ in shown:
+        read = course.model_functions.compiled_sensor_function(sensor)(course.node_values, course.theta)
+        by_state.append(np.concatenate([read.by_q, np.zeros_like(read.by_q), read.by_z], axis=2))
     if driving.input_errors is None:
         blur = np.zeros((len(result.rollout.state), len(units), 0))
     else:
@@ -92,12 +94,6 @@ def episode_sensitivities_and_information(
         width = block.shape[1]
         information[:width, :width] += block.T @ block
     return slopes, information
-
-
-def _by_state(course: NominalTrajectory, sensor: Sensor) -> Array:
-    """Slopes of a sensor's readings at every node by the state there, shape (N + 1, k, nx)."""
-    read = course.model_functions.compiled_sensor_function(sensor)(course.node_values, course.theta)
-    return np.concatenate([read.by_q, np.zeros_like(read.by_q), read.by_z], axis=2)
 
 
 def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> Array:
@@ -146,7 +142,7 @@ class _Motion:
     def __init__(self, course: NominalTrajectory, errors: InputErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
         momentum = course.model_functions.momentum_shift.momentum_derivative_by_previous_torque(course.theta)
-        by_state, by_torque, by_angles = [], [], []
+        self.by_state, self.by_torque, self.by_angles = list[Array](), list[Array](), list[Array]()
         for k, here in enumerate(linearized_steps(step, course.theta, course.rollout)):
             state, by_error = here.state_by_state.copy(), here.state_by_torque.copy()
             angles = np.zeros_like(by_error)
@@ -155,16 +151,15 @@ class _Motion:
                 pulled = here.state_by_torque @ feedback.gain[k]
                 state[:, feedback.state_indices] -= pulled
                 angles = pulled[:, : angles.shape[1]] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
-            by_state.append(state)
-            by_torque.append(by_error)
-            by_angles.append(angles)
-        self.by_state, self.by_torque, self.by_angles = by_state, by_torque, by_angles
+            self.by_state.append(state)
+            self.by_torque.append(by_error)
+            self.by_angles.append(angles)
         self.start_by_angles = course.initial_state_by_angles * errors.angle_std
         self.start_by_torque = course.initial_state_by_torque
         self.torque_std, self.bias_std = errors.torque_std[:, None], errors.torque_bias_std[:, None]
         self.sample = np.unique(errors.sample_of_step, return_inverse=True)[1]
         self.samples = int(self.sample[-1]) + 1
-        self.size = len(self.torque_std) * (2 + self.samples + len(by_torque))
+        self.size = len(self.torque_std) * (2 + self.samples + len(self.by_torque))
 
     def _parts(self, errors: Array) -> tuple[Array, Array, Array, Array]:
         """Errors of the start's angles, constant ones, those of samples and of steps, each (..., nu, c)."""

@@ -41,48 +41,32 @@ _MAX_CHANGE_SET_SIZE = 3
 class ExperimentChange:
     """One change of an experiment.
 
-    Attributes
-    ----------
-    name : str
-        `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
-    mechanical_change : str
-        Key of `MECHANICAL_EXPERIMENT_CHANGES`, empty where only sensors change.
-    camera_frame, arm_frame : str
-        Frame that the camera sees, or an arm measures, besides; empty for none.
-    camera_rate : float or None
-        Of the camera [Hz].
+    Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
     """
 
     name: str
     description: str
-    mechanical_change: str = ""
-    camera_frame: str = ""
-    arm_frame: str = ""
-    camera_rate: float | None = None
+    mechanical_change: str = ""  # key of `MECHANICAL_EXPERIMENT_CHANGES`, empty where only sensors change
+    camera_frame: str = ""  # that the camera sees besides; empty for none
+    arm_frame: str = ""  # that an arm measures besides; empty for none
+    camera_rate: float | None = None  # [Hz]
 
 
 @dataclass(frozen=True)
 class ChangedExperimentResult:
     """Predicted identifiability of an experiment with some changes; without verdicts where it could not be evaluated.
 
-    Attributes
-    ----------
-    identifiable : int
-        How many parameters.
-    gain : float
-        Information gain 1/2 log det(1 + 16 I) over relative changes [nat], for a prior standard deviation of 400 % of
-        each parameter.
-    message : str
-        Why it could not be evaluated, or obstacles on a real robot.
+    The gain is that of information, 1/2 log det(1 + 16 I) over relative changes [nat], for a prior standard deviation
+    of 400 % of each parameter.
     """
 
     changes: tuple[str, ...]
     words: str
     std_relative: Mapping[str, float]
     verdicts: Mapping[str, str]
-    identifiable: int
+    identifiable: int  # number of parameters
     gain: float
-    message: str = ""
+    message: str = ""  # why it could not be evaluated, or obstacles on a real robot
 
     @property
     def _is_complete(self) -> bool:
@@ -94,15 +78,10 @@ class ChangedExperimentResult:
 class ExperimentRanking(ReprMixin):
     """Changes of an experiment, ranked by the parameters they make identifiable.
 
-    Attributes
-    ----------
-    single_changes : tuple of ChangedExperimentResult
-        Most identifiable parameters first, then by gain; those that could not be evaluated last.
-    smallest_sufficient_sets : tuple of ChangedExperimentResult
-        All sets of fewest changes with which every parameter is identifiable, largest gain first; empty where none of
-        up to three changes does it.
-    greedy_sequence : tuple of ChangedExperimentResult
-        Best single change added one after the other.
+    Single changes come with most identifiable parameters first, then by gain; those that could not be evaluated last.
+    `smallest_sufficient_sets` are all sets of fewest changes with which every parameter is identifiable, largest gain
+    first; empty where none of up to three changes does it. `greedy_sequence` adds the best single change one after the
+    other.
     """
 
     unchanged_experiment: ChangedExperimentResult
@@ -119,8 +98,8 @@ class ExperimentRanking(ReprMixin):
         return ReprSummary(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
 
 
+# From sets of changes and a factor on the stated variances to the predicted results, one for each set.
 ChangeSetEvaluator = Callable[[Sequence[Sequence[ExperimentChange]], float], list[ChangedExperimentResult]]
-"""From sets of changes and a factor on the stated variances to the predicted results, one for each set."""
 
 
 def what_if(
@@ -145,20 +124,13 @@ def what_if(
     solution : Solution or array_like, optional
         Point at which to judge; the initial values when absent.
     start, grasp_std
-        Nuisances, as in `identifiability`.
+        Nuisances, as in `identifiability`, which states the errors too.
     two_arm_system : System, optional
         The system with one more arm and its grasp; without it that change is not tried.
     considered_changes : collection of str, optional
         Names of changes to consider, all when absent.
     evaluate_changes : callable, optional
         Evaluates sets of changes by `evaluate_change_sets`, in other processes for example; in this one when absent.
-
-    Raises
-    ------
-    SolverError
-        The model cannot be rolled out at the point.
-    ConfigError, DataError
-        As `identifiability`.
     """
     x, inflation = unknowns_from_solution(problem, solution), 1.0
     if solution is not None:
@@ -168,9 +140,7 @@ def what_if(
     (base,) = outcomes.of_all([()])
     if not base.verdicts:
         raise SolverError(base.message)
-    changes = [
-        change for change in outcomes.possible if considered_changes is None or change.name in considered_changes
-    ]
+    changes = [c for c in outcomes.possible if considered_changes is None or c.name in considered_changes]
     singles = _rank_results(outcomes.of_all([(change,) for change in changes]))
     greedy = _greedy(outcomes, changes, base)
     smallest = _rank_results(_smallest(outcomes, changes, base))
@@ -196,9 +166,8 @@ def _smallest(
     if base._is_complete:
         return [base]
     for size in range(1, _MAX_CHANGE_SET_SIZE + 1) if changes else ():
-        found = outcomes.of_all([chosen for chosen in itertools.combinations(changes, size) if _are_compatible(chosen)])
-        complete = [outcome for outcome in found if outcome._is_complete]
-        if complete:
+        found = outcomes.of_all(list(filter(_are_compatible, itertools.combinations(changes, size))))
+        if complete := [outcome for outcome in found if outcome._is_complete]:
             return complete
     return []
 
@@ -212,8 +181,7 @@ def _greedy(
     best = base
     while len(chosen) < _MAX_CHANGE_SET_SIZE and not best._is_complete:
         trials = [(*chosen, change) for change in changes if change not in chosen]
-        trials = [trial for trial in trials if _are_compatible(trial)]
-        found = outcomes.of_all(trials)
+        found = outcomes.of_all(trials := list(filter(_are_compatible, trials)))
         top = next(iter(_rank_results(found)), best)
         if (top.identifiable, top.gain) <= (best.identifiable, best.gain):
             break

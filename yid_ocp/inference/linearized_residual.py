@@ -60,16 +60,15 @@ def nominal_trajectory(
 
 @dataclass(frozen=True)
 class ResidualDerivativesAtNodes:
-    """Derivatives of a recording's r residuals [sensor noise] by the states of the two nodes around each sample.
+    """Derivatives of a recording's r residuals [sensor noise] at the two nodes around each sample.
 
-    They are by the states (r, nx) of the node before the row and of the next, their shares of the interpolation
-    included, and by the efforts of prescribed joints there (r, nc).
+    The shares of the interpolation are included.
     """
 
-    node: IntArray
-    before: Array
-    after: Array
-    by_effort_before: Array
+    node: IntArray  # before the row, shape (r,)
+    before: Array  # by the state of that node, shape (r, nx)
+    after: Array  # by the state of the next, shape (r, nx)
+    by_effort_before: Array  # by the efforts of prescribed joints there, shape (r, nc)
     by_effort_after: Array
 
     @staticmethod
@@ -147,13 +146,10 @@ def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Ev
     """Return the noise-scaled residual (r,) and Jacobian (r, nx) of data and stated priors, without weak priors."""
     assert evaluation.jacobian is not None
     rows = problem.residual_rows
-    residual, jacobian = (
-        evaluation.residual[rows.slice_without_weak_priors],
-        evaluation.jacobian[rows.slice_without_weak_priors],
-    )
-    units = np.ones(len(residual))
+    units = np.ones(len(evaluation.residual))
     units[rows.data] = problem.data_residual_noise_std
-    return residual / units, jacobian / units[:, None]
+    units = units[kept := rows.slice_without_weak_priors]
+    return evaluation.residual[kept] / units, evaluation.jacobian[kept] / units[:, None]
 
 
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
@@ -182,25 +178,27 @@ def predicted_cost_reduction(jacobian: Array, residual: Array, step: Array) -> f
 
 
 def is_stationary_point(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
-    """Whether a point (evaluated with its Jacobian) is stationary: no step promises a relevant cost reduction."""
-    worth = max(
-        _MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * problem.data_residual_noise_std**2
-    )
+    """Whether no step from a point (evaluated with its Jacobian) promises a relevant cost reduction."""
+    noise = problem.data_residual_noise_std**2
+    worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * noise)
     return achievable_cost_reduction(problem, x, evaluation) <= worth
 
 
 def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
-    """Cost reduction that the linear model predicts for a step up to the unknowns' size; infinite without a Jacobian.
-
-    The step is undamped and within the bounds; size is the larger of value and typical size.
-    """
+    """Cost reduction that a step up to the unknowns' size promises in the linear model; infinite without a Jacobian."""
     if evaluation.jacobian is None:
         return math.inf
     if not len(x):
         return 0.0
+    step = step_within_unknown_sizes(problem, x, evaluation.jacobian, evaluation.residual, 1e-14)
+    return predicted_cost_reduction(evaluation.jacobian, evaluation.residual, step)
+
+
+def step_within_unknown_sizes(
+    problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
+) -> Array:
+    """Least-squares step within the bounds, of at most the larger of value and typical size of each unknown, (nx,)."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
-    scaled = evaluation.jacobian * size
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)
-    step = bounded_levenberg_marquardt_step(scaled, evaluation.residual, 1e-14, low, high)
-    return predicted_cost_reduction(scaled, evaluation.residual, step)
+    return size * bounded_levenberg_marquardt_step(jacobian * size, residual, mu, low, high)

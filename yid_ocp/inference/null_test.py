@@ -19,8 +19,7 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
 
-RESIDUAL_WINDOW_SECONDS = 0.5
-"""Length of the time windows in which a residual is tested [s]."""
+RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 
 
 @dataclass(frozen=True)
@@ -41,18 +40,15 @@ DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 @dataclass(frozen=True)
 class ResidualChannelSamples:
-    """Samples of one scalar sensor output of a recording: times from its start (M,) [s], residual indices (M,).
-
-    The autocorrelation of its noise is at lags 0 to L samples, shape (L + 1,).
-    """
+    """Samples of one scalar sensor output of a recording."""
 
     recording: str
     channel: str
     group: str
     unit: str
-    t: Array
-    residual_indices: IntArray
-    noise_autocorrelation: Array
+    t: Array  # since the recording's start, shape (M,) [s]
+    residual_indices: IntArray  # shape (M,)
+    noise_autocorrelation: Array  # at lags 0 to L samples, shape (L + 1,)
 
 
 @dataclass(frozen=True)
@@ -78,15 +74,12 @@ class _ResidualWindow:
 
 @dataclass(frozen=True)
 class NullTestResult:
-    """Result of the null test: chi2 per degree of freedom, and the probability of one this large under noise alone.
-
-    Degrees of freedom are effective ones, of coloured noise; by channel there is the mean square of its residual.
-    """
+    """Result of the null test: chi2 per degree of freedom, and the probability of one this large under noise alone."""
 
     chi2_per_dof: float
-    degrees_of_freedom: float
+    degrees_of_freedom: float  # effective ones, of coloured noise
     p_value: float
-    channel_chi2: dict[str, float]
+    channel_chi2: dict[str, float]  # mean square of each channel's residual
     windows: tuple[_ResidualWindow, ...]
 
 
@@ -213,21 +206,17 @@ def residual_channel_samples(problem: EstimationProblem) -> tuple[ResidualChanne
             t = times_since_recording_start(episode, samples)
             place = np.full(samples.used_output_mask.shape, -1)
             place[samples.used_output_mask] = np.arange(rows.start, rows.stop)
-            colour = _sensor_noise_autocorrelation(problem, episode, samples)
+            colour = np.ones(1)
+            if samples.sensor.effort_joints:
+                low_pass, step = effort_filter(problem.options.path_cutoff), episode.grid.time_step
+                stride = low_pass.decorrelation_stride(step)
+                colour = _filtered_noise_autocorrelation(low_pass, step)[::stride]
             for column, channel in enumerate(samples.output_channel_names):
                 seen = samples.used_output_mask[:, column]
                 if seen.any():
                     text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
                     series.append(ResidualChannelSamples(*text, t[seen], place[seen, column], colour))
     return tuple(series)
-
-
-def _sensor_noise_autocorrelation(problem: EstimationProblem, episode: Episode, samples: Measurements) -> Array:
-    """Autocorrelation of a sensor's noise at lags 0, 1, ... samples: white, except for smoothed efforts."""
-    if not samples.sensor.effort_joints:
-        return np.ones(1)
-    low_pass, step = effort_filter(problem.options.path_cutoff), episode.grid.time_step
-    return _filtered_noise_autocorrelation(low_pass, step)[:: low_pass.decorrelation_stride(step)]
 
 
 def _filtered_noise_autocorrelation(low_pass: LowPassFilter, step: float) -> Array:

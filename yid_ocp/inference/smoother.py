@@ -24,7 +24,6 @@ import scipy.optimize
 import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.inference.kalman import FilterStateTransition, KalmanStep, kalman_step_and_covariance
 from yid_ocp.inference.smoother_model import (
     DEFAULT_SMOOTHER_THRESHOLDS,
     LinearResidualModel,
@@ -32,32 +31,27 @@ from yid_ocp.inference.smoother_model import (
     SmootherThresholds,
     linear_residual_models,
 )
+from yid_ocp.inference.whitening import FilterStateTransition, KalmanStep, kalman_step_and_covariance
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
 
-_MAX_ITERATIONS = 12
-"""Fixed-point iterations on the standard deviations."""
-_VARIANCE_BOUNDS = (1e-6, 1e7)
-"""Range of the variances, in units of the squared reference."""
-_LATER_GROUP_TRIALS = 6
-"""Groups tried after the first round, the most promising ones by their scores."""
+_MAX_ITERATIONS = 12  # fixed-point iterations on the standard deviations
+_VARIANCE_BOUNDS = (1e-6, 1e7)  # range of the variances, in units of the squared reference
+_LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promising ones by their scores
 
 
 @dataclass(frozen=True)
 class SmoothedUnknowns:
-    """Smoothed unknowns of one recording over its intervals, whose edges are (J + 1,) [s].
-
-    Posterior mean and standard deviation (J, nd) are in units of the reference (nd,) [N m, N or m].
-    """
+    """Smoothed unknowns of one recording over its J intervals."""
 
     recording: str
-    interval_edges: Array
+    interval_edges: Array  # shape (J + 1,) [s]
     unknown_names: tuple[str, ...]
     unknown_groups: tuple[SmoothedUnknownGroup, ...]
-    reference_std: Array
-    posterior_mean: Array
-    posterior_std: Array
+    reference_std: Array  # shape (nd,) [N m, N or m]
+    posterior_mean: Array  # in units of the reference, shape (J, nd)
+    posterior_std: Array  # in units of the reference, shape (J, nd)
 
 
 @dataclass(frozen=True)
@@ -98,9 +92,6 @@ class SmootherResult:
         return "both" if self.log_evidence["both"] - self.log_evidence[alone] > self.min_log_bayes_factor else alone
 
 
-# -- filter and smoother ----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class _Update:
     """One interval of the filter, as its backward pass needs it: prediction `mean`, covariance `p` and innovations."""
@@ -113,34 +104,24 @@ class _Update:
 
 @dataclass(frozen=True)
 class _Filtered:
-    """The filter of one recording at given variances; its updates where they are kept.
-
-    `products` (1 + ntheta, 1 + ntheta) holds V' S^-1 V. The determinant is infinite where variances are so large that
-    rounding shows: they are never the best. `begin` (ns + nd, nd) says how state and unknowns of the first interval
-    follow the first disturbances.
-    """
+    """The filter of one recording at given variances; its updates where they are kept."""
 
     model: LinearResidualModel
-    begin: Array
-    products: Array
-    log_determinant: float
+    begin: Array  # by the first disturbances: state and unknowns of the first interval, shape (ns + nd, nd)
+    products: Array  # V' S^-1 V, shape (1 + ntheta, 1 + ntheta)
+    log_determinant: float  # infinite where variances are so large that rounding shows: they are never the best
     updates: Sequence[_Update]
 
 
 @dataclass(frozen=True)
 class _Smoothed:
-    """The disturbance smoother over one recording.
+    """The disturbance smoother over one recording; disturbances are of unit variance before they are scaled."""
 
-    `score` (J, nd, 1 + ntheta) and `information` (J, nd) are the disturbances' scores and their variances, both by
-    disturbances of unit variance before they are scaled, `mean` (J, nd, 1 + ntheta) the smoothed unknowns, `covariance`
-    (J, nd) their variances, `left` the smoothed residuals.
-    """
-
-    score: Array
-    information: Array
-    mean: Array
-    covariance: Array
-    left: tuple[Array, ...]
+    score: Array  # of the disturbances, shape (J, nd, 1 + ntheta)
+    information: Array  # variances of the disturbances, shape (J, nd)
+    mean: Array  # smoothed unknowns, shape (J, nd, 1 + ntheta)
+    covariance: Array  # their variances, shape (J, nd)
+    left: tuple[Array, ...]  # smoothed residuals
 
 
 def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filtered:
@@ -197,9 +178,6 @@ def _backwards(done: _Filtered) -> _Smoothed:
         covariance[j] = np.diag(update.p)[ns:] - np.sum((own @ n) * own, axis=1)
     score[0], information[0] = begin.T @ r, np.sum(begin * (n @ begin), axis=0)
     return _Smoothed(score, information, smoothed, covariance, tuple(reversed(left)))
-
-
-# -- evidence and the choice of groups --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -279,13 +257,12 @@ def _selected(
         promising.sort(key=lambda s: -found[s][0] / max(found[s][1], 1e-300))
         if any(variance.values()):
             promising = promising[:_LATER_GROUP_TRIALS]
-
-        outcomes = list(zip(_largest_evidences(models, variance, promising), promising, strict=True))
-        if not outcomes:
-            return variance, state
-        (evidence, size), source = max(outcomes, key=lambda pair: pair[0][0])
+        if not promising:
+            break
+        reached = zip(_largest_evidences(models, variance, promising), promising, strict=True)
+        (evidence, size), source = max(reached, key=lambda pair: pair[0][0])
         if not evidence > state.log_evidence + limits.min_log_bayes_factor:
-            return variance, state
+            break
         variance, state = _refined(models, variance | {source: size})
     return variance, state
 
@@ -303,14 +280,12 @@ def _largest_evidences(
 
 
 def _responses(base: _Filtered, chosen: IntArray) -> Array:
-    """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, u J).
-
-    The filter follows a disturbance as far as its own unknowns let it; those without variance stay at zero.
-    """
+    """Innovations by disturbances of unit variance of some unknowns, shape (rows of all intervals, u J)."""
     model, updates = base.model, base.updates
     ns, count, u = len(model.initial_state_std), len(updates), len(chosen)
     kept = np.concatenate([np.arange(ns), ns + np.flatnonzero(np.diag(updates[0].p)[ns:] > 0)])
-    # what the filter has not followed yet, and the disturbed unknowns themselves, by the interval of the disturbance
+    # what the filter has not followed yet, and the disturbed unknowns themselves, by the interval of the disturbance;
+    # it follows one as far as its own unknowns let it, those without variance stay at zero
     behind, unknown = np.zeros((len(kept), u, count)), np.zeros((u, count))
     behind[:ns, :, 0] = model.initial_state_jacobian[:, chosen]
     found = []
@@ -427,9 +402,6 @@ def force_log_likelihood_coefficients(
     cross = products[split:, 1:split]
     weighed = np.linalg.solve(free, np.column_stack([products[1:split, 0], cross.T]))
     return products[split:, 0] - cross @ weighed[:, 0], products[split:, split:] - cross @ weighed[:, 1:]
-
-
-# -- what it says -----------------------------------------------------------------------------------------------------
 
 
 def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> SmoothedUnknowns:

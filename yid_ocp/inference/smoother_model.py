@@ -43,14 +43,10 @@ from yid_ocp.sensors import Sensor
 
 _UnknownKind = Literal["force", "push", "offset", "bias"]
 
-_CORRELATION_TIME = 0.5
-"""Correlation time of the unknowns [s]."""
-_MIN_INTERVAL = 0.1
-"""Shortest time over which unknowns are constant [s]."""
-_MAX_INTERVAL_COUNT = 150
-"""Number of intervals of a long recording, beyond which they become longer."""
-_FORCE_POINT = "75%"
-"""Where a segment is pushed, by arc length: what acts on its tip and what acts all along it are both near that."""
+_CORRELATION_TIME = 0.5  # of the unknowns [s]
+_MIN_INTERVAL = 0.1  # shortest time over which unknowns are constant [s]
+_MAX_INTERVAL_COUNT = 150  # of a long recording, beyond which intervals become longer
+_FORCE_POINT = "75%"  # by arc length, where a segment is pushed: near what acts on its tip and what acts all along it
 
 
 @dataclass(frozen=True)
@@ -75,14 +71,11 @@ DEFAULT_SMOOTHER_THRESHOLDS = SmootherThresholds()
 
 @dataclass(frozen=True)
 class SmoothedUnknownGroup:
-    """Group of unknown forces, offsets or biases that share a location and a standard deviation.
-
-    `is_confounded_with_bias`: a bias of an effort sensor would be the same, as for a force at a prescribed joint whose
-    effort is measured.
-    """
+    """Group of unknown forces, offsets or biases that share a location and a standard deviation."""
 
     location: str
     kind: _UnknownKind
+    # a bias of an effort sensor would be the same, as for a force at a prescribed joint whose effort is measured
     is_confounded_with_bias: bool = False
 
 
@@ -96,7 +89,6 @@ class _LinearizedEpisode:
 
     @property
     def system(self) -> System:
-        """The problem's system."""
         return self.problem.system
 
 
@@ -285,21 +277,16 @@ def linear_residual_models(
         groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
         nominal = nominal_trajectory(problem.predictor, episode, result, problem.split(x, i)[0])
-        pairs, threshold = (
-            zip(episode.measurements, result.predicted_outputs, strict=True),
-            problem.options.huber_threshold,
-        )
-        factor = [samples.residual_block(y, threshold=threshold).robust_factor for samples, y in pairs]
+        pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
+        blocks = [samples.residual_block(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
         course = _LinearizedEpisode(problem, episode, nominal)
-        found.append(_recording(course, np.concatenate(factor), observed, limits, interval))
+        factor = np.concatenate([block.robust_factor for block in blocks])
+        found.append(_recording(course, factor, observed, limits, interval))
     prior = columns[problem.residual_rows.stated_priors]
     # stated priors of the free parameters are observations that no unknown reaches
     first, *later = found[0].intervals
     first = replace(first, unreachable_products=first.unreachable_products + prior.T @ prior)
     return (replace(found[0], intervals=(first, *later)), *found[1:])
-
-
-# -- the slopes of single steps ---------------------------------------------------------------------------------------
 
 
 def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> AdditionalLoadDerivatives:
@@ -320,10 +307,7 @@ def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Additi
 def _steps(
     course: _LinearizedEpisode, loads: AdditionalLoadDerivatives, pushes: Array, moving: IntArray, first: int, last: int
 ) -> tuple[Array, Array, Array]:
-    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd') of some steps.
-
-    `pushes` (N + 1, forces, np) says what forces they amount to.
-    """
+    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd'); pushes in forces."""
     a, e, effort = [], [], []
     feedback, nominal, forces = course.episode.tracking_feedback, course.nominal, pushes.shape[1]
     found = linearized_steps(course.problem.step, nominal.theta, nominal.rollout, loads, slice(first, last))
@@ -345,9 +329,6 @@ def _steps(
         pushed = effort_by_load[:, :forces] @ pushes[k]
         effort.append(np.hstack([effort_by_state[:, moving], effort_by_load, pushed]))
     return np.stack(a), np.stack(e), np.stack(effort)
-
-
-# -- from steps to intervals ------------------------------------------------------------------------------------------
 
 
 def _recording(
@@ -400,16 +381,13 @@ def _recording(
 
 
 def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span: float, decay: float) -> Array:
-    """Variance of unknown forces that stand for the noise of recorded torques, in units of the squared reference.
-
-    White noise counts by its spectral density at low frequencies, which an unknown force of memory `decay` from
-    interval to interval must have as well.
-    """
+    """Variance of unknown forces that stand for the noise of recorded torques, in units of the squared reference."""
     errors, driven = course.episode.input_errors, course.system.driven
     known = np.zeros(len(unknowns.names))
     if errors is None:
         return known
     held = course.problem.step.time_step * len(errors.sample_of_step) / len(np.unique(errors.sample_of_step))
+    # by its spectral density at low frequencies, which an unknown force of memory `decay` must have as well
     white = errors.torque_std**2 * (held / span) * (1 - decay) / (1 + decay)
     for i, name in enumerate(unknowns.names[: len(unknowns.forced)]):
         if name in driven:

@@ -43,36 +43,30 @@ _MAX_CHECKED_PARAMETERS = 12
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """Whether the model explains the recordings on which it was fitted.
-
-    `chi2_per_dof` is the mean square of the residual in standard deviations of the noise, NaN where there is none, and
-    `p_value` the probability of one this large under noise alone; `explains` is by the null test of a diagnosis
-    (`residuals_exceed_noise`). Data are `believed` without a grave quality issue (`ProblemOptions.data_issues`).
-    """
+    """Whether the model explains the recordings on which it was fitted."""
 
     chi2_per_dof: float
-    p_value: float
-    explains: bool
-    believed: bool = True
+    p_value: float  # probability of a chi2 this large under noise alone
+    explains: bool  # by the null test of a diagnosis (`residuals_exceed_noise`)
+    believed: bool = True  # no grave quality issue of the data (`ProblemOptions.data_issues`)
 
 
 @dataclass(frozen=True)
 class ParameterEstimate:
     """Estimate of one parameter with standard deviation, bounds and verdict.
 
-    `std` is infinite where the data do not inform the parameter; the verdict is `parameter_verdict` or `fixed`.
     The 95 % `interval` is stated where a standard deviation does not tell it: one-sided at a bound, by profile
     likelihood where the cost is no parabola; None is an open end.
     """
 
     value: float
-    std: float
+    std: float  # infinite where the data do not inform the parameter
     unit: str
     initial: float
     lower: float
     upper: float
     free: bool
-    verdict: str
+    verdict: str  # `parameter_verdict`, or `fixed`
     interval: ConfidenceInterval | None = None
 
     @property
@@ -82,9 +76,6 @@ class ParameterEstimate:
             return self.value - 1.96 * self.std, self.value + 1.96 * self.std
         lower, upper = self.interval
         return -math.inf if lower is None else lower, math.inf if upper is None else upper
-
-
-# -- does the model explain the data ----------------------------------------------------------------------------------
 
 
 def assess_goodness_of_fit(
@@ -108,9 +99,6 @@ def assess_goodness_of_fit(
     )
     explains = not residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_no_serious_data_issues)
-
-
-# -- how sure ---------------------------------------------------------------------------------------------------------
 
 
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
@@ -148,17 +136,15 @@ def _chi2_per_dof(problem: EstimationProblem, evaluation: Evaluation) -> float:
 def _misfit_sandwich_covariance(problem: EstimationProblem, evaluation: Evaluation, covariance: Array) -> Array:
     """Covariance widened for model misfit, at least as large as the block-wise sandwich estimate.
 
-    What a model leaves out repeats itself from sample to sample and shows in all channels at once. The sandwich A^-1 S
-    A^-1 (White 1982, doi:10.2307/1912526) therefore takes S from the scores J' r summed over blocks of time of one
-    recording, all channels together, and where there are enough from those of single channels of whole recordings (a
-    zero that moves, friction that holds) and of whole recordings (clusters: Cameron, Gelbach, Miller 2011,
-    doi:10.1198/jbes.2010.07136); the largest variance of each unknown counts.
+    The sandwich A^-1 S A^-1 (White 1982, doi:10.2307/1912526) takes S from the scores J' r summed over blocks of time
+    of one recording, all channels together, as a misfit repeats itself from sample to sample and shows in all of them,
+    and where there are enough from single channels of whole recordings (a zero that moves, friction that holds) and
+    whole recordings (clusters: Cameron, Gelbach, Miller 2011, doi:10.1198/jbes.2010.07136); the largest counts.
     """
     if evaluation.jacobian is None or not len(covariance):
         return covariance
-    scale = problem.unknown_scales
     residual, jacobian = linearization_without_weak_priors(problem, evaluation)
-    jacobian = jacobian * scale
+    jacobian = jacobian * (scale := problem.unknown_scales)
     inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
     scores = jacobian * residual[:, None]
     plain = np.maximum(np.diag(covariance), 1e-300)
@@ -205,9 +191,8 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
     """Standard deviation of each unknown, shape (nx,), that of parameters checked against the cost.
 
     The covariance is that of a parabola at the fit. Where it does not fix a parameter well, the cost is worked out at
-    the end of its 95 % interval, the others moved along; where it rises less than the parabola promised, the
-    standard deviation is that of a parabola through there, infinite where the cost does not rise at all. Stiffnesses
-    that are small by chance look informed at the fit and are not. Of more than `_MAX_CHECKED_PARAMETERS` none is asked.
+    the end of its 95 % interval, the others moved along; where it rises less than promised, as for stiffnesses small by
+    chance, the standard deviation is that of a parabola through there, infinite where the cost does not rise at all.
     """
     spread = std_from_covariance(covariance, x)
     lower, upper = problem.bounds
@@ -227,7 +212,7 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
             moved = np.clip(x + sign * step * covariance[:, i] / covariance[i, i], lower, upper)
             trial = problem.evaluate(moved, False, evaluation.equilibrium_guesses)
             if trial.ok:
-                rise = _informed_cost(problem, trial) - _informed_cost(problem, evaluation)
+                rise = cost_without_weak_priors(problem, trial) - cost_without_weak_priors(problem, evaluation)
                 heights.append(max(2.0 * rise / scale, 1e-12) / (step / spread[i]) ** 2)
         if heights and min(heights) < _MIN_COST_RISE_RATIO:
             spread[i] /= math.sqrt(min(heights))
@@ -259,16 +244,13 @@ def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]
     return {"names": [names[i] for i in at], "matrix": kept.tolist()}
 
 
-def _informed_cost(problem: EstimationProblem, evaluation: Evaluation) -> float:
-    """Cost in units of the noise without the weak priors."""
+def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> float:
+    """Cost of data and stated priors in units of the noise."""
     weak, stated = (
         0.5 * float(np.sum(evaluation.residual[rows] ** 2))
         for rows in (problem.residual_rows.weak_priors, problem.residual_rows.stated_priors)
     )
     return (evaluation.cost - weak - stated) / problem.data_residual_noise_std**2 + stated
-
-
-# -- what may be said -------------------------------------------------------------------------------------------------
 
 
 def parameter_verdict(
@@ -402,7 +384,10 @@ def parameter_estimates(
         if said == "not_identifiable":
             std = math.inf
         elif side:
-            interval = _one_sided_interval(value, std, side, _pull(problem, evaluation, at))
+            # the slope of the cost, in units of the noise that the misfit makes
+            residual, jacobian = linearization_without_weak_priors(problem, evaluation)
+            pull = abs(float(jacobian[:, at] @ residual)) / max(1.0, _chi2_per_dof(problem, evaluation))
+            interval = _one_sided_interval(value, std, side, pull)
         initial = float(problem.initial_unknowns[at])
         result[name] = ParameterEstimate(value, std, entry.unit, initial, low, high, True, said, interval)
     return result
@@ -416,21 +401,11 @@ def estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict
     }
 
 
-def _one_sided_interval(value: float, std: float, side: int, slope: float) -> ConfidenceInterval:
-    """95 % interval of a parameter at its bound: slope d + d^2/(2 std^2) = 2.71/2 at a distance d from it."""
-    pull = max(slope, 0.0)
+def _one_sided_interval(value: float, std: float, side: int, pull: float) -> ConfidenceInterval:
+    """95 % interval of a parameter at its bound: pull d + d^2/(2 std^2) = 2.71/2 at a distance d from it."""
     reach = std * (math.sqrt((pull * std) ** 2 + _CHI2_95_ONE_SIDED) - pull * std)
     return (value, value - side * reach) if side < 0 else (value - side * reach, value)
 
-
-def _pull(problem: EstimationProblem, evaluation: Evaluation, at: int) -> float:
-    """Size of the gradient of the cost by one unknown, in units of the noise that the misfit makes."""
-    residual, jacobian = linearization_without_weak_priors(problem, evaluation)
-    scale = max(1.0, _chi2_per_dof(problem, evaluation))
-    return abs(float(jacobian[:, at] @ residual)) / scale
-
-
-# -- in words ----------------------------------------------------------------------------------------------------------
 
 VERDICT_PREDICATES: Mapping[str, str] = {
     "fixed": "is fixed",
@@ -441,10 +416,7 @@ VERDICT_PREDICATES: Mapping[str, str] = {
     "not_trusted": "is not to be trusted",
 }
 """Sentence predicate for a parameter of each verdict."""
-VERDICT_TABLE_TEXTS: Mapping[str, str] = {
-    verdict: text.removeprefix("is ") for verdict, text in VERDICT_PREDICATES.items()
-}
-"""Table text of each verdict."""
+VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VERDICT_PREDICATES.items()}
 
 
 def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
@@ -458,9 +430,7 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
     return f"{said}: no number is to be trusted; run `yid-ocp diagnose`"
 
 
-def value_and_uncertainty_text(
-    value: float, std: float | None, interval: tuple[float | None, float | None] | None
-) -> str:
+def value_and_uncertainty_text(value: float, std: float | None, interval: ConfidenceInterval | None) -> str:
     """Format a value with its 95 % interval, or else its standard deviation where the data inform it."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"

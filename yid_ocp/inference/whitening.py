@@ -30,15 +30,16 @@ Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), Sy
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import scipy.linalg.lapack
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.kalman import FilterStateTransition, KalmanStep, kalman_step_and_covariance
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualDerivativesAtNodes, nominal_trajectory
 from yid_ocp.integrator.step import LinearizedStep, active_state_mask, linearized_steps
 from yid_ocp.integrator.step_model import TrackingFeedback
@@ -50,30 +51,102 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.evaluation import ResidualWhitener
 from yid_ocp.problem.measurements import subtract_estimated_biases
 
-_MIN_TORQUE_GAIN = 0.1
-"""Smallest ratio of acting to recorded torque at which errors of one are converted into errors of the other."""
-_MAX_ROLLOUTS = 6
-"""Largest number of rollouts, each about the torque offset estimated from the one before."""
-_TORQUE_BIAS_TOLERANCE = 0.05
-"""Change of the torque offset, in stated standard deviations, below which the iteration ends."""
+_MIN_TORQUE_GAIN = (
+    0.1  # ratio of acting to recorded torque at which errors of one are converted into those of the other
+)
+_MAX_ROLLOUTS = 6  # each about the torque offset estimated from the one before
+_TORQUE_BIAS_TOLERANCE = 0.05  # change of the torque offset, in stated standard deviations, below which these end
+
+
+@dataclass(frozen=True)
+class FilterStateTransition:
+    """Transition x' = (M x, f p) of the state x = (s, p)."""
+
+    state_rows: Array  # M, shape (ns, nx)
+    decay: Array  # f, shape (nx - ns,)
+
+    def propagate_state(self, columns: Array) -> Array:
+        """States after the step, from those before it, as columns (nx, c)."""
+        return np.vstack([self.state_rows @ columns, self.decay[:, None] * columns[len(self.state_rows) :]])
+
+    def propagate_costate_back(self, costate: Array) -> Array:
+        """Costates before the step, from those after it, by the transposed map, as columns (nx, c)."""
+        ns = len(self.state_rows)
+        earlier = self.state_rows.T @ costate[:ns]
+        earlier[ns:] += self.decay[:, None] * costate[ns:]
+        return earlier
+
+
+@dataclass(frozen=True)
+class KalmanStep:
+    """Measurement update with fixed gains, and transition, of one step of a linear Kalman filter.
+
+    A state x = (s, p) of s and parameters p is measured by y = H x + e with noise e of unit covariance, and goes on by
+    x' = (M x, f p) + process noise. With the covariance P before the measurement and S = I + H P H', the normalized
+    innovations S^(-1/2) (y - H mean) of all steps are independent, of unit variance.
+    """
+
+    observation: Array  # H, shape (r, nx)
+    whitening: Array  # S^(-1/2), shape (r, r)
+    projected_covariance: Array  # S^(-1/2) H P, shape (r, nx)
+    transition: FilterStateTransition
+
+    @property
+    def normalized_observation_matrix(self) -> Array:
+        """S^(-1/2) H, shape (r, nx)."""
+        return self.whitening @ self.observation
+
+    def update(self, mean: Array, measured: Array) -> tuple[Array, Array]:
+        """Normalized innovations (r, c) of measured columns (r, c), and the mean (nx, c) after the step."""
+        white = self.whitening @ (measured - self.observation @ mean)
+        return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
+
+    def smooth_backward(self, white: Array, costate: Array) -> tuple[Array, Array]:
+        """Smoothed noise (r, c), and the costate (nx, c) before the step from that after it.
+
+        The smoothed state is the filter's prediction + P costate.
+        """
+        pulled = self.transition.propagate_costate_back(costate)
+        noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
+        return noise, pulled + self.observation.T @ noise
+
+    def costate_covariance_before_step(self, information: Array) -> Array:
+        """Covariance (nx, nx) of the costate before the step, from that after it."""
+        shaped, projected = self.normalized_observation_matrix, self.projected_covariance
+        pulled = self.transition.propagate_costate_back(self.transition.propagate_costate_back(information).T)
+        pulled -= (pulled @ projected.T) @ shaped
+        found = shaped.T @ shaped + pulled - shaped.T @ (projected @ pulled)
+        return (found + found.T) / 2
+
+
+def kalman_step_and_covariance(
+    covariance: Array, observation: Array, transition: FilterStateTransition
+) -> tuple[KalmanStep, Array, float]:
+    """One filter step with fixed gains, the covariance after it (without process noise), and log det S.
+
+    `covariance` is P (nx, nx) before the measurement by H (r, nx). The determinant is infinite, and S counts by its
+    diagonal alone, where covariances differ by so many decades that rounding shows.
+    """
+    cross = observation @ covariance
+    whitening, log_determinant = np.zeros((0, 0)), 0.0
+    if len(observation):
+        factor, failed = scipy.linalg.lapack.dpotrf(cross @ observation.T + np.eye(len(observation)), lower=1)
+        if failed:
+            factor = np.diag(np.sqrt(1.0 + np.maximum(np.sum(cross * observation, axis=1), 0.0)))
+        whitening = scipy.linalg.lapack.dtrtri(factor, lower=1)[0]
+        log_determinant = math.inf if failed else 2 * float(np.sum(np.log(np.diag(factor))))
+    projected = whitening @ cross
+    later = transition.propagate_state(transition.propagate_state(covariance - projected.T @ projected).T)
+    return KalmanStep(observation, whitening, projected, transition), later, log_determinant
 
 
 @dataclass(frozen=True)
 class _FilterStep:
-    """One step of a frozen filter of (d, w, b): rows of the residual, and their slopes by a known torque (r, nu)."""
+    """One step of a frozen filter of (d, w, b)."""
 
-    rows: IntArray
+    rows: IntArray  # of the residual
     kalman: KalmanStep
-    by_torque: Array
-
-    def update(self, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
-        """Innovations of the rows, and the prediction a step later."""
-        if push is None:
-            return self.kalman.update(mean, own)
-        white, later = self.kalman.update(mean, own - self.by_torque @ push)
-        move = self.kalman.transition.state_rows
-        later[: len(move)] += move[:, len(move) : len(move) + len(push)] @ push
-        return white, later
+    by_torque: Array  # their slopes by a known torque, shape (r, nu)
 
     @property
     def holds_noise(self) -> bool:
@@ -83,11 +156,11 @@ class _FilterStep:
 
 @dataclass(frozen=True)
 class _SmoothedInputErrors:
-    """Smoothed b (nu,), w (N, nu) [N m]; beside encoders the state's error (N + 1, nx), rollout less truth."""
+    """Smoothed input errors of a recording."""
 
-    torque_bias: Array
-    torque_noise: Array
-    state_error: Array
+    torque_bias: Array  # b, shape (nu,) [N m]
+    torque_noise: Array  # w, shape (N, nu) [N m]
+    state_error: Array  # beside encoders: rollout less truth, shape (N + 1, nx)
 
 
 @dataclass(frozen=True)
@@ -150,16 +223,19 @@ class WhiteningFilter:
 
     def _updated(self, k: int, mean: Array, own: Array, push: Array | None) -> tuple[Array, Array]:
         """Innovations of step k, and the mean of another w after it."""
-        step = self.filter_steps[k]
-        white, later = step.update(mean, own, None if push is None or k >= len(push) else push[k])
+        step, nu = self.filter_steps[k], len(self.input_errors.torque_bias)
+        known = None if push is None or k >= len(push) else push[k]
+        white, later = step.kalman.update(mean, own if known is None else own - step.by_torque @ known)
+        if known is not None:
+            move = step.kalman.transition.state_rows
+            later[: len(move)] += move[:, len(move) : len(move) + nu] @ known
         if not step.holds_noise:
-            nu = len(self.input_errors.torque_bias)
             later[len(later) - 2 * nu : len(later) - nu, 0] -= self.input_errors.torque_noise[k + 1]
         return white, later
 
 
 def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) -> WhiteningFilter:
-    """Build the whitening Kalman filter along a trajectory."""
+    """The whitening Kalman filter along a trajectory."""
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
     linear = partial(linearized_steps, step, course.theta, course.rollout)
     slopes = ResidualDerivativesAtNodes.along(course)
@@ -167,17 +243,13 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     live = active_state_mask(step, ends, slopes.visible_state_mask)
     kept = np.flatnonzero(live)
     rows_of_node, slopes = slopes.residual_rows_by_node(count), slopes.select_states(kept)
-    start = np.hstack([course.initial_state_by_angles, course.initial_state_by_torque, course.initial_state_by_torque])[
-        kept
-    ]
-    unit = np.vstack([start, np.eye(2 * nu, 3 * nu, nu)])
+    start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
+    unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.torque_bias_std])
     covariance = first = unit @ unit.T
-    made, steps, momentum = (
-        [],
-        linear(),
-        course.model_functions.momentum_shift.momentum_derivative_by_previous_torque(course.theta),
-    )
+    made, steps = [], linear()
+    # what torques of the step before add to the momenta that the filter follows, shape (nu, nu)
+    momentum = course.model_functions.momentum_shift.momentum_derivative_by_previous_torque(course.theta)
     for k in range(count + 1):
         fresh = k + 1 < count and errors.sample_of_step[k + 1] != errors.sample_of_step[k]
         here, rows = next(steps, None), rows_of_node[k]
@@ -213,8 +285,7 @@ def _error_step(
 ) -> tuple[Array, Array | None, Array | None]:
     """How (d, w, b) comes through step k: d after it (ns, na), prescribed efforts at the node before it, noise of d.
 
-    The efforts (nc, na) are None where there are none, as is what unit noises of their own add to d (ns, s). `momentum`
-    (nu, nu) is what torques of the step before add to the momenta that the filter follows.
+    The efforts (nc, na) are None where there are none, as is what unit noises of their own add to d (ns, s).
     """
     by_state, effort_by_state, shaken = here.state_by_state, here.effort_by_state, None
     by_error, effort_by_error = here.state_by_torque[kept], here.effort_by_torque
@@ -230,9 +301,6 @@ def _error_step(
         by_error, effort_by_error = by_error @ known, effort_by_error @ known
     effort = np.hstack([effort_by_state[:, kept], effort_by_error, effort_by_error]) if len(effort_by_state) else None
     return np.hstack([by_state[np.ix_(kept, kept)], by_error, by_error]), effort, shaken
-
-
-# -- about an episode -------------------------------------------------------------------------------------------------
 
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ResidualWhitener) -> Array:
@@ -311,17 +379,14 @@ def _behind_effects(
     return replace(errors, recorded_torque_noise=read, transmitted_torque_noise=none - without)
 
 
-# -- about a problem --------------------------------------------------------------------------------------------------
-
-
 def problem_whitened_at(
     problem: EstimationProblem, x: ArrayLike, equilibrium_guesses: EquilibriumGuesses | None = None, rounds: int = 1
 ) -> EstimationProblem:
     """The same problem with residuals whitened by sensor and process noise, linearized at `x`.
 
-    Returns the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened
-    already, the new filter is linearized about the smoothed motion and torques of the old one. `rounds` is the number
-    of relinearizations; 2 at a fit.
+    It is the problem itself without process noise, or where the rollout fails at `x`. Where it is whitened already,
+    the new filter is linearized about the smoothed motion and torques of the old one. `rounds` is the number of
+    relinearizations; 2 at a fit.
     """
     x = np.asarray(x, float)
     guesses = equilibrium_guesses or (None,) * len(problem.episodes)
@@ -340,10 +405,7 @@ def problem_whitened_at(
 
 
 def problem_with_whitened_held_out(problem: EstimationProblem, x: ArrayLike) -> EstimationProblem:
-    """The same problem with held-out residuals whitened by all noise at `x` as well, for `whitened_held_out_residual`.
-
-    A recording whose rollout fails is whitened by sensor noise alone.
-    """
+    """Whiten held-out residuals by all noise at `x` as well; by sensor noise alone where a rollout fails."""
     x, episodes, made = np.asarray(x, float), [], []
     for held, (episode, theta, offset) in zip(problem.held_out, problem.held_out_prediction_inputs(x), strict=True):
         own, whitening = _whitened_episode(problem.predictor, episode, (theta, offset), None, None)
@@ -354,10 +416,7 @@ def problem_with_whitened_held_out(problem: EstimationProblem, x: ArrayLike) -> 
 
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
-    """The same problem, its filters relinearized from the torque offsets estimated at `frozen` to those at `x`.
-
-    Their weights are unchanged.
-    """
+    """The same problem, filters relinearized from the torque offsets at `frozen` to those at `x`, weights unchanged."""
     at = [(e, *problem.split(x, i), problem.split(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
     return problem.with_episodes(episodes, problem.held_out, made, problem.held_out_whitening_filters)
@@ -392,7 +451,7 @@ def _with_errors(
 
 
 def estimate_recording_torque_biases(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-    """Estimate each recording's constant torque errors at `x`: values and standard deviations (nu,) [N m].
+    """Each recording's constant torque errors at `x`, and their standard deviations, (nu,) [N m].
 
     None where torques are taken as exact, or where no whitening filter is set (`problem_whitened_at`).
     """

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from yid_ocp.analysis.compare import MethodComparison
-from yid_ocp.analysis.sparsity_patterns import NamedIndexRange, SparsityPattern
+from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
 from yid_ocp.errors import OutputError
 from yid_ocp.report.figures import LINE_COLORS, asymmetric_error_bars, relative_excess_costs
 

@@ -5,7 +5,7 @@ from yid_ocp.solvers.base import Iterate as Iterate
 from yid_ocp.solvers.base import Solution as Solution
 from yid_ocp.solvers.base import Status as Status
 from yid_ocp.solvers.base import solve as solve
-from yid_ocp.solvers.gauss_newton import GaussNewton as GaussNewton
+from yid_ocp.solvers.gradient_methods import GaussNewton as GaussNewton
 from yid_ocp.solvers.gradient_methods import SingleShooting as SingleShooting
 from yid_ocp.solvers.gradient_methods import SteepestDescent as SteepestDescent
 from yid_ocp.solvers.multiple_shooting import MultipleShooting as MultipleShooting

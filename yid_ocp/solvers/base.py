@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 import threadpoolctl
@@ -32,6 +32,7 @@ from yid_ocp.inference.uncertainty import (
     value_and_uncertainty_text,
 )
 from yid_ocp.inference.whitening import problem_whitened_at, problem_whitened_by_sensor_noise
+from yid_ocp.options import check_option_bounds
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
@@ -56,19 +57,15 @@ class Status(str, Enum):
 
 @dataclass(frozen=True)
 class Iterate:
-    """One accepted iterate of a solver.
-
-    `gradient_norm` is the largest scaled component of the projected gradient; rollouts of all recordings and wall time
-    [s] are counted from the start; `note` says anything out of the ordinary, such as a shortened horizon.
-    """
+    """One accepted iterate of a solver; evaluations and wall time are counted from the start."""
 
     iteration: int
     cost: float
     x: Array
-    gradient_norm: float
-    n_evaluations: int
+    gradient_norm: float  # largest scaled component of the projected gradient
+    n_evaluations: int  # rollouts of all recordings
     seconds: float
-    note: str = ""
+    note: str = ""  # anything out of the ordinary, such as a shortened horizon
 
 
 @dataclass(frozen=True, repr=False)
@@ -79,15 +76,13 @@ class Solution(ReprMixin):
     ----------
     message : str
         Why it ended, and what to try where it did not converge.
-    unknown_names : tuple of str
-        In the order of `x`, the unknown vector of lowest cost, shape (nx,).
+    x : ndarray, shape (nx,)
+        The unknown vector of lowest cost, in the order of `unknown_names`.
     covariance : ndarray, shape (nx, nx)
         From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one, and
         counting the misfit where the model does not explain the data (`uncertainty.misfit_widened_covariance`).
     parameters : dict of str to ParameterEstimate
         Free parameters shared by all recordings, and the fixed ones that the problem's model has.
-    goodness_of_fit : GoodnessOfFit
-        Whether the model explains the recordings.
     wall_time : float
         [s]
     evaluation : Evaluation or None
@@ -113,11 +108,10 @@ class Solution(ReprMixin):
 
     def _summary(self) -> ReprSummary:
         free = {name: entry for name, entry in self.parameters.items() if entry.free}
-        words = {
-            name: value_and_uncertainty_text(e.value, finite_or_none(e.std), e.interval) for name, e in free.items()
-        }
-        rows = [("parameter", "value", "unit", "")]
-        rows += [(name, words[name], e.unit, VERDICT_TABLE_TEXTS[e.verdict]) for name, e in free.items()]
+        words, rows = {}, [("parameter", "value", "unit", "")]
+        for name, e in free.items():
+            words[name] = value_and_uncertainty_text(e.value, finite_or_none(e.std), e.interval)
+            rows.append((name, words[name], e.unit, VERDICT_TABLE_TEXTS[e.verdict]))
         told = [f"{name} = {words[name]} {e.unit}" for name, e in free.items() if e.verdict == "identifiable"][:3]
         more = f"and {count_with_noun(len(free) - len(told), 'more parameter')}" if len(free) > len(told) else ""
         fit = f"chi2 per degree of freedom {self.goodness_of_fit.chi2_per_dof:.3g}"
@@ -143,38 +137,28 @@ class Solution(ReprMixin):
         found = problem.evaluate(self.x, False, self.evaluation.equilibrium_guesses)
         if found.ok:
             return found.episode_predictions
-        return tuple(
-            problem.predictor.predict_episode(episode, *problem.split(self.x, i), False)
-            for i, episode in enumerate(problem.episodes)
-        )
+        predict, pairs = problem.predictor.predict_episode, enumerate(problem.episodes)
+        return tuple(predict(episode, *problem.split(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:
         """Measured and predicted samples of every channel of the recordings at the estimate; empty without one."""
         pairs = zip(() if self.problem is None else self.problem.episodes, self.episode_predictions, strict=False)
-        return tuple(
-            s for episode, result in pairs if not isinstance(result, str) for s in channel_predictions(episode, result)
-        )
+        known = [(episode, result) for episode, result in pairs if not isinstance(result, str)]
+        return tuple(sample for pair in known for sample in channel_predictions(*pair))
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Parameters as a pandas data frame, free ones first: value, std, lower, upper, unit, verdict, free, initial.
 
-        `lower` and `upper` are the 95 % interval, infinite at an open end and where nothing is known.
-
-        Raises
-        ------
-        ConfigError
-            pandas is not installed.
+        `lower` and `upper` are the 95 % interval, infinite at an open end and where nothing is known. Raises
+        `ConfigError` where pandas is not installed.
         """
         try:
             pandas = importlib.import_module("pandas")
         except ImportError as error:
             raise ConfigError("pandas is not installed", hint="pip install 'yid-ocp[pandas]'") from error
-        entries = sorted(self.parameters.items(), key=lambda entry: not entry[1].free)
-        columns = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"]
-        rows = {
-            name: (e.value, e.std, *e.confidence_interval_ends, e.unit, e.verdict, e.free, e.initial)
-            for name, e in entries
-        }
+        columns, rows = ["value", "std", "lower", "upper", "unit", "verdict", "free", "initial"], {}
+        for name, e in sorted(self.parameters.items(), key=lambda entry: not entry[1].free):
+            rows[name] = (e.value, e.std, *e.confidence_interval_ends, e.unit, e.verdict, e.free, e.initial)
         return pandas.DataFrame.from_dict(rows, orient="index", columns=columns).rename_axis("parameter")
 
 
@@ -183,10 +167,7 @@ IterationCallback = Callable[[Iterate], None]
 
 @dataclass(frozen=True)
 class SolverResult:
-    """Raw result of a solver: its best unknown vector, and the equilibria there where they are known.
-
-    `stopped_at_noise_level`: the search ended because many steps reduced the cost negligibly compared with the noise.
-    """
+    """Raw result of a solver: its best unknown vector, and the equilibria there where they are known."""
 
     status: Status
     message: str
@@ -194,7 +175,7 @@ class SolverResult:
     history: tuple[Iterate, ...]
     n_evaluations: int
     equilibrium_guesses: EquilibriumGuesses | None = None
-    stopped_at_noise_level: bool = False
+    stopped_at_noise_level: bool = False  # many steps lowered the cost negligibly compared with the noise
 
 
 @runtime_checkable
@@ -216,6 +197,15 @@ class Solver(Protocol):
     ) -> SolverResult:
         """Minimise the problem's cost from `start`."""
         ...
+
+
+class CheckedSolver:
+    """Base of the package's own solvers, whose settings are checked against their annotated bounds."""
+
+    name: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        check_option_bounds(self, f"solver {self.name}")
 
 
 SOLVERS: Registry[type[Solver]] = Registry("solver")
@@ -289,8 +279,6 @@ def solve(
         `GaussNewton()` when absent.
     initial_unknowns : sequence of float, optional
         The problem's when absent.
-    callback : callable, optional
-        Called with every `Iterate`.
     limits : ExcessResidualCriteria
         Criteria for a residual that exceeds noise.
     restarts : bool
@@ -347,11 +335,8 @@ class _MultiStartSearch:
             self._try(self._multiple(first, factor), f"initial values x {factor:g}", most)
         once = len(self._fits) == 1 and noisy and _accounts_for_process_noise(self._solver)
         if once and np.any(_doubtful(self._best, first)):
-            self._try(
-                self._multiple(first, INITIAL_VALUE_RESTART_FACTORS[0]),
-                f"initial values x {INITIAL_VALUE_RESTART_FACTORS[0]:g}",
-                2,
-            )
+            factor = INITIAL_VALUE_RESTART_FACTORS[0]
+            self._try(self._multiple(first, factor), f"initial values x {factor:g}", 2)
         if not uses_process_noise_covariance(self._solver):
             return
         most = self._n_starts + len(_NEARBY_START_FACTORS)
@@ -424,7 +409,7 @@ def _noting(callback: IterationCallback | None, note: str) -> IterationCallback 
     """The callback for a part of the search, whose points say which part it is."""
     if callback is None or not note:
         return callback
-    return lambda entry: callback(replace(entry, note=f"{note}, {entry.note}" if entry.note else note))
+    return lambda entry: callback(replace(entry, note=", ".join(filter(None, (note, entry.note)))))
 
 
 def _fit_from(
@@ -434,10 +419,7 @@ def _fit_from(
     callback: IterationCallback | None,
     known: Sequence[_Fit] = (),
 ) -> _Fit:
-    """The fit of one start, by shorter horizons where the rollout fails there.
-
-    A search that has come to one of the `known` fits is not weighted again: it would end there.
-    """
+    """The fit of one start, by shorter horizons where the rollout fails there."""
     history: list[Iterate] = []
     evaluations = 0
     if getattr(solver, "needs_rollout", True) and not problem.evaluate(x, derivatives=False).ok:
@@ -468,6 +450,7 @@ def _fit_from(
         # the second pass is the first about torque offsets that are not guessed
         if number and len(result.history) < 2:
             break
+        # a search that has come to a known fit is not weighted again: it would end there
         if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:
             return replace(same, n_evaluations=evaluations, history=history)
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
@@ -523,7 +506,6 @@ def uses_process_noise_covariance(solver: Solver) -> bool:
 
 
 def _accounts_for_process_noise(solver: Solver) -> bool:
-    """Whether a solver accounts for process noise, by its covariance or with the errors as unknowns."""
     return uses_process_noise_covariance(solver) or bool(getattr(solver, "estimates_torque_errors", False))
 
 

@@ -1,8 +1,9 @@
-"""First-order methods on the adjoint's gradient: SciPy's L-BFGS-B, and the source paper's steepest descent."""
+"""Methods that follow derivatives of a rollout: Gauss-Newton, L-BFGS-B, and the source paper's steepest descent."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -10,10 +11,20 @@ import scipy.optimize
 from annotated_types import Ge, Gt, Lt
 
 from yid_ocp.arrays import Array
-from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.inference.linearized_residual import (
+    achievable_cost_reduction,
+    bounded_levenberg_marquardt_step,
+    is_stationary_point,
+    predicted_cost_reduction,
+)
+from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED, unknowns_covariance_and_reduced_chi2
+from yid_ocp.options import OptionInfo
 from yid_ocp.problem.estimation_problem import EstimationProblem
+from yid_ocp.problem.evaluation import EvaluateFunction, Evaluation
 from yid_ocp.solvers.base import (
     SOLVERS,
+    CheckedSolver,
+    Iterate,
     IterationCallback,
     IterationRecorder,
     SolverResult,
@@ -21,10 +32,126 @@ from yid_ocp.solvers.base import (
     projected_gradient_norm,
 )
 
+# A positive unknown falls by no more than this factor in one step, until it is this part of its typical size.
+_MAX_DECREASE_FACTOR, _NEAR_ZERO_FRACTION = 10.0, 1e-3
+# So many accepted steps in a row are the end if together they save no more of the cost than this, a tenth of what one
+# standard deviation is worth, and move no unknown by more than this part of its standard deviation, and if the linear
+# model promises no more than what a 95 % interval is worth.
+_PATIENCE_STEPS, _NEGLIGIBLE_COST_REDUCTION, _NEGLIGIBLE_MOVE_STDS = 20, 0.05, 0.1
+_LOWEST = "the cost cannot be lowered any further"
+
+
+@SOLVERS.register("gauss_newton")
+@dataclass(frozen=True)
+class GaussNewton(CheckedSolver):
+    """Minimise 1/2 |r(x)|^2 by bounded, damped linear least-squares steps.
+
+    Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
+    falls by a fair part of what the linear model promised. A short step, or one that damping keeps from promising
+    anything, is no end (`is_stationary_point`). Many steps that are worth nothing beside the noise are one: where the
+    valley is rough (friction that turns, fast waves over many seconds) the linear model promises what no step keeps.
+
+    References
+    ----------
+    Nocedal and Wright (2006), Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5.
+    """
+
+    max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 60
+    step_tolerance: Annotated[
+        float,
+        Gt(0),
+        OptionInfo("converged when no unknown moves by more than this fraction of its size, and none should"),
+    ] = 1e-5
+    cost_tolerance: Annotated[
+        float, Gt(0), OptionInfo("converged when the predicted relative reduction of the cost is below this")
+    ] = 1e-8
+    initial_damping: Annotated[
+        float, Gt(0), OptionInfo("initial mu, in units of the largest diagonal entry of the scaled normal matrix")
+    ] = 1e-6
+    name: ClassVar[str] = "gauss_newton"
+    uses_process_noise_covariance: ClassVar[bool] = True
+
+    def minimize_cost(
+        self,
+        problem: EstimationProblem,
+        start: Array,
+        callback: IterationCallback | None,
+        evaluate: EvaluateFunction | None = None,
+    ) -> SolverResult:
+        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may replace its evaluation."""
+        evaluate = evaluate or problem.evaluate
+        (lower, upper), scale = problem.bounds, problem.unknown_scales
+        recorder, x = IterationRecorder(callback), start.copy()
+        now = evaluate(x)
+        recorder.n_evaluations += 1
+        if not now.ok or now.jacobian is None:
+            return recorder.result(Status.FAILED, now.message, x)
+
+        def ended(status: Status, message: str) -> SolverResult:
+            return recorder.result(status, message, x, now.equilibrium_guesses)
+
+        mu, rejected = self.initial_damping, 0
+        while True:
+            jacobian, residual = now.jacobian, now.residual
+            assert jacobian is not None
+            size = np.maximum(np.abs(x), scale)
+            if rejected == 0:
+                slope = projected_gradient_norm(x, jacobian.T @ residual, lower, upper, size)
+                recorder.record_iterate(now.cost, x, slope)
+                saved = _saved(problem, recorder.history, now)
+                if saved is not None:
+                    last = f"the last {_PATIENCE_STEPS} steps lowered the cost by {saved:.2g} together"
+                    message = f"{last} and moved nothing by a tenth of its standard deviation"
+                    return replace(ended(Status.CONVERGED, message), stopped_at_noise_level=True)
+            if len(recorder.history) > self.max_iterations:
+                remedy = "raise solver.max_iterations or free fewer parameters"
+                return ended(Status.ITERATION_LIMIT, f"no convergence in {self.max_iterations} iterations; {remedy}")
+            # the linear model is good for a factor, not for a jump to a bound at zero, whence little leads back
+            guarded = problem.positive_unknowns_mask & (x > _NEAR_ZERO_FRACTION * scale)
+            low = (np.where(guarded, np.maximum(lower, x / _MAX_DECREASE_FACTOR), lower) - x) / size
+            step = size * bounded_levenberg_marquardt_step(jacobian * size, residual, mu, low, (upper - x) / size)
+            promised = predicted_cost_reduction(jacobian, residual, step)
+            # damping makes any step promise little
+            if promised <= self.cost_tolerance * max(now.cost, 1e-300) and is_stationary_point(problem, x, now):
+                return ended(Status.CONVERGED, _LOWEST)
+            trial = evaluate(np.clip(x + step, lower, upper), equilibrium_guesses=now.equilibrium_guesses)
+            recorder.n_evaluations += 1
+            gain = (now.cost - trial.cost) / promised if trial.ok and promised > 0 else -1.0
+            if gain > 1e-3:
+                moved = float(np.max(np.abs(step) / size))
+                x, now, rejected = np.clip(x + step, lower, upper), trial, 0
+                mu = max(mu * (0.2 if gain > 0.5 else 1.0 if gain > 0.2 else 3.0), 1e-12)
+                if moved < self.step_tolerance and now.jacobian is not None and is_stationary_point(problem, x, now):
+                    slope = projected_gradient_norm(x, now.jacobian.T @ now.residual, lower, upper, size)
+                    recorder.record_iterate(now.cost, x, slope)
+                    return ended(Status.CONVERGED, "the step is below its tolerance")
+                continue
+            rejected += 1
+            mu = max(mu * 8.0, 1e-6)
+            if mu > 1e10 or rejected > 40:
+                if is_stationary_point(problem, x, now):
+                    return ended(Status.CONVERGED, _LOWEST)
+                reason = f"no step lowers the cost ({trial.message or 'the linear model does not hold'})"
+                return ended(Status.STALLED, f"{reason}; start nearer, shorten the recording, or use multiple_shooting")
+
+
+def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluation) -> float | None:
+    """What the last steps saved of the cost together, if that is worth nothing; else None."""
+    if len(history) <= _PATIENCE_STEPS:
+        return None
+    before, last = history[-1 - _PATIENCE_STEPS], history[-1]
+    saved, unit = before.cost - last.cost, problem.data_residual_noise_std**2
+    if saved > _NEGLIGIBLE_COST_REDUCTION * unit:
+        return None
+    if achievable_cost_reduction(problem, last.x, now) > 0.5 * CHI2_95_TWO_SIDED * unit:
+        return None
+    std = np.sqrt(np.maximum(np.diag(unknowns_covariance_and_reduced_chi2(problem, now)[0]), 0.0))
+    return saved if np.all(np.abs(last.x - before.x) <= _NEGLIGIBLE_MOVE_STDS * std) else None
+
 
 @SOLVERS.register("single_shooting")
 @dataclass(frozen=True)
-class SingleShooting:
+class SingleShooting(CheckedSolver):
     """Minimise the cost by SciPy's L-BFGS-B on unknowns scaled to order one.
 
     References
@@ -37,9 +164,6 @@ class SingleShooting:
         float, Gt(0), OptionInfo("converged when the cost falls by less than this fraction in an iteration")
     ] = 1e-9
     name: ClassVar[str] = "single_shooting"
-
-    def __post_init__(self) -> None:
-        check_option_bounds(self, f"solver {self.name}")
 
     def minimize_cost(
         self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
@@ -71,15 +195,10 @@ class SingleShooting:
             recorder.record_iterate(cost, x, projected_gradient_norm(x, gradient, lower, upper, scale))
 
         accepted(scipy.optimize.OptimizeResult(x=start / scale))
+        options = {"maxiter": self.max_iterations, "ftol": self.cost_tolerance, "gtol": 1e-9, "maxls": 40, "maxcor": 20}
+        bounds = scipy.optimize.Bounds(lower / scale, upper / scale)
         result = scipy.optimize.minimize(
-            function,
-            start / scale,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=scipy.optimize.Bounds(lower / scale, upper / scale),
-            callback=accepted,
-            options={"maxiter": self.max_iterations, "ftol": self.cost_tolerance, "gtol": 1e-9}
-            | {"maxls": 40, "maxcor": 20},
+            function, start / scale, jac=True, method="L-BFGS-B", bounds=bounds, callback=accepted, options=options
         )
         best = min(recorder.history, key=lambda entry: entry.cost if np.isfinite(entry.cost) else np.inf)
         status = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}.get(result.status, Status.STALLED)
@@ -88,7 +207,7 @@ class SingleShooting:
 
 @SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
-class SteepestDescent:
+class SteepestDescent(CheckedSolver):
     """Projected steepest descent: x <- P(x - s g), P the projection on the bounds, s by Armijo backtracking.
 
     The gradient comes from the adjoint. Unscaled on purpose: this is what the paper did.
@@ -119,9 +238,6 @@ class SteepestDescent:
         int, Ge(1), OptionInfo("the cost must fall below the largest of so many last ones; 1 is the paper's")
     ] = 1
     name: ClassVar[str] = "steepest_descent"
-
-    def __post_init__(self) -> None:
-        check_option_bounds(self, f"solver {self.name}")
 
     def minimize_cost(
         self, problem: EstimationProblem, start: Array, callback: IterationCallback | None

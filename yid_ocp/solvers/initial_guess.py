@@ -21,9 +21,8 @@ from yid_ocp.problem.signal_filters import LowPassFilter
 
 log = logging.getLogger(__name__)
 
-
+# Mean square whitened residual of a recording, by its number, with given node states, at unknowns of the problem.
 _MisfitFunction = Callable[[int, Array, Array], float]
-"""Mean square whitened residual of a recording, by its number, with given node states, at unknowns of the problem."""
 # Values tried of every shape parameter, across its range.
 _N_SHAPE_VALUES = 4
 # Part of an amplitude's range at which an effect begins that has no slope at its neutral value, and at the least.
@@ -40,15 +39,12 @@ _EQUILIBRIUM_SPACING = 0.1
 
 @dataclass(frozen=True)
 class NodeStateGuess:
-    """Guess of the unknown vector, and of each recording's initial state, node states and constraint multipliers.
-
-    Node states have the shape (K + 1, nx), multipliers (K, m) or (N, m).
-    """
+    """Guess of the unknown vector, and of each recording's initial state, node states and constraint multipliers."""
 
     x: Array
     initial_states: tuple[InitialState, ...]
-    node_states: tuple[Array, ...]
-    multipliers: tuple[Array, ...]
+    node_states: tuple[Array, ...]  # shape (K + 1, nx) each
+    multipliers: tuple[Array, ...]  # shape (K, m) or (N, m) each
 
 
 def guess_node_states(
@@ -57,8 +53,8 @@ def guess_node_states(
     """Guess node states near a solution, at an unknown vector or, where that fits poorly, at multiples of it.
 
     A recording's states are the rollout under the tracking filter, which has no defects, or, where that fails or strays
-    from what was measured, every node at rest at the posture that the arms had then, which has defects but follows the
-    data. `nodes`, of every recording, have the shape (K + 1,).
+    from what was measured, every node (`nodes`, (K + 1,) of every recording) at rest at the posture that the arms had
+    then, which has defects but follows the data.
     """
     lower, upper = problem.bounds
     best: tuple[float, NodeStateGuess] | None = None
@@ -87,8 +83,9 @@ def guess_node_states(
     return best[1]
 
 
-def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, theta: Array) -> float:
+def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
     """Mean square whitened residual of a trajectory (N + 1, nx) of recording `i`, without effort channels."""
+    theta = problem.predictor.theta_with_episode_values(problem.episodes[i], problem.split(x, i)[0])
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameters)))
     parts = [np.zeros(1)]
     for samples in problem.episodes[i].measurements:
@@ -142,9 +139,6 @@ def _resting(
     velocity = np.gradient(state[:, :n], times, axis=0)
     state[:, n : 2 * n] += generalized_momentum(step, state[:, :n], velocity, theta)
     return state, pull[:-1] * h
-
-
-# -- free effects ------------------------------------------------------------------------------------------------------
 
 
 def unknowns_with_active_effects(problem: EstimationProblem, x: Array) -> Array:

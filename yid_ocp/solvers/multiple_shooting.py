@@ -16,11 +16,12 @@ from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step, predicted_cost_reduction
 from yid_ocp.integrator.step import simulate
 from yid_ocp.integrator.step_model import Rollout, SensitivityDirections
-from yid_ocp.options import OptionInfo, check_option_bounds
+from yid_ocp.options import OptionInfo
 from yid_ocp.problem.episodes import InitialState
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.solvers.base import (
     SOLVERS,
+    CheckedSolver,
     IterationCallback,
     IterationRecorder,
     SolverResult,
@@ -43,10 +44,8 @@ from yid_ocp.solvers.symbolic_transcription import (
 
 log = logging.getLogger(__name__)
 
-
 _MEMORY_WARNING_BYTES = 2e9
 _CONDENSING_NODE_INTERVAL = 20
-
 # Condensing. Largest factor by which one iteration changes an unknown that is positive by nature.
 _MAX_CHANGE_FACTOR = 3.0
 # Fraction of a point's cost or defects that a better point may at most have; shortest fraction of a step that is tried.
@@ -60,7 +59,7 @@ _CLOSED_DEFECT = 1e-7
 
 @SOLVERS.register("multiple_shooting")
 @dataclass(frozen=True)
-class MultipleShooting:
+class MultipleShooting(CheckedSolver):
     """Multiple shooting: minimize 1/2 |r|^2 over parameters and node states, subject to the equations of motion.
 
     IPOPT solves the program of `transcribe`, with the DEL equations of every step as constraints. Defects are scaled to
@@ -108,9 +107,6 @@ class MultipleShooting:
     name: ClassVar[str] = "multiple_shooting"
     needs_rollout: ClassVar[bool] = False
 
-    def __post_init__(self) -> None:
-        check_option_bounds(self, f"solver {self.name}")
-
     @property
     def estimates_torque_errors(self) -> bool:
         """Whether the torque errors are estimated as unknowns of the program."""
@@ -124,8 +120,6 @@ class MultipleShooting:
             return self._by_condensing(problem, start, IterationRecorder(callback))
         self._check_ipopt_settings()
         return self._by_ipopt(problem, start, IterationRecorder(callback))
-
-    # -- IPOPT --------------------------------------------------------------------------------------------------------
 
     def _check_ipopt_settings(self) -> None:
         told: tuple[str, ...] = ()
@@ -202,8 +196,6 @@ class MultipleShooting:
             return Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
         return Status.STALLED, f"IPOPT: {returned}, {closed}; start nearer, or use gauss_newton"
 
-    # -- condensing ---------------------------------------------------------------------------------------------------
-
     def _by_condensing(self, problem: EstimationProblem, start: Array, recorder: IterationRecorder) -> SolverResult:
         intervals = _ShootingIntervals(problem, self.node_interval or _CONDENSING_NODE_INTERVAL)
         x, nodes = intervals.initial_guess(start)
@@ -221,9 +213,8 @@ class MultipleShooting:
             gradient = now.jacobian.T @ now.residual
             recorder.record_iterate(now.cost, x, projected_gradient_norm(x, gradient, *problem.bounds, size))
             closed = now.residual + now.by_defect
-            step = size * bounded_levenberg_marquardt_step(
-                now.jacobian * size, closed, mu, *_step_bounds(problem, x, size)
-            )
+            bounds = _step_bounds(problem, x, size)
+            step = size * bounded_levenberg_marquardt_step(now.jacobian * size, closed, mu, *bounds)
             promised = predicted_cost_reduction(now.jacobian, closed, step)
             moved = float(np.max(np.abs(step) / size, initial=0.0))
             flat = mu < _MAX_TRUSTED_DAMPING and promised <= self.cost_tolerance * now.cost
@@ -266,11 +257,9 @@ class _AdaptiveRidge(ca.Callback):
         return ca.Sparsity.dense(self._size, 1)
 
     def eval(self, _: Sequence[ca.DM]) -> list[float]:
-        """The factor, whatever the point is."""
         return [self.factor]
 
     def update(self, before: Array, after: Array) -> None:
-        """Take note of an iterate."""
         change = (after - before) / np.maximum(np.abs(after), self._scale)
         turned = float(change @ self._change) < 0
         self.factor = 4.0 * self.factor if turned else max(0.5 * self.factor, MIN_RIDGE_FACTOR)
@@ -304,7 +293,6 @@ class _Watch(ca.Callback):
         return ca.Sparsity.dense(self._sizes[ca.nlpsol_out(i)], 1)
 
     def eval(self, arguments: Sequence[ca.DM]) -> list[int]:
-        """Enter an iterate; never stops the solver."""
         w = np.array(arguments[0]).ravel()
         cost, slope, _ = self._functions(w, self._program.parameter_values)
         assert self._program.ridge is not None
@@ -316,9 +304,6 @@ class _Watch(ca.Callback):
         note = "" if self.recorder.history else "start"
         self.recorder.record_iterate(float(cost), x, float(ca.norm_inf(slope)) / self.unit, note)
         return [0]
-
-
-# -- condensing -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -378,27 +363,18 @@ class _ShootingIntervals:
         for episode in problem.episodes:
             steps = episode.grid.steps
             if steps < node_interval:
-                raise SolverError(
-                    f"the recording has {steps} steps, fewer than one node interval of {node_interval}",
-                    where=episode.name,
-                    allowed=f"solver.node_interval from 1 to {steps}",
-                )
+                message = f"the recording has {steps} steps, fewer than one node interval of {node_interval}"
+                raise SolverError(message, where=episode.name, allowed=f"solver.node_interval from 1 to {steps}")
             if any(s.sensor.effort_joints for s in episode.measurements):
-                raise SolverError(
-                    "effort channels depend on whole steps, which node states do not carry",
-                    where=episode.name,
-                    hint="use gauss_newton",
-                )
+                message = "effort channels depend on whole steps, which node states do not carry"
+                raise SolverError(message, where=episode.name, hint="use gauss_newton")
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
         # equilibria are looked for near those of the problem's start, whatever the point
-        starts = [
-            problem.initial_state(episode, problem.split(problem.initial_unknowns, i)[0])
-            for i, episode in enumerate(problem.episodes)
-        ]
+        thetas = (problem.split(problem.initial_unknowns, i)[0] for i in range(len(problem.episodes)))
+        starts = map(problem.initial_state, problem.episodes, thetas)
+        found = [None if start.failure_message else start.equilibrium for start in starts]
         n = problem.step.sizes["n"]
-        self.equilibrium_guesses = tuple(
-            None if s.equilibrium is None or s.failure_message else s.equilibrium.state[:n] for s in starts
-        )
+        self.equilibrium_guesses = tuple(None if rest is None else rest.state[:n] for rest in found)
 
     def initial_guess(self, start: Array) -> tuple[Array, list[Array]]:
         """Unknowns near `start` and the node states of every recording."""
@@ -413,7 +389,7 @@ class _ShootingIntervals:
         theta = self.problem.predictor.theta_with_episode_values(self.problem.episodes[i], self.problem.split(x, i)[0])
         rollouts = [self._rollout(i, j, nodes[j], theta, None) for j in range(len(nodes) - 1)]
         trajectory = np.vstack([*(rollout.state[:-1] for rollout in rollouts), rollouts[-1].state[-1:]])
-        return mean_square_residual_without_efforts(self.problem, i, trajectory, theta)
+        return mean_square_residual_without_efforts(self.problem, i, trajectory, x)
 
     def moved(self, nodes: list[Array], now: _Linearization, step: Array, factor: float) -> list[Array]:
         """Node states after a part of a step of the unknowns that also closes as large a part of the defects."""
@@ -473,7 +449,6 @@ class _ShootingIntervals:
         return trajectory, slopes, by_nodes[:, :, :width], by_nodes[:, :, width], float(np.max(np.abs(gaps)))
 
     def _rollout(self, i: int, j: int, start: Array, theta: Array, directions: SensitivityDirections | None) -> Rollout:
-        """Rollout of one interval under the recording's tracking feedback."""
         episode, (first, last) = self.problem.episodes[i], self.node_steps[i][j : j + 2].tolist()
         feedback = episode.tracking_feedback
         if feedback is not None:

@@ -108,31 +108,16 @@ class NonlinearProgram(ReprMixin):
 
     `nlp[name]` is a block of `variables` or `parameters` as MX of its shape; where there is one recording, `nlp["q"]`
     stands for `nlp["q[NAME]"]`.
-
-    Attributes
-    ----------
-    variables, parameters : mapping of str to _VectorBlock
-        What the columns `w` of unknowns and `p` of parameters are made of.
-    constraint_terms : tuple of ProgramTerm
-        Equalities, one below the other in `g`.
-    residual_terms : tuple of ResidualTerm
-        Their losses make the objective.
-    lower, upper, initial_guess : ndarray, shape (nw,)
-        Of `w`.
-    parameter_values : ndarray, shape (np,)
-        Of `p`.
-    user_terms : tuple
-        What `with_user_terms` added.
     """
 
-    variables: Mapping[str, _VectorBlock]
-    parameters: Mapping[str, _VectorBlock]
-    constraint_terms: tuple[ProgramTerm, ...]
-    residual_terms: tuple[ResidualTerm, ...]
-    lower: Array
+    variables: Mapping[str, _VectorBlock]  # what the column `w` of unknowns is made of
+    parameters: Mapping[str, _VectorBlock]  # what the column `p` of parameters is made of
+    constraint_terms: tuple[ProgramTerm, ...]  # equalities, one below the other in `g`
+    residual_terms: tuple[ResidualTerm, ...]  # their losses make the objective
+    lower: Array  # of `w`, shape (nw,), as `upper` and the guess
     upper: Array
     initial_guess: Array
-    parameter_values: Array
+    parameter_values: Array  # of `p`, shape (np,)
     ridge: RidgeRegularization | None
     w: ca.MX
     p: ca.MX
@@ -143,15 +128,10 @@ class NonlinearProgram(ReprMixin):
         equalities = count_with_noun(sum(term.n_values for term in self.constraint_terms), "equation")
         return ReprSummary(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
 
-    # -- what it is made of -------------------------------------------------------------------------------------------
-
     def block(self, name: str) -> _VectorBlock:
-        """Return a block by its name; with one recording, `[NAME]` may be left out.
+        """A block by its name; with one recording, `[NAME]` may be left out.
 
-        Raises
-        ------
-        SolverError
-            There is none, or more than one.
+        Raises `SolverError` where there is none, or more than one.
         """
         blocks = {**self.variables, **self.parameters}
         if name in blocks:
@@ -159,9 +139,8 @@ class NonlinearProgram(ReprMixin):
         alike = [key for key in blocks if key.startswith(f"{name}[")]
         if len(alike) == 1:
             return blocks[alike[0]]
-        raise SolverError(
-            f"the program has {len(alike)} blocks '{name}'", hint=nearest_name_hint(name, alike or blocks)
-        )
+        message = f"the program has {len(alike)} blocks '{name}'"
+        raise SolverError(message, hint=nearest_name_hint(name, alike or blocks))
 
     def __getitem__(self, name: str) -> ca.MX:
         """Block of variables or parameters as an MX matrix of its shape."""
@@ -180,19 +159,14 @@ class NonlinearProgram(ReprMixin):
 
     def constraint_names(self) -> tuple[str, ...]:
         """Names of all rows of `g`: term, row and place; `added.I` for those of `with_user_terms`."""
-        terms = [
-            f"{t.name}.{row}.{k}"
-            for t in self.constraint_terms
-            for k in range(len(t.variable_indices))
-            for row in t.row_names
-        ]
+        places = ((t, k) for t in self.constraint_terms for k in range(len(t.variable_indices)))
+        terms = [f"{t.name}.{row}.{k}" for t, k in places for row in t.row_names]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
 
     @ThreadSafeCachedProperty
     def f(self) -> ca.MX:
         """Symbolic objective f(w, p), a scalar."""
-        own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
-        return sum(self._losses, ca.MX(0)) + own
+        return sum((*self._losses, *(extra.objective for extra in self.user_terms)), ca.MX(0))
 
     @ThreadSafeCachedProperty
     def g(self) -> ca.MX:
@@ -212,8 +186,6 @@ class NonlinearProgram(ReprMixin):
         low, high = ([zero, *(getattr(extra, side) for extra in self.user_terms)] for side in ("lower", "upper"))
         bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
         return {"x0": self.initial_guess, "p": self.parameter_values, **bounds}
-
-    # -- derivatives --------------------------------------------------------------------------------------------------
 
     @ThreadSafeCachedProperty
     def _residuals(self) -> list[ca.MX]:
@@ -326,8 +298,6 @@ class NonlinearProgram(ReprMixin):
         """Estimated additional memory of an interior-point method with a direct linear solver [bytes]."""
         return _BYTES_PER_ENTRY * float(self.jac_g.nnz() + self.hessian(hessian).nnz())
 
-    # -- use ----------------------------------------------------------------------------------------------------------
-
     def with_user_terms(
         self,
         objective: ca.MX | float = 0.0,
@@ -337,44 +307,30 @@ class NonlinearProgram(ReprMixin):
     ) -> NonlinearProgram:
         """The program with a further scalar objective term and further constraint rows, expressions of `w` and `p`.
 
-        Rows without bounds are equalities to zero.
-
-        Raises
-        ------
-        SolverError
-            An expression of other symbols, or bounds of another number than rows.
+        Rows without bounds are equalities to zero. Raises `SolverError` for expressions of other symbols, or bounds of
+        another number than rows.
         """
         rows = [constraints] if isinstance(constraints, ca.MX) else list(constraints)
         column = ca.vertcat(ca.MX(0, 1), *(ca.vec(ca.densify(row)) for row in rows))
         scalar = ca.MX(objective)
-        strange = [s.name() for s in ca.symvar(ca.vertcat(scalar, column)) if not _is_of(s, self.w, self.p)]
-        if strange:
-            raise SolverError(
-                f"the symbol '{strange[0]}' is neither an unknown nor a parameter of the program",
-                where="NonlinearProgram.adding",
-                allowed="expressions of nlp.w, nlp.p and of nlp[NAME]",
-            )
-        bounds = []
+        where, bounds = "NonlinearProgram.adding", []
+        for symbol in ca.symvar(ca.vertcat(scalar, column)):
+            if not any(ca.is_equal(symbol, vector) for vector in (self.w, self.p)):
+                message = f"the symbol '{symbol.name()}' is neither an unknown nor a parameter of the program"
+                raise SolverError(message, where=where, allowed="expressions of nlp.w, nlp.p and of nlp[NAME]")
         for name, side in (("lower", lower), ("upper", upper)):
             given = np.asarray(side, float).ravel()
             if given.size not in (1, column.numel()):
-                raise SolverError(
-                    f"{given.size} {name} bounds for {column.numel()} constraints",
-                    where="NonlinearProgram.adding",
-                    allowed=f"one for all, or {column.numel()}",
-                )
+                message = f"{given.size} {name} bounds for {column.numel()} constraints"
+                raise SolverError(message, where=where, allowed=f"one for all, or {column.numel()}")
             bounds.append(np.broadcast_to(given, (column.numel(),)).copy())
         return replace(self, user_terms=(*self.user_terms, _UserTerms(scalar, column, *bounds)))
 
     def make_solver(self, plugin: str = "ipopt", hessian: HessianKind = "gauss_newton", **options: Any) -> ca.Function:
         """Make a `casadi.nlpsol` solver with the program's assembled derivatives, to be called with `solver_arguments`.
 
-        `plugin` is any of CasADi's, `options` those of `casadi.nlpsol`.
-
-        Raises
-        ------
-        SolverError
-            CasADi does not have the plug-in, or refuses the options.
+        `plugin` is any of CasADi's, `options` those of `casadi.nlpsol`. Raises `SolverError` where CasADi does not have
+        the plug-in, or refuses the options.
         """
         with CASADI_LOCK:
             options = {**QUIET_NLPSOL_OPTIONS, **options}
@@ -384,10 +340,8 @@ class NonlinearProgram(ReprMixin):
                 cache = {name: function for name, function in made.items() if function is not None}
                 return ca.nlpsol("program", plugin, self.nlp, {**options, "cache": cache})
             except RuntimeError as error:
-                raise SolverError(
-                    f"CasADi cannot make the solver '{plugin}': {str(error).strip().splitlines()[-1]}",
-                    hint="see casadi.doc_nlpsol for its options",
-                ) from error
+                message = f"CasADi cannot make the solver '{plugin}': {str(error).strip().splitlines()[-1]}"
+                raise SolverError(message, hint="see casadi.doc_nlpsol for its options") from error
 
     def _derivatives(
         self, name: str, inputs: list[str], outputs: list[str], hessian: HessianKind
@@ -405,10 +359,6 @@ class NonlinearProgram(ReprMixin):
         if not set(outputs) <= set(known) or not set(inputs) <= set(symbols):
             return None
         return ca.Function(name, [symbols[i] for i in inputs], [known[o]() for o in outputs], inputs, outputs)
-
-
-def _is_of(symbol: ca.MX, *vectors: ca.MX) -> bool:
-    return any(ca.is_equal(symbol, vector) for vector in vectors)
 
 
 def _asked_for(plugin: str, options: Mapping[str, Any]) -> dict[str, tuple[list[str], list[str]]]:

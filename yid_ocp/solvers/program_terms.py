@@ -30,9 +30,8 @@ class ThreadSafeCachedProperty(cached_property[Any]):
 class LocalVariableFunction:
     """Function y(v; d, s) of the columns v (local variables), d (data) and s (shared data), with its derivatives.
 
-    The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. With `use_compiler`
-    the derivatives are compiled where that is possible; the value stays CasADi's own, so that whoever builds upon it
-    can differentiate it.
+    The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. Derivatives may be
+    compiled; the value stays CasADi's own, so that whoever builds upon it can differentiate it.
     """
 
     def __init__(
@@ -77,34 +76,21 @@ class LocalVariableFunction:
 
 @dataclass(frozen=True)
 class ProgramTerm:
-    """A function of a few unknowns, evaluated at K places of a nonlinear program, such as at every step.
-
-    Attributes
-    ----------
-    row_names : tuple of str
-        Names of the ny outputs.
-    variable_indices : ndarray of int, shape (K, nv)
-        Indices of each place's local variables among the unknowns; none twice in a row.
-    data_indices : ndarray of int, shape (K, nd)
-        Indices of each place's data among the parameters.
-    shared_data_indices : ndarray of int, shape (ns,)
-        Indices of the data that all places share.
-    """
+    """A function of a few unknowns, evaluated at K places of a nonlinear program, such as at every step."""
 
     name: str
-    row_names: tuple[str, ...]
+    row_names: tuple[str, ...]  # of the ny outputs
     local_function: LocalVariableFunction
-    variable_indices: IntArray
-    data_indices: IntArray
-    shared_data_indices: IntArray
+    variable_indices: IntArray  # local variables of each place among the unknowns; none twice in a row, (K, nv)
+    data_indices: IntArray  # data of each place among the parameters, shape (K, nd)
+    shared_data_indices: IntArray  # data that all places share, shape (ns,)
 
     @property
     def n_values(self) -> int:
-        """Number of values at all places."""
+        """At all places."""
         return len(self.row_names) * len(self.variable_indices)
 
     def _map_over_places(self, function: ca.Function, w: ca.MX, p: ca.MX, *more: ca.MX) -> ca.MX:
-        """Map a local function over all places, its results side by side."""
         count = len(self.variable_indices)
         pairs = ((w, self.variable_indices), (p, self.data_indices))
         local = (ca.reshape(vector[at.ravel().tolist()], at.shape[1], count) for vector, at in pairs)
@@ -138,27 +124,17 @@ class ProgramTerm:
 
 @dataclass(frozen=True)
 class ResidualTerm:
-    """Residual term of a program's objective: r = weight (combination values - target).
-
-    Attributes
-    ----------
-    combination : casadi.DM, shape (nr, ny K), or None
-        None takes the values as they are.
-    weight_indices, target_indices : ndarray of int, shape (nr,), or None
-        Indices among the parameters; None for weights of one and targets of zero.
-    huber_threshold : float
-        Residual beyond which Huber's loss is linear.
-    """
+    """Residual term of a program's objective: r = weight (combination values - target)."""
 
     term: ProgramTerm
-    combination: ca.DM | None = None
-    weight_indices: IntArray | None = None
-    target_indices: IntArray | None = None
-    huber_threshold: float = math.inf
+    combination: ca.DM | None = None  # shape (nr, ny K); None takes the values as they are
+    weight_indices: IntArray | None = None  # among the parameters, shape (nr,); None for weights of one
+    target_indices: IntArray | None = None  # among the parameters, shape (nr,); None for targets of zero
+    huber_threshold: float = math.inf  # residual beyond which Huber's loss is linear
 
     @property
     def n_residuals(self) -> int:
-        """Number of residuals."""
+        """Number nr of residuals."""
         return self.term.n_values if self.combination is None else self.combination.size1()
 
     def residual_jacobian_by_term_values(self, p: ca.MX) -> ca.MX | None:

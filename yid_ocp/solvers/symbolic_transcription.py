@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -70,7 +71,7 @@ def transcribe(
     Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
     """
     problem = _about_zero(problem)
-    _check_transcribable(problem, "transcribe")
+    _check_transcribable(problem)
     compiled = problem.step.is_compiled if use_compiler is None else use_compiler
     start = problem.initial_unknowns if initial_unknowns is None else np.asarray(initial_unknowns, float)
     with CASADI_LOCK:
@@ -90,25 +91,19 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
     """Raise `SolverError` where an effect changes recorded inputs, which nodes do not carry."""
     if not problem.uses_inputs_as_recorded:
-        raise SolverError(
-            "an effect changes recorded inputs, times or what the tracking filter follows",
-            where=where,
-            allowed="effects of the mechanics and of what sensors read",
-            hint="use gauss_newton",
-        )
+        message = "an effect changes recorded inputs, times or what the tracking filter follows"
+        allowed = "effects of the mechanics and of what sensors read"
+        raise SolverError(message, where=where, allowed=allowed, hint="use gauss_newton")
 
 
-def _check_transcribable(problem: EstimationProblem, where: str) -> None:
+def _check_transcribable(problem: EstimationProblem) -> None:
     """Raise `SolverError` for problems that the program does not support."""
-    check_no_effect_changes_inputs(problem, where)
+    check_no_effect_changes_inputs(problem, where := "transcribe")
     names = [episode.name for episode in problem.episodes]
     twice = [name for name in names if names.count(name) > 1]
     if twice:
-        raise SolverError(
-            f"two recordings are called '{twice[0]}'",
-            where=where,
-            hint="rename one of the files: blocks have their names",
-        )
+        hint = "rename one of the files: blocks have their names"
+        raise SolverError(f"two recordings are called '{twice[0]}'", where=where, hint=hint)
     for episode in problem.episodes:
         start = episode.fixed_initial_state
         known = {*episode.known_parameters, *(() if start is None else start.fitted_parameters)}
@@ -198,8 +193,8 @@ def _driven_stage(
 
     The torque that acts is u_k = ubar_k - w_k - b - K_k (x_k[followed] - xbar_k) - K_k v_k, without K_k where encoders
     are measurements, and without the errors where torques are taken as true: the two forms of `inference.whitening`,
-    with the errors themselves in the place of their covariance, so that nothing is linearised. `momentum` (nu, nu) is
-    what torques of the step before add to the momenta that the filter follows.
+    with the errors themselves in the place of their covariance. `momentum` (nu, nu) is what torques of the step before
+    add to the momenta that the filter follows.
     """
     nx, nu, m, index = stage.x0.numel(), stage.u.numel(), stage.lam.numel(), list(followed)
     before, after, lam = ca.SX.sym("x0", nx), ca.SX.sym("x1", nx), ca.SX.sym("lam", m)
@@ -255,9 +250,8 @@ class _Maker:
         """The program, its guess made near the problem's unknown vector `x`."""
         problem, low, high = self._problem, *self._problem.bounds
         nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
-        found = guess_node_states(problem, nodes, x, self._misfit)
-        x = found.x
-        shared = len(problem.shared_parameters)
+        found = guess_node_states(problem, nodes, x, partial(mean_square_residual_without_efforts, problem))
+        x, shared = found.x, len(problem.shared_parameters)
         theta = self._w.extend(x[:shared], low[:shared], high[:shared])
         self._w.name("theta", theta[:, None], problem.shared_parameters)
         constraints: list[ProgramTerm] = []
@@ -272,10 +266,8 @@ class _Maker:
             places, errors = self._laid_out(i, found, np.concatenate([theta, local]))
             begun, prior = self._begun(episode, places)
             constraints += [begun, self._moved(episode, places)]
-            residuals += [
-                self._sampled(episode, samples, places) for samples in episode.measurements if samples.n_residuals
-            ]
-            residuals += [*prior, *errors]
+            used = [samples for samples in episode.measurements if samples.n_residuals]
+            residuals += [*(self._sampled(episode, samples, places) for samples in used), *prior, *errors]
         residuals += self._priors(columns)
         index = np.concatenate(ridge)
         order = [k for k, _ in sorted(columns.items(), key=lambda entry: entry[1])]
@@ -294,19 +286,15 @@ class _Maker:
             ca.MX.sym("p", self._p.size),
         )
 
-    # -- layout -------------------------------------------------------------------------------------------------------
-
     def _laid_out(self, i: int, found: NodeStateGuess, free: IntArray) -> tuple[_Places, list[ResidualTerm]]:
         """The unknowns of a recording at their guess and what drives it; priors of errors."""
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
         theta = problem.predictor.theta_with_episode_values(episode, problem.split(found.x, i)[0])
-        rest = np.zeros(0)
-        sought = list(problem.model_functions.equilibrium_solver.free_coordinates)
-        if (found_rest := begin.equilibrium) is not None:
-            parts = found_rest.state[sought], found_rest.state[2 * n :], found_rest.constraint_reactions
-            rest = np.concatenate(parts)
+        rest, sought = np.zeros(0), list(problem.model_functions.equilibrium_solver.free_coordinates)
+        if (known := begin.equilibrium) is not None:
+            rest = np.concatenate([known.state[sought], known.state[2 * n :], known.constraint_reactions])
         joints = system.mechanism.joint_names
         grasped = [name for grasp in system.grasps for name in grasp.constraint_equation_names]
         at_rest = [*(joints[k] for k in sought), *system.internal_coordinates, *grasped]
@@ -325,11 +313,12 @@ class _Maker:
             self._w.name(f"{label}[{name}]", part.T, rows)
         self._w.name(f"z[{name}]", states[:, 2 * n :].T, tuple(system.internal_coordinates))
         self._w.name(f"lam[{name}]", multipliers.T, grasped)
-        known = self._p.add(f"theta[{name}]", theta, system.parameters.names)
+        theta_at = self._p.add(f"theta[{name}]", theta, system.parameters.names)
         torque = self._p.add(f"torque[{name}]", episode.torque.T, system.driven, "N m")
         gain, reference = self._followed(episode)
         errors, first, priors = self._erring(episode)
-        return _Places(free, rest_at, states, multipliers, errors, first, known[:, 0], torque, gain, reference), priors
+        places = _Places(free, rest_at, states, multipliers, errors, first, theta_at[:, 0], torque, gain, reference)
+        return places, priors
 
     def _followed(self, episode: Episode) -> tuple[IntArray, IntArray]:
         """Gains (row by row) and reference of the tracking filter at every step."""
@@ -342,21 +331,13 @@ class _Maker:
         gain = self._p.add(f"gain[{episode.name}]", feedback.gain.reshape(steps, -1).T, pairs)
         return gain, self._p.add(f"reference[{episode.name}]", feedback.reference.T, followed)
 
-    def _misfit(self, i: int, nodes: Array, x: Array) -> float:
-        theta = self._problem.predictor.theta_with_episode_values(
-            self._problem.episodes[i], self._problem.split(x, i)[0]
-        )
-        return mean_square_residual_without_efforts(self._problem, i, nodes, theta)
-
     def _driven(self, episode: Episode) -> _DrivenStage:
         """The stage as a recording drives it."""
         key = is_followed, is_noisy = _kind(episode)
         if key not in self._stages:
-            feedback = episode.tracking_feedback
+            feedback, shift = episode.tracking_feedback, self._problem.model_functions.momentum_shift
             followed = feedback.state_indices.tolist() if is_followed and feedback is not None else []
-            momentum = self._problem.model_functions.momentum_shift.momentum_derivative_by_previous_torque(
-                self._problem.theta
-            )
+            momentum = shift.momentum_derivative_by_previous_torque(self._problem.theta)
             made = _driven_stage(self._stage, self._freed, followed, momentum, is_noisy, self._compiled)
             self._stages[key] = made
         return self._stages[key]
@@ -388,8 +369,6 @@ class _Maker:
         per_step += [places["angle_error"]] if "angle_error" in places else []
         first = places.get("first_angle_error", np.zeros((1, 0), np.int64))[0]
         return np.hstack(per_step), first, priors
-
-    # -- terms --------------------------------------------------------------------------------------------------------
 
     def _moved(self, episode: Episode, places: _Places) -> ProgramTerm:
         """Every step's equations."""
@@ -430,11 +409,10 @@ class _Maker:
             wrong = [places.first, places.errors[0, : 2 * nu]] if len(places.first) else []
             at = np.concatenate([places.free, places.rest, places.state[0], *wrong])[None, :]
             data, shared = np.concatenate([given[:, 0], places.torque[:, 0]])[None, :], places.theta
-        labels = [f"rest.{k}" for k in range(balance.numel())] + [f"start.{rows[k]}" for k in fixed]
+        labels = (*(f"rest.{k}" for k in range(balance.numel())), *(f"start.{rows[k]}" for k in fixed))
         value = ca.densify(ca.vertcat(balance, (first - state)[fixed]))
-        term = ProgramTerm(
-            f"start[{name}]", tuple(labels), LocalVariableFunction("start", inputs, value), at, data, shared
-        )
+        function = LocalVariableFunction("start", inputs, value)
+        term = ProgramTerm(f"start[{name}]", labels, function, at, data, shared)
         if not loose:
             return term, []
         offset = LocalVariableFunction("offset", inputs, ca.densify((first - state)[loose]))
@@ -446,12 +424,9 @@ class _Maker:
     def _sampled(self, episode: Episode, samples: Measurements, places: _Places) -> ResidualTerm:
         """Samples of one sensor, predicted linearly between the two nodes beside them."""
         sensor, nodes, n = samples.sensor, samples.evaluation_nodes, self._sizes["n"]
-        read, loaded = self._reading(sensor, episode)
-        smooth = (
-            self._problem.predictor.predicted_effort_smoother(episode, self._problem.theta)
-            if sensor.effort_joints
-            else None
-        )
+        (read, loaded), smooth = self._reading(sensor, episode), None
+        if sensor.effort_joints:
+            smooth = self._problem.predictor.predicted_effort_smoother(episode, self._problem.theta)
         if smooth is not None:
             nodes = np.arange(episode.grid.steps)
         if loaded:
@@ -486,12 +461,9 @@ class _Maker:
         if key not in self._sensors:
             function = sensor_reading_function(self._problem.system, sensor, self._names)
             if any(function.size2_out(name) for name in ("by_v", "by_a", "by_lam")):
-                raise SolverError(
-                    f"'{sensor.group_name}' depends on velocities, accelerations or constraint forces, "
-                    "which node states do not carry",
-                    where=episode.name,
-                    hint="use gauss_newton",
-                )
+                what = f"'{sensor.group_name}' depends on velocities, accelerations or constraint forces"
+                message = f"{what}, which node states do not carry"
+                raise SolverError(message, where=episode.name, hint="use gauss_newton")
             loaded = function.nnz_out("by_load") > 0
             made = self._loaded(function, self._driven(episode)) if loaded else self._unloaded(function)
             self._sensors[key] = made, loaded
@@ -530,9 +502,8 @@ class _Maker:
         v, about = ca.SX.sym("v"), ca.SX.sym("about")
         ratio = v / about
         below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
-        soft = ca.log(ca.fmax(ratio, SOFT_LOGARITHM_MIN_RATIO)) + ca.if_else(
-            ratio < SOFT_LOGARITHM_MIN_RATIO, below - below**2 / 2, 0
-        )
+        bent = ca.if_else(ratio < SOFT_LOGARITHM_MIN_RATIO, below - below**2 / 2, 0)
+        soft = ca.log(ca.fmax(ratio, SOFT_LOGARITHM_MIN_RATIO)) + bent
         stated = problem.residual_rows.stated_priors.stop - problem.residual_rows.stated_priors.start
         found = []
         kinds = (("prior", slice(0, stated), v - about), ("weak_prior", slice(stated, None), soft))

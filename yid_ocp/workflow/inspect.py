@@ -12,20 +12,18 @@ from typing import Any
 import h5py
 import numpy as np
 
-from yid_ocp.analysis.sparsity_patterns import (
-    SparsityPattern,
-    full_nlp_size,
-    kkt_sparsity_pattern,
-    nlp_stage_sparsity,
-    step_sparsity_patterns,
-)
 from yid_ocp.analysis.step_diagnostics import (
     CheckedStepLinearisation,
     ParameterEquationDependence,
+    SparsityPattern,
+    full_nlp_size,
+    kkt_sparsity_pattern,
     linearise_and_check,
     linearise_step_equations,
+    nlp_stage_sparsity,
     parameter_dependences,
     step_size_summary,
+    step_sparsity_patterns,
 )
 from yid_ocp.analysis.step_symbols import EquationEntry, StepSymbols
 from yid_ocp.arrays import Array

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.analysis.compare import MethodComparison
-from yid_ocp.analysis.profile import CHI2_QUANTILE_95
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.inference.uncertainty import CHI2_95_TWO_SIDED
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
@@ -181,7 +181,7 @@ def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
         best = result["parameters"][name]["value"]
         if best > 0:
             curves[name] = ([value / best for value in profile["values"]], profile["delta_chi2"])
-    figure = figures.profile_likelihood_figure(curves, CHI2_QUANTILE_95) if curves else None
+    figure = figures.profile_likelihood_figure(curves, CHI2_95_TWO_SIDED) if curves else None
     asked, names = result["what_if"], list(result["parameters"])
     changes = [] if asked is None else [asked["base"], *asked["singles"], *asked["smallest"]]
     return {"figure": figure, "changes": changes, "names": names} if figure is not None or changes else None
