@@ -39,7 +39,7 @@ from yid_ocp.model.objects.cable import (
     read_vertex_positions,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.prediction_errors import (
+from yid_ocp.problem.predictions import (
     clamp_displacement_baseline,
     constant_position_baseline,
     interpolated_displacement_baseline,

@@ -17,7 +17,7 @@ from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.synthetic_recording import recording_from_prediction
+from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.solve import run_solve

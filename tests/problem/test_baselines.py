@@ -3,7 +3,7 @@ import pytest
 
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import DataError
-from yid_ocp.problem.prediction_errors import (
+from yid_ocp.problem.predictions import (
     clamp_displacement_baseline,
     constant_position_baseline,
     interpolated_displacement_baseline,

@@ -15,7 +15,7 @@ from small_problems import H, efforts, measured, pendulum_step, points, taken
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.initial_state_fit import InitialStateFitter, _speed
-from yid_ocp.problem.prediction_errors import rmse_by_channel
+from yid_ocp.problem.predictions import rmse_by_channel
 
 NAN = math.nan
 

@@ -11,7 +11,7 @@ from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.episode_initialization import _MAX_FIRST_SAMPLE_TIME
+from yid_ocp.problem.episode_prediction import _MAX_FIRST_SAMPLE_TIME
 from yid_ocp.sensors import sensor_reading_function
 from yid_ocp.sensors.points import PointSensor
 

@@ -11,7 +11,7 @@ from small_problems import pendulum_step, taken
 import yid_ocp as yid
 from yid_ocp.errors import ConfigError
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.prediction_errors import rmse_by_channel
+from yid_ocp.problem.predictions import rmse_by_channel
 
 FREE = ["elbow.stiffness", "elbow.damping"]
 

@@ -20,7 +20,7 @@ from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.synthetic_recording import recording_from_prediction
+from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.terminal import torque_offset_table_rows
 from yid_ocp.workflow.check import _input_noise

@@ -14,7 +14,7 @@ from yid_ocp.inference.uncertainty import ParameterEstimate
 from yid_ocp.model import forward_kinematics
 from yid_ocp.model.system import MidpointState
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.prediction_errors import channel_predictions
+from yid_ocp.problem.predictions import channel_predictions
 from yid_ocp.problem.recorded_inputs import smoothed_joint_angles
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.solvers import GaussNewton, Solution

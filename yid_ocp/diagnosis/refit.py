@@ -28,7 +28,7 @@ from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
-from yid_ocp.problem.prediction_errors import rmse_by_channel
+from yid_ocp.problem.predictions import rmse_by_channel
 from yid_ocp.progress import ParallelProgress, Progress
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import SolverError
+from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step, checked_rollout_inputs, simulate_batch
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
@@ -28,12 +28,18 @@ from yid_ocp.problem.model_functions import (
     node_velocity_adjoint,
 )
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.recorded_inputs import mean_step_input_delay_derivative, mean_step_inputs
+from yid_ocp.problem.recorded_inputs import denoised_gear_loads, mean_step_input_delay_derivative, mean_step_inputs
 from yid_ocp.problem.signal_filters import FirstOrderLag, LowPassFilter, NodeSmoother
 from yid_ocp.problem.unknown_vector import UnknownVectorLayout
 
 _MAX_PARALLEL_ROLLOUTS, _MAX_ROLLOUT_MEMORY = 16, 2.0**28
 """Largest number of episodes rolled out at once, and largest memory of their states and derivatives [bytes]."""
+_MAX_FIRST_SAMPLE_TIME = 1.0
+"""Latest time at which a point's first sample still shows the initial equilibrium [s]."""
+_POOR_EQUILIBRIUM_RMSE = 5.0
+"""Root mean square error of first points above which another equilibrium is sought [standard deviations]."""
+_MAX_REMAINING_ERROR_FRACTION = 0.5
+"""Largest fraction of that error that may remain at another equilibrium."""
 
 
 @dataclass(frozen=True)
@@ -488,3 +494,87 @@ class _Pulls:
     by_effort: Array
     by_torque: Array
     by_multipliers: Array
+
+
+# -- what a recording shows of its start and of its loads --------------------------------------------------------------
+
+
+def with_observed_equilibrium_and_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+    """Episode with the initial equilibrium that its points show and with gear loads free of effort noise.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (ntheta,)
+        Nominal parameters.
+    """
+    return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
+
+
+def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+    """Episode with the equilibrium near its first points, where that of least energy is far from them."""
+    fitted = episode.fixed_initial_state is not None or predictor.options.initial_state == "fitted_to_points"
+    if fitted or not predictor.system.grasps:
+        return episode
+    seen = [found for samples in episode.measurements if (found := _first(samples, episode.grid.time_step)) is not None]
+    if not seen:
+        return episode
+    own, n = predictor.theta_with_episode_values(episode, theta), predictor.system.n_coordinates
+    offset = np.zeros(len(predictor.unknowns.initial_state_names))
+    least = predictor.initial_state(episode, own, offset, ())
+    error = _error(predictor, seen, least, own)
+    if not error > _POOR_EQUILIBRIUM_RMSE:
+        return episode
+    try:
+        shape = predictor.model_functions.initial_state_fitter.fit_to_points(
+            episode.initial_known_coordinates, seen, own, _MAX_FIRST_SAMPLE_TIME, episode.prescribed_path
+        ).state[:n]
+    except DataError:
+        return episode
+    other = predictor.initial_state(episode, own, offset, (), shape)
+    if not _error(predictor, seen, other, own) < _MAX_REMAINING_ERROR_FRACTION * error:
+        return episode
+    return replace(episode, equilibrium_guess=other.state[:n])
+
+
+def _first(samples: Measurements, time_step: float) -> Measurements | None:
+    """The first sample of points, as if it were taken at node 0; None where it comes too late."""
+    rows = np.flatnonzero(samples.used_output_mask.any(axis=1))[:1]
+    if (
+        not samples.sensor.point_names
+        or not len(rows)
+        or np.max(samples.node[rows]) * time_step > _MAX_FIRST_SAMPLE_TIME
+    ):
+        return None
+    parts = {name: getattr(samples, name)[rows] for name in ("value", "weight", "std")}
+    return replace(samples, node=np.zeros(1, np.int64), fraction=np.zeros(1), noise_correlation=None, **parts)
+
+
+def _error(predictor: EpisodePredictor, seen: Sequence[Measurements], start: InitialState, theta: Array) -> float:
+    """Root mean square error of first points at a start [standard deviations]; infinite where it is not at rest."""
+    if start.failure_message:
+        return math.inf
+    state = start.state[None]
+    squares: list[Array] = []
+    for samples in seen:
+        read = predictor.model_functions.compiled_sensor_function(samples.sensor, predictor.unknowns.free_parameters)
+        predicted = read(TimeGridStateValues.from_trajectory(predictor.step, state), theta).output
+        squares.append(samples.whitened_residual(predicted)[samples.used_output_mask] ** 2)
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
+
+
+def _loaded(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+    """The episode with the model's loads on gears of joints whose efforts are compared (`denoised_gear_loads`)."""
+    compared = [s for s in episode.measurements if s.sensor.effort_joints]
+    corrections = predictor.model_functions.input_corrections
+    if not compared or not corrections.angles_depend_on_effort:
+        return episode
+    result = predictor.predict_episode(episode, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
+    if isinstance(result, str):
+        return episode
+    load, own = episode.joint_loads.copy(), predictor.node_values(result.rollout).load
+    for samples in compared:
+        at = [corrections.joint_names.index(joint) for joint in samples.sensor.effort_joints]
+        column = [predictor.system.mechanism.joint_index(joint) for joint in samples.sensor.effort_joints]
+        cutoff = predictor.options.path_cutoff
+        load[:, at] = denoised_gear_loads(load[:, at], own[:, column], samples.node, episode.grid.node_times, cutoff)
+    return replace(episode, joint_loads=load)

@@ -16,14 +16,14 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.system import System
-from yid_ocp.problem.episode_initialization import estimate_initial_state_offset, with_observed_equilibrium_and_loads
-from yid_ocp.problem.episode_prediction import EpisodePredictor
+from yid_ocp.problem.episode_prediction import EpisodePredictor, with_observed_equilibrium_and_loads
 from yid_ocp.problem.episodes import (
     Episode,
     EpisodePrediction,
     InitialState,
     mass_matrix_diagonal_at_zero,
     prepare_episode,
+    truncate_episode,
 )
 from yid_ocp.problem.evaluation import (
     EquilibriumGuesses,
@@ -35,7 +35,7 @@ from yid_ocp.problem.evaluation import (
 from yid_ocp.problem.measurements import ResidualBlock, huber_loss_and_residual_factors
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions
-from yid_ocp.problem.synthetic_recording import synthesize_recording
+from yid_ocp.problem.predictions import synthesize_recording
 from yid_ocp.problem.unknown_vector import (
     UnknownVectorLayout,
     check_free_parameters,
@@ -47,6 +47,11 @@ from yid_ocp.problem.unknown_vector import (
     stated_prior_std,
     with_named_entries,
 )
+
+_HELD_OUT_START_WINDOW = 0.2
+"""Duration of the data from which a held-out recording's initial state is estimated [s]."""
+_HELD_OUT_ITERATIONS = 3
+"""Gauss-Newton iterations of this nearly linear estimate."""
 
 
 class EstimationProblem(ReprMixin):
@@ -382,7 +387,7 @@ class EstimationProblem(ReprMixin):
                 continue
             episode = self.predictor.with_fitted_initial_state(held, theta)
             std = self.initial_state_prior_std
-            found.append((episode, theta, estimate_initial_state_offset(self.predictor, episode, theta, std)))
+            found.append((episode, theta, _estimated_initial_state_offset(self.predictor, episode, theta, std)))
         return found
 
     def held_out_theta(self, x: Array) -> Array:
@@ -473,3 +478,31 @@ class EstimationProblem(ReprMixin):
         estimated, held_out = ([episode.recording for episode in group] for group in (self.episodes, self.held_out))
         same = {"recordings": estimated, "free": self.free, "options": self.options, "held_out": held_out}
         return EstimationProblem(self.step, values=known, **{**same, **changes})
+
+
+def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episode, theta: Array, std: Array) -> Array:
+    """Offset of the initial state from equilibrium, estimated from the first measurements and its prior.
+
+    Zero where the rollout fails; `std` is the prior's, (number of estimated rows,).
+    """
+    offset = np.zeros(len(predictor.unknowns.initial_state_names))
+    if not len(offset):
+        return offset
+    short = truncate_episode(episode, max(round(_HELD_OUT_START_WINDOW / predictor.step.time_step), 2))
+    weight = 1.0 / std
+    guess: Array | None = None
+    limit = initial_state_offset_limits(predictor.system, predictor.unknowns.initial_state_names)
+    for _ in range(_HELD_OUT_ITERATIONS):
+        result = predictor.predict_episode(short, theta, offset, True, guess)
+        if isinstance(result, str) or result.output_sensitivities is None:
+            return np.zeros(len(predictor.unknowns.initial_state_names))
+        guess = result.equilibrium_guess
+        rows, slopes = [weight * offset], [np.diag(weight)]
+        for k, samples in enumerate(short.measurements):
+            by_start = result.output_sensitivities[k][:, :, len(predictor.unknowns.free_parameters) :]
+            part = samples.residual_block(result.predicted_outputs[k], by_start)
+            rows.append(part.residual)
+            slopes += [] if part.jacobian is None else [part.jacobian]
+        offset = offset - np.linalg.lstsq(np.vstack(slopes), np.concatenate(rows), rcond=None)[0]
+        offset = np.clip(offset, -limit, limit)
+    return offset

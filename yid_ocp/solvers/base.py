@@ -36,7 +36,7 @@ from yid_ocp.options import check_option_bounds
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
-from yid_ocp.problem.prediction_errors import ChannelPrediction, channel_predictions
+from yid_ocp.problem.predictions import ChannelPrediction, channel_predictions
 from yid_ocp.registry import Registry
 from yid_ocp.solvers.initial_guess import unknowns_with_active_effects
 

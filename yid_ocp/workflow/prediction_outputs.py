@@ -18,7 +18,7 @@ from yid_ocp.diagnosis.localise import smoothed_unknown_units
 from yid_ocp.inference import whitening
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
-from yid_ocp.problem import EstimationProblem, prediction_errors
+from yid_ocp.problem import EstimationProblem, predictions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.report.animation import ModelTrajectory
@@ -140,9 +140,9 @@ def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | N
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
         arrays = {
-            "stays": prediction_errors.constant_position_baseline(recording, points, _START_FRAMES),
-            "moves_with_clamps": prediction_errors.clamp_displacement_baseline(recording, points, held, _START_FRAMES),
-            "linear_carry": prediction_errors.interpolated_displacement_baseline(
+            "stays": predictions.constant_position_baseline(recording, points, _START_FRAMES),
+            "moves_with_clamps": predictions.clamp_displacement_baseline(recording, points, held, _START_FRAMES),
+            "linear_carry": predictions.interpolated_displacement_baseline(
                 recording, points, cable.parent_vertices, cable.child_vertices, given=_START_FRAMES
             ),
         }

@@ -14,7 +14,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.synthetic_recording import recording_from_prediction
+from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, make_animation, recording_animation
 from yid_ocp.report.summaries import simulate_summary

@@ -32,7 +32,7 @@ from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.prediction_errors import rmse_by_channel
+from yid_ocp.problem.predictions import rmse_by_channel
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
