@@ -1,6 +1,7 @@
-"""The command line: the table of commands and their arguments; `workflow` implements the commands.
+"""The command line: the table of commands, their arguments and their completion by a shell.
 
-A command's module is imported when it runs, so that help needs none of the libraries for numbers.
+`workflow` implements the commands. A command's module is imported when it runs, so that help needs none of the
+libraries for numbers.
 """
 
 from __future__ import annotations
@@ -16,10 +17,11 @@ import re
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn, TextIO, cast
 
 from yid_ocp import interruption
@@ -31,45 +33,49 @@ _ERROR_FORMAT = "yid-error/1"
 
 @dataclass(frozen=True)
 class _CliCommand:
-    """A command: name, help, and the file of `workflow` whose `run` takes the parsed arguments and returns the code."""
+    """A command; `run`, `MODULE.FUNCTION` of `workflow`, takes the parsed arguments and returns the exit code."""
 
     name: str
     help: str
-    workflow_module: str
+    run: str | Callable[[argparse.Namespace], int]
     add_arguments: Callable[[argparse.ArgumentParser], None]
 
 
 # -- arguments --------------------------------------------------------------------------------------------------------
 
 
+def _switch(parser: argparse.ArgumentParser, flag: str, text: str) -> None:
+    parser.add_argument(flag, action="store_true", help=text)
+
+
+def _setting(parser: argparse.ArgumentParser, flag: str, override: str, text: str) -> None:
+    parser.add_argument(flag, action="append_const", const=override, dest="overrides", help=text)
+
+
+def _repeated(parser: argparse.ArgumentParser, flag: str, metavar: str, text: str, dest: str | None = None) -> None:
+    text = f"{text}; may be repeated"
+    parser.add_argument(flag, metavar=metavar, action="append", default=[], dest=dest, help=text)
+
+
 def _configured(parser: argparse.ArgumentParser, optional: bool = False) -> None:
-    extra: dict[str, Any] = {"nargs": "?"} if optional else {}
     what = "the run's settings; an embedded example when absent" if optional else "the run's settings"
-    parser.add_argument("config", metavar="CONFIG.yaml", help=what, **extra)
+    parser.add_argument("config", metavar="CONFIG.yaml", help=what, nargs="?" if optional else None)
     parser.add_argument("--out", metavar="DIR", help="run folder to make (default: runs/NAME-DATE-TIME)")
-    parser.add_argument(
-        "--set",
-        metavar="KEY=VALUE",
-        action="append",
-        default=[],
-        dest="overrides",
-        help="set a setting, for example problem.time_step=0.005; a section, 'solver={max_iterations: 9}', merges with "
-        "what stands there, an empty one empties it; may be repeated",
-    )
+    text = "set a setting, for example problem.time_step=0.005; a section, 'solver={max_iterations: 9}', merges with "
+    text += "what stands there, an empty one empties it"
+    _repeated(parser, "--set", "KEY=VALUE", text, "overrides")
     _printing(parser, "run folder's path")
 
 
 def _printing(parser: argparse.ArgumentParser, path: str) -> None:
-    parser.add_argument("--quiet", action="store_true", help=f"print nothing but the {path}")
-    text = "print the result as JSON, errors as well, and nothing else on standard output"
-    parser.add_argument("--json", action="store_true", help=text)
+    _switch(parser, "--quiet", f"print nothing but the {path}")
+    _switch(parser, "--json", "print the result as JSON, errors as well, and nothing else on standard output")
 
 
 def _doubting(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     _configured(parser, optional)
     text = "stop, with exit code 2, where anything about a recording is in doubt"
-    strict = "recordings.strict=true"
-    parser.add_argument("--strict", action="append_const", const=strict, dest="overrides", help=text)
+    _setting(parser, "--strict", "recordings.strict=true", text)
 
 
 def _working(parser: argparse.ArgumentParser, absent: str = "as many as there are processors") -> None:
@@ -81,26 +87,25 @@ def _working(parser: argparse.ArgumentParser, absent: str = "as many as there ar
 
 def _diagnose(parser: argparse.ArgumentParser) -> None:
     _doubting(parser, optional=True)
-    text = "run folder of an earlier solve or diagnose of the same model: ask what differs since; may be repeated"
-    parser.add_argument("--baseline", metavar="RUN", action="append", default=[], help=text)
+    text = "run folder of an earlier solve or diagnose of the same model: ask what differs since"
+    _repeated(parser, "--baseline", "RUN", text)
 
 
 def _identifiability(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
-    parser.add_argument("--what-if", action="store_true", help="rank changes of the experiment; takes a few minutes")
+    _switch(parser, "--what-if", "rank changes of the experiment; takes a few minutes")
     text = "95 %% intervals by profile likelihood of: all, none, or NAME,NAME; by default all if they are few"
     parser.add_argument("--intervals", metavar="NAMES", default="auto", help=text)
-    parser.add_argument("--initial", action="store_true", help="judge at the initial values, without solving")
-    text = "judge with initial states estimated along, whatever the settings assume"
-    parser.add_argument("--unknown-start", action="store_true", help=text)
+    _switch(parser, "--initial", "judge at the initial values, without solving")
+    _switch(parser, "--unknown-start", "judge with initial states estimated along, whatever the settings assume")
     _working(parser, "this process alone")
-    parser.add_argument("--unknown-grasp", action="store_true", help="judge with the places of grasps estimated along")
+    _switch(parser, "--unknown-grasp", "judge with the places of grasps estimated along")
 
 
 def _overrides(parser: argparse.ArgumentParser) -> None:
-    text = "set a setting in every run, as other commands do; may be repeated"
-    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="overrides", help=text)
+    _repeated(parser, "--set", "KEY=VALUE", "set a setting in every run, as other commands do", "overrides")
     _printing(parser, "folder's path")
+    _working(parser)
 
 
 def _blind(parser: argparse.ArgumentParser) -> None:
@@ -110,9 +115,8 @@ def _blind(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cases", type=int, default=20, help="size of the ensemble")
     parser.add_argument("--seed", type=int, default=1, help="from which it is drawn")
     text = "draw an ensemble to set thresholds by, other cases than those that are reported for the same seed"
-    parser.add_argument("--calibration", action="store_true", help=text)
+    _switch(parser, "--calibration", text)
     _overrides(parser)
-    _working(parser)
 
 
 def _batch(parser: argparse.ArgumentParser) -> None:
@@ -123,28 +127,26 @@ def _batch(parser: argparse.ArgumentParser) -> None:
     text = "folder of all runs (default: runs/batch-DATE-TIME); the same one again does what is not done yet"
     parser.add_argument("--out", metavar="DIR", help=text)
     _overrides(parser)
-    _working(parser)
 
 
 def _track(parser: argparse.ArgumentParser) -> None:
     _doubting(parser)
     text = "keep the told pose and depth of the camera, as of a hand-eye calibration; the arm then checks them"
-    fixed = "track.options.calibration.fix_pose=true"
-    parser.add_argument("--fix-pose", action="append_const", const=fixed, dest="overrides", help=text)
+    _setting(parser, "--fix-pose", "track.options.calibration.fix_pose=true", text)
     _working(parser, "this process alone")
 
 
 def _simulate(parser: argparse.ArgumentParser) -> None:
     _configured(parser)
     parser.add_argument("--seed", type=int, default=0, help="of the noise and of a virtual experiment's motion")
-    parser.add_argument("--noise", action="store_true", help="add noise of the recorded standard deviations")
+    _switch(parser, "--noise", "add noise of the recorded standard deviations")
 
 
 def _inspect(parser: argparse.ArgumentParser) -> None:
     _configured(parser)
     text = "print an equation, with ROW, COLUMN its derivative, such as 'del[T1_0_x], q1[T1_0_x]', or where a "
-    text += "parameter enters; may be repeated"
-    parser.add_argument("--entry", metavar="ROW[, COLUMN]", action="append", default=[], dest="entries", help=text)
+    text += "parameter enters"
+    _repeated(parser, "--entry", "ROW[, COLUMN]", text, "entries")
     text = "folder for the equations as CasADi functions, C and a LaTeX sheet"
     parser.add_argument("--export", metavar="DIR", help=text)
 
@@ -153,8 +155,7 @@ def _import(parser: argparse.ArgumentParser) -> None:
     files = "CSV, C3D, MCAP, rosbag (file or folder), LeRobot dataset (folder), or a recording"
     parser.add_argument("file", metavar="FILE", help=files)
     parser.add_argument("--out", metavar="RECORDING.h5", help="recording to write; needed without --preview")
-    text = "show what there is, and the command that imports it, and write nothing"
-    parser.add_argument("--preview", action="store_true", help=text)
+    _switch(parser, "--preview", "show what there is, and the command that imports it, and write nothing")
     text = "its section `import` says how; a flag goes before what stands there"
     parser.add_argument("--config", metavar="CONFIG.yaml", help=text)
     _importing(parser)
@@ -195,22 +196,20 @@ def _init(parser: argparse.ArgumentParser) -> None:
     text = "recordings of it, or files that `import` understands; several: the last ones are held out"
     parser.add_argument("files", metavar="FILE", nargs="+", help=text)
     parser.add_argument("--out", metavar="CONFIG.yaml", required=True, help="configuration to write")
-    parser.add_argument("--replace", action="store_true", help="write over files that are there")
+    _switch(parser, "--replace", "write over files that are there")
     text = "what is held, such as cable, beam, tree or foam_y, the paper's; an unknown word lists all"
     parser.add_argument("--object", metavar="KIND", required=True, help=text)
     for name, unit in (("length", "m"), ("mass", "kg"), ("radius", "m")):
         text = f"of the object, of each equal branch [{unit}]"
         parser.add_argument(f"--{name}", type=float, metavar="NUMBER", help=text)
     parser.add_argument("--section", metavar="X,Y", help="extents of a rectangular cross section [m], not a radius")
-    text = "further number of some kinds of objects; an unknown name lists them; may be repeated"
-    parser.add_argument("--number", metavar="NAME=VALUE", action="append", default=[], help=text)
+    _repeated(parser, "--number", "NAME=VALUE", "further number of some kinds of objects; an unknown name lists them")
     parser.add_argument("--links", type=int, metavar="NUMBER", help="rigid links of each segment")
     parser.add_argument("--branches", type=int, metavar="NUMBER", help="of a tree: equal ones, in a star")
-    text = "of a tree: NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW]; NAME@PARENT grows on PARENT's end; may be repeated"
-    parser.add_argument("--branch", metavar="BRANCH", action="append", default=[], help=text)
+    text = "of a tree: NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW]; NAME@PARENT grows on PARENT's end"
+    _repeated(parser, "--branch", "BRANCH", text)
     parser.add_argument("--holder", metavar="FRAME", help="of the robot, that carries the object's root")
-    text = "what else holds it, such as right_gripper=w_cable; may be repeated"
-    parser.add_argument("--grasp", metavar="FRAME=POINT", action="append", default=[], help=text)
+    _repeated(parser, "--grasp", "FRAME=POINT", "what else holds it, such as right_gripper=w_cable")
     _importing(parser)
     _printing(parser, "configuration's path")
 
@@ -241,44 +240,101 @@ def _schema(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="file to write; printed when absent")
 
 
-COMMANDS: tuple[_CliCommand, ...] = (
-    _CliCommand("init", "write a commented configuration from a robot and recordings of it", "init", _init),
-    _CliCommand("solve", "estimate the free parameters from recordings", "solve", partial(_doubting, optional=True)),
-    _CliCommand("compare", "run several methods on one problem and say whether they agree", "compare", _doubting),
-    _CliCommand(
-        "identifiability",
-        "say which parameters the recordings determine, and which experiment would tell more",
-        "identifiability",
-        _identifiability,
-    ),
-    _CliCommand("friction", "say which law of friction the recordings warrant", "friction", _doubting),
-    _CliCommand("diagnose", "find the gap between model and recordings, and what makes it", "diagnose", _diagnose),
-    _CliCommand(
-        "blind",
-        "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted",
-        "blind",
-        _blind,
-    ),
-    _CliCommand("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch", _batch),
-    _CliCommand("report", "compare runs of one model: what drifted, which run to distrust", "run_history", _report),
-    _CliCommand("plan", "plan a motion of the arms with the identified model", "plan", _configured),
-    _CliCommand("simulate", "write what the model says would be recorded", "simulate", _simulate),
-    _CliCommand(
-        "check", "validate a configuration, its recordings and the model before a long run", "check", _doubting
-    ),
-    _CliCommand("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect", _inspect),
-    _CliCommand("track", "measure the object's points in the frames of a depth camera", "track", _track),
-    _CliCommand("import", "turn a file of another tool into a recording", "import_recording", _import),
-    _CliCommand(
-        "export", "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP", "export", _export
-    ),
-    _CliCommand(
-        "completion",
-        "print what makes a shell complete commands, options, files and settings",
-        "editor_support",
-        _completion,
-    ),
-    _CliCommand("schema", "print the JSON Schema of configuration files, for editors", "editor_support", _schema),
+# -- completion -------------------------------------------------------------------------------------------------------
+
+_EXPORT_FORMATS = ("mjcf", "urdf", "sdf", "yaml", "csv", "mcap")
+
+
+def _print_schema(arguments: argparse.Namespace) -> int:
+    from yid_ocp.config.schema import config_json_schema
+    from yid_ocp.files import write_text
+
+    text = json.dumps(config_json_schema(), indent=1)
+    if arguments.out is not None:
+        write_text(Path(arguments.out), text + "\n")
+    print(text if arguments.out is None else arguments.out)
+    return 0
+
+
+def _print_completion_script(arguments: argparse.Namespace) -> int:
+    try:
+        print(import_module("argcomplete").shellcode(["yid-ocp"], shell=arguments.shell).strip())
+    except ImportError as error:
+        what = "completion needs a package that is not installed"
+        raise ConfigError(what, where="argcomplete", hint="pip install 'yid-ocp[completion]'") from error
+    return 0
+
+
+def _print_shell_completions(parser: argparse.ArgumentParser) -> None:
+    """Print completions for the calling shell and exit; does nothing without the package argcomplete."""
+    try:
+        library = import_module("argcomplete")
+    except ImportError:
+        return
+    configurations, folders = library.FilesCompleter(("yaml", "yml")), library.DirectoriesCompleter()
+    completers: Mapping[str, Callable[..., Any]] = {
+        "config": configurations,
+        "configs": configurations,
+        "runs": folders,
+        "baseline": folders,
+        "source": library.FilesCompleter(("h5", "hdf5")),
+        "format": library.ChoicesCompleter(_EXPORT_FORMATS),
+        "overrides": _settings,
+    }
+    commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    for command in commands.choices.values():
+        for action in command._actions:
+            if action.dest in completers and action.nargs != 0:
+                action.completer = completers[action.dest]
+    library.autocomplete(parser, always_complete_options="long")
+
+
+def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[str]:
+    from yid_ocp.config.reader import settable_keys_with_prefix  # it takes a second, which no other completion needs
+
+    given = getattr(parsed_args, "config", None) or next(iter(getattr(parsed_args, "configs", None) or ()), None)
+    try:
+        return settable_keys_with_prefix(prefix, given)
+    except YidError:
+        return settable_keys_with_prefix(prefix)
+
+
+# -- commands ---------------------------------------------------------------------------------------------------------
+
+_SAID_IDENTIFIABILITY = "say which parameters the recordings determine, and which experiment would tell more"
+_SAID_BLIND = "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted"
+COMMANDS = tuple(
+    _CliCommand(*row)
+    for row in (
+        ("init", "write a commented configuration from a robot and recordings of it", "init.run", _init),
+        ("solve", "estimate the free parameters from recordings", "solve.run", partial(_doubting, optional=True)),
+        ("compare", "run several methods on one problem and say whether they agree", "compare.run", _doubting),
+        ("identifiability", _SAID_IDENTIFIABILITY, "identifiability.run", _identifiability),
+        ("friction", "say which law of friction the recordings warrant", "compare.friction", _doubting),
+        ("diagnose", "find the gap between model and recordings, and what makes it", "diagnose.run", _diagnose),
+        ("blind", _SAID_BLIND, "blind.run", _blind),
+        ("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch.run", _batch),
+        ("report", "compare runs of one model: what drifted, which run to distrust", "run_history.run", _report),
+        ("plan", "plan a motion of the arms with the identified model", "plan.run", _configured),
+        ("simulate", "write what the model says would be recorded", "simulate.run", _simulate),
+        ("check", "validate a configuration, its recordings and the model before a long run", "check.run", _doubting),
+        ("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect.run", _inspect),
+        ("track", "measure the object's points in the frames of a depth camera", "track.run", _track),
+        ("import", "turn a file of another tool into a recording", "import_recording.run", _import),
+        (
+            "export",
+            "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP",
+            "export.run",
+            _export,
+        ),
+        (
+            "completion",
+            "print what makes a shell complete commands, options, files and settings",
+            _print_completion_script,
+            _completion,
+        ),
+        ("schema", "print the JSON Schema of configuration files, for editors", _print_schema, _schema),
+    )
 )
 
 
@@ -322,7 +378,7 @@ def build_argument_parser() -> argparse.ArgumentParser:
     for row in COMMANDS:
         added = commands.add_parser(row.name, help=row.help, description=row.help[0].upper() + row.help[1:] + ".")
         row.add_arguments(added)
-        added.set_defaults(module=row.workflow_module)
+        added.set_defaults(run=row.run)
     return top
 
 
@@ -409,7 +465,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         printed as `yid-error/1` as well: kind, what, where, allowed, hint and exit_code.
     """
     if "_ARGCOMPLETE" in os.environ:
-        import_module("yid_ocp.workflow.editor_support").print_shell_completions(build_argument_parser())
+        _print_shell_completions(build_argument_parser())
     as_json = "--json" in (sys.argv[1:] if argv is None else argv)
     with _reliable_streams():
         return _parsed_and_carried_out(argv, as_json)
@@ -443,12 +499,15 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     # matrices are small: threads of the linear algebra library cost more than they give, in workers as well
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        gc.disable()  # imports leave nothing to collect, and looking for it takes a tenth of their time
-        try:
-            command = import_module(f"yid_ocp.workflow.{arguments.module}")
-        finally:
-            gc.enable()
-        code = int(command.run(arguments))
+        run = arguments.run
+        if isinstance(run, str):
+            module, _, function = run.rpartition(".")
+            gc.disable()  # imports leave nothing to collect, and looking for it takes a tenth of their time
+            try:
+                run = getattr(import_module(f"yid_ocp.workflow.{module}"), function)
+            finally:
+                gc.enable()
+        code = int(run(arguments))
         sys.stdout.flush()
         interruption.raise_if_requested()
         return code

@@ -13,6 +13,7 @@ from rich.progress import Progress as Bars
 from yid_ocp.progress import NULL_PROGRESS
 from yid_ocp.report.terminal import SummaryStatement
 from yid_ocp.solvers import Iterate
+from yid_ocp.workflow import command_runner
 from yid_ocp.workflow.command_runner import (
     EXIT_DONE,
     EXIT_FAILED,
@@ -109,14 +110,15 @@ def test_who_does_not_look_is_shown_nothing_or_lines():
 @pytest.mark.parametrize(("quiet", "reached"), [(True, True), (False, True), (False, False)])
 def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, capsys, quiet, reached):
     monkeypatch.chdir(tmp_path)
+    said = [SummaryStatement("a = 1"), SummaryStatement("done")]
+    monkeypatch.setattr(command_runner, "SUMMARY_BY_FORMAT", {"made": lambda result: said if result["a"] == 1 else []})
 
     def work(progress):
         progress.begin_stage("working")
-        return CommandResult(folder, {"a": 1}, None, reached)
+        return CommandResult(folder, {"format": "made", "a": 1}, None, reached)
 
     folder = tmp_path / "runs" / "x"
-    said = [SummaryStatement("a = 1"), SummaryStatement("done")]
-    code = run_command_and_print(asked(quiet=quiet), work, lambda result: said if result == {"a": 1} else [])
+    code = run_command_and_print(asked(quiet=quiet), work)
     captured = capsys.readouterr()
     assert code == (EXIT_DONE if reached else EXIT_FAILED)
     expected = (f"{folder}\n", "") if quiet else ("a = 1\ndone\nrun folder: runs/x\n", "working ...\n")
@@ -126,7 +128,6 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    run_command_and_print(
-        asked(), lambda progress: CommandResult(tmp_path / "there", {"a": 1}, None), lambda result: []
-    )
+    monkeypatch.setattr(command_runner, "SUMMARY_BY_FORMAT", {"made": lambda result: []})
+    run_command_and_print(asked(), lambda progress: CommandResult(tmp_path / "there", {"format": "made"}, None))
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")

@@ -33,13 +33,12 @@ from yid_ocp.solvers.base import Solver
 from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.surface_meshes import ExtraMesh
 
+_Names = tuple[str, ...]
 _Vector3 = tuple[float, float, float]
 _Vector4 = tuple[float, float, float, float]
-_Bounds = tuple[float, float]
 _FilePath = Annotated[str, OptionInfo("a file, relative to the configuration", is_path=True)]
-_RecordingPath = Annotated[
-    str, OptionInfo("a recording, relative to the configuration, or default:NAME.h5", is_path=True)
-]
+_Recording = Annotated[str, OptionInfo("a recording, relative to the configuration, or default:NAME.h5", is_path=True)]
+_Recordings = tuple[_Recording, ...]
 _ArmMode = Literal["driven", "prescribed", "servo", "passive"]
 _GraspKind = Literal["point", "axis", "weld"]
 
@@ -85,9 +84,7 @@ class JointSpringSettings:
 
     stiffness: Annotated[float, Ge(0), OptionInfo("stiffness", "N m/rad or N/m")]
     rest_position: Annotated[float, OptionInfo("coordinate at which it is relaxed", "rad or m")] = 0.0
-    damping: Annotated[float | None, Ge(0), OptionInfo("viscous; model.damping when absent", "N m s/rad or N s/m")] = (
-        None
-    )
+    damping: Annotated[float | None, Ge(0), OptionInfo("viscous; or model.damping", "N m s/rad or N s/m")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +100,7 @@ class EffectSettings:
 class JointActuationSettings:
     """Moving joints of the robot and how each is driven."""
 
-    joints: Annotated[tuple[str, ...] | None, OptionInfo("in configuration order; all movable ones when absent")] = None
+    joints: Annotated[_Names | None, OptionInfo("in configuration order; all movable ones when absent")] = None
     mode: Annotated[
         _ArmMode,
         OptionInfo(
@@ -112,19 +109,10 @@ class JointActuationSettings:
             "encoders correct"
         ),
     ] = "driven"
-    servo: Annotated[PositionServoOptions, OptionInfo("of the mode servo")] = field(
-        default_factory=PositionServoOptions
-    )
-    passive_joints: Annotated[
-        tuple[str, ...], OptionInfo("joints among them that nothing drives, whatever the mode")
-    ] = ()
-    locked_joints: Annotated[Mapping[str, float], OptionInfo("value of joints that do not move", "rad or m")] = field(
-        default_factory=dict
-    )
-    exclude_links: Annotated[
-        tuple[str, ...],
-        OptionInfo("links of the URDF left out with all that hangs on them, such as a hand not mounted"),
-    ] = ()
+    servo: Annotated[PositionServoOptions, OptionInfo("of mode servo")] = field(default_factory=PositionServoOptions)
+    passive_joints: Annotated[_Names, OptionInfo("joints among them that nothing drives, whatever the mode")] = ()
+    locked_joints: Annotated[Mapping[str, float], OptionInfo("fixed values", "rad or m")] = field(default_factory=dict)
+    exclude_links: Annotated[_Names, OptionInfo("links of the URDF left out with all that hangs on them")] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,9 +126,7 @@ class FrictionSettings:
             "load (grows with the torque through the gear) beside Coulomb; load_stribeck, all of them"
         ),
     ]
-    joints: Annotated[
-        tuple[str, ...] | None, OptionInfo("joints of the robot that have it; all that move when absent")
-    ] = None
+    joints: Annotated[_Names | None, OptionInfo("joints of the robot that have it; all that move when absent")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,10 +135,7 @@ class ModelSettings:
 
     robot: Annotated[
         _FilePath | None,
-        OptionInfo(
-            "URDF file, package:NAME of example-robot-data, or default:NAME.urdf of this package; null for an object "
-            "held by the world or by clamps"
-        ),
+        OptionInfo("URDF file, package:NAME of example-robot-data, default:NAME.urdf of this package; null for none"),
     ] = None
     clamps: Annotated[
         Mapping[str, ClampSettings],
@@ -161,34 +144,22 @@ class ModelSettings:
     arms: Annotated[JointActuationSettings, OptionInfo("the robot's joints")] = JointActuationSettings()
     frames: Annotated[
         Mapping[str, FrameSettings],
-        OptionInfo(
-            "more frames, by name, on robot, object or world: a tool's tip, the middle of what a hand holds, a marker"
-        ),
+        OptionInfo("more frames, by name, on robot, object or world: a tool's tip, a hand's middle, a marker"),
     ] = field(default_factory=dict)
     object: Annotated[
         ObjectKind | None, RegistryChoice(OBJECT_KINDS, selector_key="kind"), OptionInfo("the flexible object")
     ] = None
-    grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("by name: left, right, gripper")] = field(
-        default_factory=dict
-    )
-    springs: Annotated[Mapping[str, JointSpringSettings], OptionInfo("by joint of the robot")] = field(
-        default_factory=dict
-    )
+    grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("by name: left, right")] = field(default_factory=dict)
+    springs: Annotated[Mapping[str, JointSpringSettings], OptionInfo("by robot joint")] = field(default_factory=dict)
     damping: Annotated[
         Annotated[float, Ge(0)] | Mapping[str, Annotated[float, Ge(0)]],
-        OptionInfo(
-            "viscous damping of every coordinate; or by joint of the robot (0.05 for those not named) and by the name "
-            "`object`",
-            "N m s/rad",
-        ),
+        OptionInfo("viscous, of every coordinate; or by joint (0.05 for those not named) and `object`", "N m s/rad"),
     ] = 0.05
-    friction: Annotated[
-        FrictionSettings | None, OptionInfo("ordinary friction of the joints, its amplitudes and damping free")
-    ] = None
+    friction: Annotated[FrictionSettings | None, OptionInfo("of the joints, its amplitudes and damping free")] = None
     gravity: Annotated[_Vector3, OptionInfo("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
-    points: Annotated[
-        tuple[str, ...] | None, OptionInfo("frames that sensors may see, such as T1:40%; the segments' tips")
-    ] = None
+    points: Annotated[_Names | None, OptionInfo("frames that sensors may see, such as T1:40%; or segments' tips")] = (
+        None
+    )
     extra_meshes: Annotated[
         tuple[ExtraMesh, ...],
         OptionInfo("what a camera sees and the URDF does not have: a gripper's body, a table; `track` leaves it out"),
@@ -200,50 +171,35 @@ class ModelSettings:
 class RecordingSettings:
     """Recordings for estimation, for held-out prediction and for reference."""
 
-    estimate: Annotated[tuple[_RecordingPath, ...], OptionInfo("to estimate on")] = ()
-    held_out: Annotated[tuple[_RecordingPath, ...], OptionInfo("only predicted, never touched by the fit")] = ()
+    estimate: Annotated[_Recordings, OptionInfo("to estimate on")] = ()
+    held_out: Annotated[_Recordings, OptionInfo("only predicted, never touched by the fit")] = ()
     reference_recordings: Annotated[
-        tuple[_RecordingPath, ...],
+        _Recordings,
         OptionInfo("made without what a diagnosis finds, which it then predicts; those of its baseline when absent"),
     ] = ()
-    strict: Annotated[
-        bool, OptionInfo("whether any doubt about a recording stops the run; --strict on the command line")
-    ] = False
+    strict: Annotated[bool, OptionInfo("whether any doubt about a recording stops the run, as by --strict")] = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
     """How `import` converts a file of another tool; a command-line flag overrides its key here."""
 
-    joint_topics: Annotated[
-        tuple[str, ...] | None, OptionInfo("of a bag: topics of joint states, put on one clock; all when absent")
-    ] = None
-    command_topic: Annotated[
-        str | None, OptionInfo("of a bag: topic of joint states whose positions were asked for, not measured")
-    ] = None
-    joints: Annotated[
-        tuple[str, ...] | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; all when absent")
-    ] = None
+    joint_topics: Annotated[_Names | None, OptionInfo("of a bag: of joint states, put on one clock; or all")] = None
+    command_topic: Annotated[str | None, OptionInfo("of a bag: topic of joint states with commanded positions")] = None
+    joints: Annotated[_Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; or all")] = None
     points: Annotated[
         Mapping[str, str] | None,
         OptionInfo("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point that it is, such as cable:40%"),
     ] = None
     pose_axes: Annotated[
-        float | None,
-        Gt(0),
-        Le(10),
-        OptionInfo("how far along a pose's axes points NAME_x, NAME_y, NAME_z are made", "m"),
+        float | None, Gt(0), Le(10), OptionInfo("how far along a pose's axes points NAME_x, _y and _z are made", "m")
     ] = None
     columns: Annotated[
         Mapping[str, str] | None,
         OptionInfo("of a table: column, or pattern such as *_pos, and t, CHANNEL:JOINT, AXIS:POINT or skip"),
     ] = None
-    header: Annotated[bool | None, OptionInfo("of a table: whether its first row has names, else 1, 2 and so on")] = (
-        None
-    )
-    skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether lines that are no numbers are left out")] = (
-        None
-    )
+    header: Annotated[bool | None, OptionInfo("of a table: whether its first row has names, else 1, 2, ...")] = None
+    skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether to leave out lines without numbers")] = None
     delimiter: Annotated[str | None, OptionInfo("of a table: one character between cells; a comma when absent")] = None
     units: Annotated[
         Mapping[str, str] | None,
@@ -256,8 +212,7 @@ class ImportSettings:
         Mapping[str, float] | None, OptionInfo("by joint or pattern, where effort is a motor's current", "N m/A")
     ] = None
     gears: Annotated[
-        Mapping[str, float] | None,
-        OptionInfo("turns of the motor per turn of the joint, by joint or pattern; 1 when absent"),
+        Mapping[str, float] | None, OptionInfo("turns of the motor per turn of a joint or pattern; or 1")
     ] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
     clock: Annotated[ClockKind | None, OptionInfo("of a table: whether its times were measured")] = None
@@ -270,11 +225,9 @@ class ParameterSettings:
     """Initial value, bounds and prior of one parameter, or of all that match a pattern such as T*.bend."""
 
     initial: Annotated[float | None, OptionInfo("value, or where the search starts", "that of the parameter")] = None
-    bounds: Annotated[_Bounds | None, OptionInfo("lower and upper bound", "that of the parameter")] = None
+    bounds: Annotated[tuple[float, float] | None, OptionInfo("lower and upper bound", "that of the parameter")] = None
     free: Annotated[bool | None, OptionInfo("whether it is estimated")] = None
-    prior_std: Annotated[
-        float | None, Gt(0), OptionInfo("standard deviation of a Gaussian prior", "that of the parameter")
-    ] = None
+    prior_std: Annotated[float | None, Gt(0), OptionInfo("std of a Gaussian prior", "that of the parameter")] = None
     per_recording: Annotated[bool | None, OptionInfo("whether it has a value of its own in every recording")] = None
 
 
@@ -284,9 +237,7 @@ class ProblemSettings(ProblemOptions):
 
     time_step: Annotated[float, Gt(0), Le(0.1), OptionInfo("of the integrator", "s")] = 0.01
     force_split: Annotated[ForceSplit, OptionInfo("rule for forces; left is the paper's")] = "symmetric"
-    constraint_force: Annotated[ConstraintForcePlacement, OptionInfo("where grasps pull; node is the paper's")] = (
-        "midpoint"
-    )
+    constraint_force: Annotated[ConstraintForcePlacement, OptionInfo("where grasps pull; node: paper")] = "midpoint"
     use_compiler: Annotated[bool, OptionInfo("whether to compile the step where a C compiler is found")] = True
 
 
@@ -294,22 +245,13 @@ class ProblemSettings(ProblemOptions):
 class DiagnosisSettings(Thresholds):
     """Candidates and thresholds of the diagnosis of the sim-to-real gap."""
 
-    candidates: Annotated[
-        Literal["all"] | tuple[str, ...], OptionInfo("effects to try: all, or a list of kind or kind@location")
-    ] = "all"
-    exclude: Annotated[tuple[str, ...], OptionInfo("candidates not to try, by kind or kind@location")] = ()
+    candidates: Annotated[Literal["all"] | _Names, OptionInfo("effects to try: all, kind or kind@location")] = "all"
+    exclude: Annotated[_Names, OptionInfo("candidates not to try, by kind or kind@location")] = ()
     noise_fraction: Annotated[
-        float,
-        Gt(0),
-        Le(1),
-        OptionInfo(
-            "part of all stated std, torques' included, that is noise, where the rest stands for the model's error"
-        ),
+        float, Gt(0), Le(1), OptionInfo("part of all stated std that is noise; the rest stands for the model's error")
     ] = 1.0
-
     baseline: Annotated[
-        tuple[_FilePath, ...],
-        OptionInfo("run folders of `solve` or `diagnose`, of the same model: what differs since is asked"),
+        tuple[_FilePath, ...], OptionInfo("runs of `solve` or `diagnose` of this model: what differs since is asked")
     ] = ()
 
     @property
@@ -336,9 +278,7 @@ class CompareSettings:
     methods: Annotated[
         Mapping[str, Annotated[Solver, RegistryChoice(SOLVERS)]], OptionInfo("settings of each method, by name")
     ] = field(default_factory=_compared)
-    paper_experiment: Annotated[str | None, OptionInfo("experiment of the source paper whose answer stands beside")] = (
-        None
-    )
+    paper_experiment: Annotated[str | None, OptionInfo("of the source paper whose answer stands beside")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,9 +287,7 @@ class VirtualFramesSettings:
 
     seed: Annotated[int, Ge(0), OptionInfo("of motion, noise and camera")] = 0
     duration: Annotated[float, Gt(0), Le(600), OptionInfo("of the experiment", "s")] = 5.0
-    max_gripper_travel: Annotated[
-        float, Gt(0), Le(1), OptionInfo("largest distance of a gripper from its start", "m")
-    ] = 0.11
+    max_gripper_travel: Annotated[float, Gt(0), Le(1), OptionInfo("largest, from its start", "m")] = 0.11
     grasp_start_offsets: Annotated[
         Mapping[str, _Vector3], OptionInfo("by grasp: where it starts beside the end of the undeformed object", "m")
     ] = field(default_factory=dict)
@@ -372,9 +310,7 @@ class TrackSettings:
             "folder of clouds or depth images, bag, MCAP or RealSense file; a virtual frame sequence when absent"
         ),
     ] = None
-    frame_topic: Annotated[str | None, OptionInfo("of the clouds or depth images in a bag, where it has several")] = (
-        None
-    )
+    frame_topic: Annotated[str | None, OptionInfo("of clouds or depth images in a bag that has several")] = None
     camera_pose: Annotated[
         tuple[_Vector4, _Vector4, _Vector4, _Vector4] | None,
         OptionInfo("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
@@ -386,16 +322,10 @@ class TrackSettings:
             "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
         ),
     ] = None
-    virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("what is filmed without frames")] = (
-        VirtualFramesSettings()
-    )
-    keep_frames: Annotated[
-        bool, OptionInfo("whether a virtual frame sequence's frames are written to the run folder")
-    ] = False
+    virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("filmed without frames")] = VirtualFramesSettings()
+    keep_frames: Annotated[bool, OptionInfo("whether virtual frames are written to the run folder")] = False
     n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("frames of which every stage is drawn")] = 2
-    options: Annotated[TrackOptions, OptionInfo("filters, skeleton, fit, clock and what counts as good")] = field(
-        default_factory=TrackOptions
-    )
+    options: Annotated[TrackOptions, OptionInfo("filters, fit and quality")] = field(default_factory=TrackOptions)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -415,9 +345,7 @@ class PlanSettings(PlanOptions):
 class OutputSettings:
     """Output: run folders, the report and the discretisation check."""
 
-    runs_folder: Annotated[
-        _FilePath | None, OptionInfo("in which run folders are made; `runs` in the working folder")
-    ] = None
+    runs_folder: Annotated[_FilePath | None, OptionInfo("for run folders; `runs` in the working folder")] = None
     write_report: Annotated[bool, OptionInfo("whether report.html is written")] = True
     discretisation_check: Annotated[
         Literal["none", "time_step", "both"] | None,
@@ -434,7 +362,7 @@ class RunSettings:
 
     description: Annotated[str, OptionInfo("one sentence for the report")] = ""
     plugins: Annotated[
-        tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are run")
+        tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they run")
     ] = ()
     model: Annotated[ModelSettings, OptionInfo("what the world is made of")] = ModelSettings()
     recordings: Annotated[RecordingSettings, OptionInfo("the data")] = RecordingSettings()
@@ -442,9 +370,7 @@ class RunSettings:
     sensors: Annotated[
         Mapping[str, SensorOptions], OptionInfo("by group of the recordings: points, joints.effort, motors.current")
     ] = field(default_factory=dict)
-    parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("by name or pattern")] = field(
-        default_factory=dict
-    )
+    parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("name or pattern")] = field(default_factory=dict)
     problem: Annotated[ProblemSettings, OptionInfo("what is compared with the recordings and how")] = ProblemSettings()
     solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("how the cost is lowered")] = field(
         default_factory=GaussNewton

@@ -22,7 +22,6 @@ from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_hint
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_json
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.diagnosis_summaries import batch_summary
 from yid_ocp.report.html import write_report, write_shared_plotly_script
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
@@ -33,7 +32,6 @@ from yid_ocp.workflow.run_history import estimate_history_result, read_estimates
 from yid_ocp.workflow.run_inputs import input_files
 from yid_ocp.workflow.solve import run_solve
 
-_RESULT_FORMAT = "yid-batch/1"
 _RUNS_FOLDER, _TASKS_FOLDER = "runs", "tasks"
 _PARAMETER_KEYS = ("value", "std", "unit", "verdict")
 log = logging.getLogger(__name__)
@@ -58,23 +56,17 @@ def run(arguments: argparse.Namespace) -> int:
     words += ["--command", arguments.each, *(word for said in arguments.overrides for word in ("--set", said))]
     again = shlex.join([*words, "--out", str(out)])
     asked = (members, out, arguments.each, workers)
-    return run_command_and_print(arguments, lambda shown: run_batch(*asked, shown, again), batch_summary)
+    return run_command_and_print(arguments, lambda shown: run_batch(*asked, shown, again))
 
 
 def list_batch_runs(
     configs: Sequence[str | Path], recordings: str | None = None, overrides: Sequence[str] = ()
 ) -> list[_BatchRun]:
-    """Runs of a batch: one per configuration, or one per configuration and matching recording.
+    """Runs of a batch: one per configuration, or one per configuration and recording that matches a pattern.
 
-    Parameters
-    ----------
-    recordings : str, optional
-        A pattern such as `fleet/*.h5`, `**` for any folders; a run then estimates on one recording and holds none out,
-        unless the overrides say otherwise.
-    overrides : sequence of str
-        `a.b=c` each, for every run.
-
-    `ConfigError` where a configuration is not there or given twice, or no recording matches.
+    With a pattern, such as `fleet/*.h5`, `**` for any folders, a run estimates on one recording and holds none out,
+    unless the overrides, `a.b=c` each, say otherwise. `ConfigError` where a configuration is not there or given twice,
+    or no recording matches.
     """
     paths = [Path(config) for config in configs]
     for i, path in enumerate(paths):
@@ -91,15 +83,11 @@ def list_batch_runs(
             advice = "put the pattern in quotes, so that the shell leaves it alone, and check the folder"
             allowed = "a pattern such as 'fleet/*.h5' or 'fleet/**/*.h5', relative to the working folder"
             raise ConfigError("no recording matches", where=f"--recordings {recordings}", allowed=allowed, hint=advice)
-        entries = [
-            (
-                file.stem if len(paths) == 1 else f"{path.stem}-{file.stem}",
-                path,
-                (f"recordings.estimate=[{json.dumps(str(file.resolve()))}]", "recordings.held_out=[]", *overrides),
-            )
-            for path in paths
-            for file in files
-        ]
+        entries = []
+        for path, file in itertools.product(paths, files):
+            name = file.stem if len(paths) == 1 else f"{path.stem}-{file.stem}"
+            estimate = f"recordings.estimate=[{json.dumps(str(file.resolve()))}]"
+            entries.append((name, path, (estimate, "recordings.held_out=[]", *overrides)))
     members: dict[str, _BatchRun] = {}
     for stem, path, settings in entries:
         names = itertools.chain([stem], (f"{stem}-{number}" for number in itertools.count(2)))
@@ -116,22 +104,12 @@ def run_batch(
     progress: Progress = NULL_PROGRESS,
     command_line: str = "",
 ) -> CommandResult[None]:
-    """Run a command for every run of a batch; finished runs in the folder are reused.
+    """Run `solve` or `diagnose` for every run of `list_batch_runs`; finished runs in the folder are reused.
 
-    Successful where all runs were; those that failed say why.
-
-    Parameters
-    ----------
-    members : sequence of _BatchRun
-        See `list_batch_runs`.
-    out : str or Path
-        Folder: `runs/NAME/` (a run folder each), `tasks/` (results of tasks, see `yid_ocp.parallel`), then `batch.json`
-        (`yid-batch/1`) and `report.html`.
-    command : {'solve', 'diagnose'}
-    command_line : str
-        The command line that does the same, for the report.
-
-    `OutputError` where the folder holds something else or cannot be made, `WorkerError` as `run_tasks`.
+    Successful where all runs were; those that failed say why. The folder `out` then holds `runs/NAME/` (a run folder
+    each), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`) and `report.html`, which
+    has the command line that does the same. `OutputError` where it holds something else or cannot be made,
+    `WorkerError` as `run_tasks`.
     """
     folder = _folder(Path(out))
     write_shared_plotly_script(folder)
@@ -156,7 +134,7 @@ def run_batch(
     results |= {entry.name: entry for entry in done}
     entries = [_entry(results[member.name], folder) for member in members]
     result = {
-        "format": _RESULT_FORMAT,
+        "format": "yid-batch/1",
         "command": command,
         "again": command_line,
         "runs": entries,

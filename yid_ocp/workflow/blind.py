@@ -29,7 +29,7 @@ from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.diagnosis_summaries import blind_summary, blind_tables_markdown
+from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
 from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     purpose = blind.ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
     asked = (runs, out, arguments.cases, arguments.seed)
-    return run_command_and_print(arguments, lambda shown: run_blind(*asked, shown, workers, purpose), blind_summary)
+    return run_command_and_print(arguments, lambda shown: run_blind(*asked, shown, workers, purpose))
 
 
 def run_blind(
@@ -73,21 +73,13 @@ def run_blind(
 ) -> CommandResult[None]:
     """Run a blind validation of the diagnosis in several processes; finished parts in the folder are reused.
 
-    Parameters
-    ----------
-    runs : sequence of RunSettings
-        Configurations: models, posture and sensors of their first recordings, `diagnosis.candidates`. Each is varied
-        (`EXPERIMENT_VARIATIONS`) as far as there are cases for it.
-    out : str or Path
-        Folder: `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
-        `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the
-        sources that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then
-        `result.json` (`yid-blind/1`), `table.md` and pictures; of an ensemble to calibrate by `thresholds.json`
-        (`yid-calibration/1`).
-    count : int
-        Number of cases.
-    purpose : {'report', 'calibration'}
-        The same seed draws other cases for each.
+    Models, postures and sensors are those of the runs' first recordings, varied (`EXPERIMENT_VARIATIONS`) as far as
+    there are cases for it; the same seed draws other cases for each purpose, 'report' and 'calibration'.
+
+    The folder holds `configs/`, `prepared/` (what is detectable in every experiment), `cases/` (recordings),
+    `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the sources
+    that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then `result.json`
+    (`yid-blind/1`), `table.md` and pictures; of an ensemble to calibrate by `thresholds.json` (`yid-calibration/1`).
 
     Raises
     ------
@@ -102,10 +94,10 @@ def run_blind(
     for entry in runs:
         _require_compatible(entry)
     names = [entry.name for entry in runs]
-    twice = [name for i, name in enumerate(names) if name in names[:i]]
-    if twice:
-        what, hint = f"two configurations are called {twice[0]}", "give each a name of its own"
-        raise ConfigError(what, where="blind", hint=hint)
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            what, hint = f"two configurations are called {name}", "give each a name of its own"
+            raise ConfigError(what, where="blind", hint=hint)
     proof = _Proof(Path(out).absolute(), runs, count, seed, purpose, progress, workers)
     try:
         commitment, cases = proof.commit()
@@ -139,12 +131,7 @@ def run_blind(
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
         write_json(proof.folder / "thresholds.json", to_json_types(found | made))
-    return _write_outcome(proof.folder, to_json_types(result), runs, progress)
-
-
-def _write_outcome(
-    folder: Path, written: dict[str, Any], runs: Sequence[RunSettings], progress: Progress
-) -> CommandResult[None]:
+    folder, written = proof.folder, to_json_types(result)
     write_json(folder / "result.json", written)
     write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")
     draw_blind_results(folder, written)
@@ -190,13 +177,9 @@ class _Proof:
         for entry in read_input_json(self.folder / "cases" / "cases.json"):
             config, _, variation = str(entry["experiment"]).rpartition(".")
             experiment = BlindExperiment(self.config_file(config), variation, self.seed, self.purpose)
-            own = {
-                "experiment": vars(experiment),
-                "first": self.folder / "prepared" / f"{entry['experiment']}.h5",
-                "name": str(entry["name"]),
-                "recordings": [self.folder / "cases" / name for name in (*entry["estimate"], entry["held_out"])],
-                "without": entry["without"],
-            }
+            recordings = [self.folder / "cases" / name for name in (*entry["estimate"], entry["held_out"])]
+            own = {"name": str(entry["name"]), "recordings": recordings, "without": entry["without"]}
+            own |= {"experiment": vars(experiment), "first": self.folder / "prepared" / f"{entry['experiment']}.h5"}
             tasks.append(Task(own["name"], own))
         return said, tasks
 
@@ -223,9 +206,8 @@ class _Proof:
         tasks = []
         for entry in plan:
             name = entry.experiment
-            known = {"first": prepared / f"{name}.h5", "detectable": prepared / f"{name}.json"}
-            wanted = {"planned": asdict(entry), "folder": str(cases)}
-            tasks.append(Task(f"case {entry.number}", {**told[name], **known, **wanted}))
+            known = {"first": prepared / f"{name}.h5", "detectable": prepared / f"{name}.json", "folder": str(cases)}
+            tasks.append(Task(f"case {entry.number}", {**told[name], **known, "planned": asdict(entry)}))
         made = self.done(_draw_case, tasks, "sealed/drawn")
         text, digest = blind.seal_labels_with_hash([blind.CaseGroundTruth.from_dict(entry["label"]) for entry in made])
         write_text(self.folder / "sealed/labels.json", text)
@@ -284,8 +266,7 @@ def _draw_case(
         "held_out": f"{case.held_out_recording.name}.h5",
         "without": list(case.excluded_kinds),
     }
-    found: dict[str, Any] = to_json_types({"label": label.to_dict(), "case": told})
-    return found
+    return dict(to_json_types({"label": label.to_dict(), "case": told}))
 
 
 def diagnose_case_task(
@@ -319,10 +300,9 @@ def _true_effect_closure(
     """Task: fraction of a case's gap closed by its refitted true effects; None where it cannot be computed."""
     run, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
     case = _case(name, recordings, ())
+    truth = blind.CaseGroundTruth.from_dict(label)
     try:
-        best = blind.true_effects_gap_closure(
-            ensemble, case, blind.CaseGroundTruth.from_dict(label), run.diagnosis.candidates
-        )
+        best = blind.true_effects_gap_closure(ensemble, case, truth, run.diagnosis.candidates)
     except YidError:
         return None
     return best if math.isfinite(best) else None
@@ -464,8 +444,7 @@ def list_experiments(
 ) -> tuple[dict[str, BlindExperiment], frozenset[str]]:
     """Virtual experiments by name, and the names of those whose object's links can be divided further.
 
-    Variations that a configuration does not allow, as one whose frames sit on the object that is taken away, are left
-    out.
+    Variations that a configuration does not allow, as by frames on the object that is taken away, are left out.
     """
     found: dict[str, BlindExperiment] = {}
     chains = set()

@@ -9,11 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.discretisation import (
-    NaturalFrequencies,
-    largest_alternating_error_growth,
-    step_map_natural_frequencies,
-)
+from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import ChannelGroup, JointGroup, PointGroup
@@ -25,32 +21,23 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.progress import Progress
 from yid_ocp.report.animation import Animation, make_animation, recording_animation
-from yid_ocp.report.summaries import check_summary
-from yid_ocp.sensors import CHANNEL_KINDS
-from yid_ocp.sensors.joints import (
-    JOINT_EFFORT_GROUP_NAME,
-    JOINT_POSITION_GROUP_NAME,
-    is_noise_std_stated,
-    joint_angle_noise_std,
-    joint_torque_noise_std,
-)
+from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
 from yid_ocp.workflow.build_problem import build_problem, initial_grasp_closure_errors, issues_to_plain_data
-from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, run_command_with_settings
+from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, command_with_settings
 from yid_ocp.workflow.prediction_outputs import predicted_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files
 from yid_ocp.workflow.solve import discretisation_shift_results, measure_discretisation_shifts
 
-_RESULT_FORMAT = "yid-check/1"
 _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
 _N_MODES = 3
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    code = run_command_with_settings(arguments, _run_check, check_summary)
+    code = command_with_settings(_run_check)(arguments)
     return EXIT_WRONG_INPUT if code == EXIT_FAILED else code
 
 
@@ -81,7 +68,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             data = {"recordings": taken, "system": step.system}
             shown = {"animations": _scenes(problem, first), "section_data": data}
         result = {
-            "format": _RESULT_FORMAT,
+            "format": "yid-check/1",
             "model": {"name": step.system.mechanism.name, **step.sizes},
             "mechanics": mechanics,
             "recordings": recordings,
@@ -121,7 +108,7 @@ def _mechanics(
 
 
 def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings: list[str]) -> dict[str, Any]:
-    recording, system, joints = episode.recording, problem.system, episode.recording.joints
+    recording, system, arm = episode.recording, problem.system, episode.recording.joints
     noise = _input_noise(problem, episode)
     for samples in episode.measurements:
         known = samples.std[np.isfinite(samples.std)]
@@ -139,15 +126,15 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         "noise": noise,
     }
     rate = 1.0 / problem.step.time_step
-    if joints is not None:
-        recorded = 1.0 / float(np.median(np.diff(joints.t)))
+    if arm is not None:
+        recorded = 1.0 / float(np.median(np.diff(arm.t)))
         if recorded < 0.5 * rate:
             warnings.append(f"{episode.name}: joints come at {recorded:.4g} Hz, the model steps at {rate:.4g} Hz")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
-        if moves and not system.servos and joints.effort is not None and joints.effort_kind is None:
+        if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
             warnings.append(
                 f"{episode.name}: nothing says whether joints/effort is a sample, a mean or a command (attribute "
-                f"effort_kind); it is taken as a {joints.effort_kind_or_default}"
+                f"effort_kind); it is taken as a {arm.effort_kind_or_default}"
             )
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
@@ -170,21 +157,19 @@ def _group(group: JointGroup | PointGroup | ChannelGroup) -> dict[str, Any]:
 
 
 def _input_noise(problem: EstimationProblem, episode: Episode) -> dict[str, Any]:
-    joints, errors, noise = episode.recording.joints, episode.input_errors, {}
-    if joints is None or errors is None:
+    arm, errors, noise = episode.recording.joints, episode.input_errors, {}
+    if arm is None or errors is None:
         return {}
-    for group, noise_std in (
-        (JOINT_EFFORT_GROUP_NAME, joint_torque_noise_std),
-        (JOINT_POSITION_GROUP_NAME, joint_angle_noise_std),
-    ):
+    effort, position = joints.JOINT_EFFORT_GROUP_NAME, joints.JOINT_POSITION_GROUP_NAME
+    for group, noise_std in ((effort, joints.joint_torque_noise_std), (position, joints.joint_angle_noise_std)):
         choice = problem.options.sensors.get(group, SensorOptions())
         noise[group] = {
-            "samples": len(joints.t),
-            "std": float(np.median(noise_std(joints, problem.system.driven, choice, episode.name))),
+            "samples": len(arm.t),
+            "std": float(np.median(noise_std(arm, problem.system.driven, choice, episode.name))),
             "unit": CHANNEL_KINDS[group].unit,
-            "estimated": not is_noise_std_stated(joints, group, choice),
+            "estimated": not joints.is_noise_std_stated(arm, group, choice),
         }
-    noise[JOINT_EFFORT_GROUP_NAME]["bias_std"] = float(np.median(errors.torque_bias_std))
+    noise[effort]["bias_std"] = float(np.median(errors.torque_bias_std))
     return noise
 
 
@@ -208,7 +193,7 @@ def _moves(
     run: RunSettings, problem: EstimationProblem, at_x: Evaluation, warnings: list[str], progress: Progress
 ) -> dict[str, Any]:
     x = problem.initial_unknowns
-    growth = largest_alternating_error_growth(problem, x)
+    growth = discretisation.largest_alternating_error_growth(problem, x)
     if growth is not None and not growth.is_stable:
         warnings.append(f"with the initial parameters {growth.description}")
     if not at_x.ok:
@@ -227,10 +212,7 @@ def _moves(
 def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
     """Lowest natural frequencies with twice the links and with half and a quarter of the time step.
 
-    Returns
-    -------
-    dict
-        `links` and `time_step`: lists of {value, hertz, growing, message}; empty where there is nothing to vary.
+    Under `links` and `time_step` are lists of {value, hertz, growing, message}, empty where there is nothing to vary.
     """
     system, h = build_system(run), run.problem.time_step
     names = (*system.driven, *system.prescribed)
@@ -243,7 +225,8 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         posture = dict(zip(names, map(float, first.initial_known_coordinates), strict=True)) if names else {}
         theta = problem.predictor.theta_with_episode_values(first, theta)
         guess = None if first.fixed_initial_state is None else first.fixed_initial_state.state[: system.n_coordinates]
-    own = step_map_natural_frequencies(system, posture, theta, h, *rule, guess)
+    frequencies = discretisation.step_map_natural_frequencies
+    own = frequencies(system, posture, theta, h, *rule, guess)
     if own.message:
         return {"links": [], "time_step": [], "message": own.message}
     if own.n_unstable_modes:
@@ -253,24 +236,21 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
             f"problem.time_step, {remedy}or more damping"
         )
     steps = [_row(h, own)]
-    steps += [_row(h / k, step_map_natural_frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
+    steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", " s", steps)
     rows: list[dict[str, Any]] = []
     count = None if run.model.object is None else run.model.object.links_per_segment_or_total
     if count is not None:
         other = build_system(run, link_division=2)
-        values = {
-            name: value * divided_link_parameter_scale(run, name, 2)
-            for name, value in zip(system.parameters.names, theta, strict=True)
-            if name in other.parameters
-        }
-        finer = step_map_natural_frequencies(other, posture, other.parameters.vector(values), h, *rule)
+        known = zip(system.parameters.names, theta, strict=True)
+        values = {name: x * divided_link_parameter_scale(run, name, 2) for name, x in known if name in other.parameters}
+        finer = frequencies(other, posture, other.parameters.vector(values), h, *rule)
         rows = [_row(count, own), _row(2 * count, finer)]
         _warn(warnings, "the links go", "", rows)
     return {"links": rows, "time_step": steps, "message": ""}
 
 
-def _row(value: float, found: NaturalFrequencies) -> dict[str, Any]:
+def _row(value: float, found: discretisation.NaturalFrequencies) -> dict[str, Any]:
     hertz = found.frequencies_hz[:_N_MODES].tolist()
     return {"value": value, "hertz": hertz, "growing": found.n_unstable_modes, "message": found.message}
 

@@ -18,7 +18,8 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.terminal import SummaryBlock, summary_terminal_lines
+from yid_ocp.report import diagnosis_summaries, summaries  # noqa: F401, they register
+from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, summary_terminal_lines
 
 if TYPE_CHECKING:
     import rich.progress
@@ -40,28 +41,27 @@ class CommandResult(Generic[Output]):
     is_successful: bool = True
 
 
-def run_command_with_settings(
-    arguments: argparse.Namespace,
-    work: Callable[..., CommandResult[Any]],
-    summary: Callable[[Mapping[str, Any]], Sequence[SummaryBlock]],
-    *options: Any,
-) -> int:
-    """`run_command_and_print` of `work(settings, out, progress, *options)` with settings and overrides."""
-    settings = load_config(arguments.config, arguments.overrides)
-    return run_command_and_print(arguments, lambda shown: work(settings, arguments.out, shown, *options), summary)
+def command_with_settings(
+    work: Callable[..., CommandResult[Any]], *options: str
+) -> Callable[[argparse.Namespace], int]:
+    """A command that runs `work(settings, out, progress, ...)`, at the end the arguments that `options` names."""
+
+    def run(arguments: argparse.Namespace) -> int:
+        settings = load_config(arguments.config, arguments.overrides)
+        more = [getattr(arguments, name) for name in options]
+        return run_command_and_print(arguments, lambda shown: work(settings, arguments.out, shown, *more))
+
+    return run
 
 
-def run_command_and_print(
-    arguments: argparse.Namespace,
-    work: Callable[[Progress], CommandResult[Any]],
-    summary: Callable[[Mapping[str, Any]], Sequence[SummaryBlock]],
-) -> int:
+def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progress], CommandResult[Any]]) -> int:
     """Run a command's function, print the summary of its result and its run folder, and return its exit code."""
     with stderr_progress_display(arguments) as progress:
         outcome = work(progress)
-    path, near = str(outcome.folder), os.path.relpath(outcome.folder)
+    path, near, result = str(outcome.folder), os.path.relpath(outcome.folder), outcome.result
     place = path if near.startswith("..") else f"run folder: {near}"
-    print_result(arguments, outcome.result, lambda: summary_terminal_lines(summary(outcome.result)), place, path)
+    summary = SUMMARY_BY_FORMAT[result["format"]]
+    print_result(arguments, result, lambda: summary_terminal_lines(summary(result)), place, path)
     return EXIT_DONE if outcome.is_successful else EXIT_FAILED
 
 
@@ -128,10 +128,7 @@ def _format_iterate(entry: Iterate) -> str:
 
 
 class StderrLineProgress(Progress):
-    """Progress as lines on standard error, for logs and pipes.
-
-    One for every stage and iterate, for every tenth of a stage, and for what is done some seconds after the last line.
-    """
+    """Progress as lines on standard error: for every stage, iterate, tenth of a stage, and some seconds of silence."""
 
     def __init__(self) -> None:
         self._tenths, self._last, self._left = 0, 0.0, _RemainingTime()

@@ -26,30 +26,17 @@ from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, make_animation
-from yid_ocp.report.diagnosis_summaries import diagnose_summary
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Iterate
+from yid_ocp.workflow import prediction_outputs, run_history
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print
 from yid_ocp.workflow.plan import discrimination_plan_settings
-from yid_ocp.workflow.prediction_outputs import (
-    HeldOutPredictionPair,
-    estimated_torque_offsets,
-    predicted_trajectory,
-    write_diagnosis_trajectories,
-)
+from yid_ocp.workflow.prediction_outputs import HeldOutPredictionPair
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder, software_and_plugin_versions
-from yid_ocp.workflow.run_history import (
-    baseline_estimates,
-    load_reference_recordings,
-    require_distinct_recordings,
-    settings_with_baseline_effects,
-)
 
 log = logging.getLogger(__name__)
-
-
 _STORE_FORMAT = "yid-refits/1"
 
 
@@ -59,9 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
-    return run_command_and_print(
-        arguments, lambda shown: run_diagnose(settings, arguments.out, shown), diagnose_summary
-    )
+    return run_command_and_print(arguments, lambda shown: run_diagnose(settings, arguments.out, shown))
 
 
 def run_diagnose(
@@ -73,13 +58,13 @@ def run_diagnose(
         refits = JsonRefitStore(folder, folder.input_hashes, dump_config(run), software_and_plugin_versions())
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step")
-        runs = baseline_estimates(run)
-        without, said = load_reference_recordings(run)
+        runs = run_history.baseline_estimates(run)
+        without, said = run_history.load_reference_recordings(run)
         if said:
             folder.log_event("message", level="WARNING", source="baseline", text=said)
-        run = settings_with_baseline_effects(run, runs)
+        run = run_history.settings_with_baseline_effects(run, runs)
         problem = build_problem(run, reference_recordings=without)
-        require_distinct_recordings(run, problem, runs, without)
+        run_history.require_distinct_recordings(run, problem, runs, without)
         if runs:
             problem = with_baseline_prior(problem, pool_estimates(runs)[0])
         nominal: Solution | None = None
@@ -103,14 +88,15 @@ def run_diagnose(
             raise
         folder.log_event("end", verdict=finding.verdict, effects=[effect.label for effect in finding.accepted_effects])
         predicted = _held_out_predictions(finding)
-        write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
+        prediction_outputs.write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
         moving = not last.problem.options.clamp_paths and bool(system.driven or system.prescribed)
+        x = last.problem.vector(last.values)
         own = {
             "model": final_model_to_dict(finding),
             "doubts": issues_to_plain_data(problem.options.data_issues),
-            "torque_offsets": estimated_torque_offsets(last.problem, last.problem.vector(last.values)),
+            "torque_offsets": prediction_outputs.estimated_torque_offsets(last.problem, x),
             "next_plan": discrimination_plan_settings(told["confusable"] if moving else (), folder.final_path),
         }
         known = {"problem": problem, "animations": _scenes(finding, predicted)}
@@ -213,23 +199,20 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]
     fits |= {"with the effects": finding.final_model} if finding.accepted_effects else {}
     scenes = []
     for episode, *outcomes in predicted:
-        told = [
-            predicted_trajectory(name, own, episode, outcome, own.split(own.vector(fit.values), 0)[0])
-            for (name, fit), outcome in zip(fits.items(), outcomes, strict=False)
-            for own in [fit.problem]
-        ]
+        told = []
+        for (name, fit), outcome in zip(fits.items(), outcomes, strict=False):
+            theta = fit.problem.split(fit.problem.vector(fit.values), 0)[0]
+            told.append(prediction_outputs.predicted_trajectory(name, fit.problem, episode, outcome, theta))
         scenes.append(make_animation(f"{episode.name} (held out)", told, episode.recording))
     return scenes
 
 
 class JsonRefitStore:
-    """A store of refits in one JSON file: {format, key, refits: {name: data of a `StoredFit`}}.
+    """A store of refits in one JSON file, replaced as a whole after every refit.
 
-    The file is replaced as a whole after every refit. One that was made from other inputs, by another configuration or
-    by another version is skipped with a notice.
-
-    Refits run in threads, not as tasks of `yid_ocp.parallel`: all of one diagnosis share a compiled step and what was
-    worked out from the recordings, and a refit takes less time than to build these in another process.
+    One that was made from other inputs, by another configuration or version is skipped with a notice. Refits run in
+    threads, not as tasks of `yid_ocp.parallel`: all of one diagnosis share a compiled step and what was worked out from
+    the recordings, and a refit takes less time than to build these in another process.
     """
 
     def __init__(self, folder: RunFolder, *made_from: Mapping[str, str] | str) -> None:

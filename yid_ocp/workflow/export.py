@@ -18,32 +18,22 @@ from yid_ocp.data import read_recording
 from yid_ocp.data.hdf5_io import open_checked_hdf5
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.export.models import (
-    EXPORT_MANIFEST_FORMAT,
-    FormatSupport,
-    effect_format_support,
-    parameter_format_support,
-    system_to_sdf,
-    system_to_urdf,
-)
+from yid_ocp.export import models
+from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FormatSupport
 from yid_ocp.export.signals import RosTopicTimeSeries, export_csv, export_mcap, ros_signals_from_recording
-from yid_ocp.files import file_sha256, to_json_types, write_json, write_text
+from yid_ocp.files import attributes_to_json, file_sha256, to_json_types, write_json, write_text
 from yid_ocp.model.system import System
 from yid_ocp.progress import Progress
 from yid_ocp.report.summaries import export_summary
 from yid_ocp.report.terminal import recording_summary_lines, summary_terminal_lines
 from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_replay import REPLAY_FEEDBACK_BANDWIDTH, ReplayMismatch, replay_in_mujoco
+from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
 from yid_ocp.workflow.import_recording import recording_contents_summary
 from yid_ocp.workflow.prediction_outputs import DIAGNOSIS_TRAJECTORIES_FORMAT, SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import software_and_plugin_versions
-from yid_ocp.workflow.run_history import (
-    effect_parameter_values_by_label,
-    read_estimation_result,
-    settings_with_effect_values,
-)
 from yid_ocp.workflow.run_inputs import read_recordings
 
 _MODEL_FORMATS = ("mjcf", "urdf", "sdf", "yaml")
@@ -127,11 +117,11 @@ class _CalibratedModel:
         values = self.values_for(system)
         if form == "mjcf":
             return mujoco_xml(system, values, emulate=True, actuators=True)
-        return system_to_urdf(system, values) if form == "urdf" else system_to_sdf(system, values)
+        return (models.system_to_urdf if form == "urdf" else models.system_to_sdf)(system, values)
 
 
 def _read_calibrated_model(folder: Path) -> _CalibratedModel:
-    result = read_estimation_result(folder)
+    result = run_history.read_estimation_result(folder)
     try:
         parameters = {str(name): dict(entry) for name, entry in result.get("model", result)["parameters"].items()}
         values = {name: float(entry["value"]) for name, entry in parameters.items()}
@@ -140,7 +130,8 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         raise DataError("the result has no parameters", where=where, hint="run it again") from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
-    whole = settings_with_effect_values(nominal, effect_parameter_values_by_label(values))
+    effects = run_history.effect_parameter_values_by_label(values)
+    whole = run_history.settings_with_effect_values(nominal, effects)
     return _CalibratedModel(whole, nominal, values, std)
 
 
@@ -167,7 +158,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
     if form == "mjcf":
         grasp = FormatSupport("native", "equality constraints between sites, or a tendon where it gives way")
     parameters = {}
-    for name, entry in parameter_format_support(full, supports, form).items():
+    for name, entry in models.parameter_format_support(full, supports, form).items():
         own, stds = full.parameters[name], calibrated.parameter_stds
         known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
         parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}
@@ -198,7 +189,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
 
 def _expressible(calibrated: _CalibratedModel, full: System, form: str) -> tuple[System, dict[str, FormatSupport]]:
     """The system without the effects that a format cannot tell, and what it makes of each."""
-    said = effect_format_support(full, calibrated.values_for(full), form)
+    said = models.effect_format_support(full, calibrated.values_for(full), form)
     for _ in range(len(said) + 1):
         told = {label: entry for label, entry in said.items() if entry.status != "not representable"}
         kept = [label for label, entry in told.items() if not entry.how.startswith("neutral")]
@@ -232,16 +223,10 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         after = _replayed(text, system, recordings, progress, 1)
     except (DataError, ModelError) as error:
         return {"status": "not done", "reason": error.what}
-    channels = {
-        name: {
-            "unit": error.unit,
-            "noise": error.noise_rms,
-            "before": before[name].rmse,
-            "after": error.rmse,
-            "fall": _fall([(before[name], error)]),
-        }
-        for name, error in after.items()
-    }
+    channels = {}
+    for name, mismatch in after.items():
+        own = attributes_to_json(mismatch, "unit noise=noise_rms after=rmse")
+        channels[name] = own | {"before": before[name].rmse, "fall": _fall([(before[name], mismatch)])}
     return {
         "status": "done",
         "which": which,
@@ -283,7 +268,7 @@ def _fall(pairs: Sequence[tuple[ReplayMismatch, ReplayMismatch]]) -> float | Non
 def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
     """Write `OUT/RECORDING.mcap` for every recording of a run; its topics stand in docs/reports.md."""
     source, files, notes = folder / "trajectories.h5", [], []
-    read_estimation_result(folder)
+    run_history.read_estimation_result(folder)
     with open_checked_hdf5(source) as file:
         form = str(file.attrs.get("format", ""))
         if form not in _PREDICTION_TOPICS:

@@ -12,63 +12,40 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from yid_ocp.analysis import identifiability as fisher
+from yid_ocp.analysis import what_if
 from yid_ocp.analysis.compare import problem_without_cable_memory
 from yid_ocp.analysis.experiment_design import RecordedExperiment
-from yid_ocp.analysis.identifiability import (
-    GRASP_OFFSET_PRIOR_STD,
-    IdentifiabilityResult,
-    InitialStateKnowledge,
-    ParameterIdentifiability,
-    identifiability,
-    unknowns_from_solution,
-    with_grasp_offset_effects,
-)
+from yid_ocp.analysis.identifiability import GRASP_OFFSET_PRIOR_STD, IdentifiabilityResult, with_grasp_offset_effects
 from yid_ocp.analysis.profile import ParameterProfileLikelihood, is_small_enough_for_profiles
-from yid_ocp.analysis.what_if import (
-    ChangedExperimentResult,
-    ExperimentChange,
-    ExperimentRanking,
-    evaluate_change_sets,
-    what_if,
-)
+from yid_ocp.analysis.what_if import ChangedExperimentResult
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.files import dataclass_from_plain_data, to_lossless_plain_data
 from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.summaries import identifiability_summary
 from yid_ocp.solvers import Solution, Status
 from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResult, command_with_settings, workers_from_arguments
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files
 from yid_ocp.workflow.solve import solve_and_log
-
-_RESULT_FORMAT = "yid-identifiability/1"
 
 
 @dataclass(frozen=True)
 class IdentifiabilityOptions:
     """Options of an identifiability analysis beyond the run's settings.
 
-    Attributes
-    ----------
-    evaluation_point : "solution" or "initial"
-        Where the solver ends, or the initial values, without solving.
-    start_knowledge : "assumed" or "unknown"
-        Initial states as the settings have them, so that verdicts are those of `solve`, or all estimated along.
-    grasp_offset_std : float or None
-        Prior standard deviation of where the grasps sit [m]; None for grasps as the settings have them.
-    interval_parameters : "auto", "all" or sequence of str
-        For profile likelihoods; `auto` for all parameters of a small problem, none of a large one.
-    rank_changes : bool
-        Whether to rank changes of the experiment.
+    It judges where the solver ends or at the initial values, without solving. Initial states are as the settings have
+    them, so that verdicts are those of `solve`, or all estimated along; `grasp_offset_std` is the prior standard
+    deviation of where the grasps sit [m], None for grasps as the settings have them. Profile likelihoods are of the
+    `interval_parameters`, with `auto` of all in a small problem and none in a large one.
     """
 
     evaluation_point: Literal["solution", "initial"] = "solution"
-    start_knowledge: InitialStateKnowledge = "assumed"
+    start_knowledge: fisher.InitialStateKnowledge = "assumed"
     grasp_offset_std: float | None = None
     interval_parameters: Literal["auto", "all"] | Sequence[str] = "auto"
     rank_changes: bool = False
@@ -102,8 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
         interval_parameters={"auto": "auto", "all": "all", "none": ()}.get(arguments.intervals, names),
         rank_changes=arguments.what_if,
     )
-    workers = workers_from_arguments(arguments)
-    return run_command_with_settings(arguments, run_identifiability, identifiability_summary, asked, workers)
+    work = partial(run_identifiability, options=asked, workers=workers_from_arguments(arguments))
+    return command_with_settings(work)(arguments)
 
 
 def run_identifiability(
@@ -115,12 +92,8 @@ def run_identifiability(
 ) -> CommandResult[IdentifiabilityResult | None]:
     """Solve, analyse identifiability and write the run folder.
 
-    Where the solver failed there is no analysis, and the run folder holds the reason.
-
-    Parameters
-    ----------
-    workers : WorkerConfig or Executor, optional
-        Who works out intervals, one parameter a task, and the experiments of `what_if`; this process when absent.
+    Where the solver failed there is no analysis, and the run folder holds the reason. `workers` work out intervals, one
+    parameter a task, and the experiments of `what_if`; this process when absent.
     """
     asked = options or IdentifiabilityOptions()
     with atomic_run_folder(run, out, "identifiability") as folder:
@@ -139,7 +112,7 @@ def run_identifiability(
                 "config": folder.path / "config.yaml",
                 # what the results depend on beside it
                 "inputs": sorted({p.absolute() for name, p in input_files(run).items() if name != "configuration"}),
-                "x": None if solution is None else unknowns_from_solution(problem, solution).tolist(),
+                "x": None if solution is None else fisher.unknowns_from_solution(problem, solution).tolist(),
                 "remembers": problem is whole,
                 "start": asked.start_knowledge,
                 "grasp_std": asked.grasp_offset_std,
@@ -148,7 +121,7 @@ def run_identifiability(
         unknown = information = ranking = None
         if solution is None or solution.status != Status.FAILED:
             progress.begin_stage("Fisher information")
-            judged = partial(identifiability, problem, solution, limits=limits)
+            judged = partial(fisher.identifiability, problem, solution, limits=limits)
             unknown = judged(start="unknown", grasp_std=GRASP_OFFSET_PRIOR_STD)
             judged = partial(judged, start=asked.start_knowledge, grasp_std=asked.grasp_offset_std)
             information = judged()
@@ -160,15 +133,10 @@ def run_identifiability(
                 information = judged(intervals=wanted, progress=progress)
             if asked.rank_changes:
                 other = system_with_second_arm(run, system)
-                ranking = what_if(
-                    problem,
-                    solution,
-                    start=asked.start_knowledge,
-                    grasp_std=asked.grasp_offset_std,
-                    two_arm_system=None if other is None else with_grasp_offset_effects(other),
-                    progress=progress,
-                    evaluate_changes=None if tasks is None else tasks.evaluate_change_sets,
-                )
+                known: dict[str, Any] = {"start": asked.start_knowledge, "grasp_std": asked.grasp_offset_std}
+                known["two_arm_system"] = None if other is None else with_grasp_offset_effects(other)
+                known["evaluate_changes"] = None if tasks is None else tasks.evaluate_change_sets
+                ranking = what_if.what_if(problem, solution, progress=progress, **known)
         result = _identifiability_result(problem, solution, information, unknown, ranking, asked)
         folder.log_event("end", status=result["status"], message=result["message"])
         written = folder.write_result_and_report(run, progress, result, problem=problem, solution=solution)
@@ -184,12 +152,12 @@ def _identifiability_result(
     solution: Solution | None,
     information: IdentifiabilityResult | None,
     unknown: IdentifiabilityResult | None,
-    ranking: ExperimentRanking | None,
+    ranking: what_if.ExperimentRanking | None,
     asked: IdentifiabilityOptions,
 ) -> dict[str, Any]:
     """`yid-identifiability/1` without inputs and versions."""
     result: dict[str, Any] = {
-        "format": _RESULT_FORMAT,
+        "format": "yid-identifiability/1",
         "status": "not_solved" if solution is None else solution.status.value,
         "message": "judged at the initial values" if solution is None else solution.message,
         "at": asked.evaluation_point,
@@ -200,10 +168,8 @@ def _identifiability_result(
         "what_if": None,
     }
     if information is None or unknown is None:
-        correlations: dict[str, Any] = {"names": [], "matrix": []}
-        return result | {
-            "parameters": {}, "correlations": correlations, "directions": [], "nuisances": 0, "profiles": {}
-        }  # fmt: skip
+        result |= {"parameters": {}, "correlations": {"names": [], "matrix": []}}
+        return result | {"directions": [], "nuisances": 0, "profiles": {}}
     parameters = {}
     for name, entry in information.parameters.items():
         unsure = unknown.parameters[name]
@@ -213,9 +179,9 @@ def _identifiability_result(
     if ranking is not None:
         result["what_if"] = {
             "base": _outcome(ranking.unchanged_experiment),
-            "singles": [_outcome(entry) for entry in ranking.single_changes],
-            "smallest": [_outcome(entry) for entry in ranking.smallest_sufficient_sets],
-            "greedy": [_outcome(entry) for entry in ranking.greedy_sequence],
+            "singles": list(map(_outcome, ranking.single_changes)),
+            "smallest": list(map(_outcome, ranking.smallest_sufficient_sets)),
+            "greedy": list(map(_outcome, ranking.greedy_sequence)),
             "searched": ranking.n_evaluated_sets,
         }
     return result | {
@@ -250,12 +216,12 @@ class _IdentifiabilityTasks:
         found = self._done(profile_likelihood_task, {name: {"name": name} for name in names})
         parameters, profiles = dict(information.parameters), dict(information.profiles)
         for name, told in zip(names, found, strict=True):
-            parameters[name] = dataclass_from_plain_data(ParameterIdentifiability, told["parameter"])
+            parameters[name] = dataclass_from_plain_data(fisher.ParameterIdentifiability, told["parameter"])
             profiles[name] = dataclass_from_plain_data(ParameterProfileLikelihood, told["profile"])
         return replace(information, parameters=parameters, profiles=profiles)
 
     def evaluate_change_sets(
-        self, sets: Sequence[Sequence[ExperimentChange]], inflation: float
+        self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float
     ) -> list[ChangedExperimentResult]:
         """What sets of changes of the experiment would tell, one task per changed mechanics; a `ChangeSetEvaluator`."""
         groups: dict[str, list[int]] = {}
@@ -263,9 +229,8 @@ class _IdentifiabilityTasks:
             mechanics = sorted({change.mechanical_change for change in changes if change.mechanical_change})
             groups.setdefault(" and ".join(mechanics) or "sensors", []).append(i)
         named = [[change.name for change in changes] for changes in sets]
-        tasks = {
-            name: {"sets": [named[i] for i in members], "inflation": inflation} for name, members in groups.items()
-        }
+        own = {name: [named[i] for i in members] for name, members in groups.items()}
+        tasks = {name: {"sets": members, "inflation": inflation} for name, members in own.items()}
         self.progress.begin_stage(f"judging {len(sets)} experiments")
         done = self._done(_change_set_outcomes, tasks)
         order = [i for members in groups.values() for i in members]
@@ -286,16 +251,9 @@ class _IdentifiabilityTasks:
 def profile_likelihood_task(common: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Task: profile likelihood of one parameter and its updated verdict, as plain data."""
     run, problem = _problem(common)
-    known = {
-        "start": common["start"],
-        "grasp_std": common["grasp_std"],
-        "limits": run.diagnosis.null_test_residual_limits,
-    }
-    found = identifiability(problem, common["x"], intervals=[name], **known)
-    return {
-        "parameter": to_lossless_plain_data(found.parameters[name]),
-        "profile": to_lossless_plain_data(found.profiles[name]),
-    }
+    known = {key: common[key] for key in ("start", "grasp_std")} | {"limits": run.diagnosis.null_test_residual_limits}
+    found = fisher.identifiability(problem, common["x"], intervals=[name], **known)
+    return dict(to_lossless_plain_data({"parameter": found.parameters[name], "profile": found.profiles[name]}))
 
 
 def _change_set_outcomes(
@@ -305,9 +263,9 @@ def _change_set_outcomes(
     run, problem = _problem(common)
     other = system_with_second_arm(run, build_system(run))
     two_arms = None if other is None else with_grasp_offset_effects(other)
-    x = unknowns_from_solution(problem, common["x"])
+    x = fisher.unknowns_from_solution(problem, common["x"])
     setting = RecordedExperiment(problem, x, common["start"], common["grasp_std"], two_arms)
-    return [to_lossless_plain_data(entry) for entry in evaluate_change_sets(setting, sets, inflation)]
+    return list(to_lossless_plain_data(what_if.evaluate_change_sets(setting, sets, inflation)))
 
 
 def _problem(common: Mapping[str, Any]) -> tuple[RunSettings, EstimationProblem]:

@@ -14,13 +14,12 @@ from yid_ocp.config.settings import ImportSettings
 from yid_ocp.data import Recording, preview_file, read_any, write_recording
 from yid_ocp.data.readers.base import parse_quantity_units
 from yid_ocp.errors import ConfigError
+from yid_ocp.files import attributes_to_json
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.terminal import recording_summary_lines, third_party_file_summary_lines
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
 _RESULT_FORMAT = "yid-import/1"
-_RENAMED_SOURCE_KEYS = {"count": "n_samples", "rate": "mean_rate", "becomes": "imported_as"}
-_SOURCE_KEYS = ("name", "kind", "count", "rate", "becomes", "note")
 _LISTS = ("joint_topics", "joints")
 _MAPPINGS: Mapping[str, type] = {"points": str, "columns": str, "torque_constants": float, "gears": float}
 _SINGLE = ("command_topic", "pose_axes", "header", "skip_bad_lines", "delimiter", "episode", "clock", "sensor", "frame")
@@ -36,8 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
             progress.begin_stage(f"reading {file}")
             contents = preview_file(file, progress)
         if arguments.json:
-            keys = {key: _RENAMED_SOURCE_KEYS.get(key, key) for key in _SOURCE_KEYS}
-            sources = [{key: getattr(own, name) for key, name in keys.items()} for own in contents.sources]
+            keys = "name kind count=n_samples rate=mean_rate becomes=imported_as note"
+            sources = [attributes_to_json(own, keys) for own in contents.sources]
             told = {"sources": sources, "options": contents.reader_options, "notes": contents.notes}
             print_json({"format": _RESULT_FORMAT, "recording": None, **told})
             return EXIT_DONE
@@ -70,10 +69,7 @@ def recording_contents_summary(recording: Recording) -> dict[str, Any]:
 def read_third_party_recording(
     file: str | Path, options: Mapping[str, Any], progress: Progress = NULL_PROGRESS
 ) -> Recording:
-    """Recording read from a file of another tool with options of its reader, the file's hash in `source`.
-
-    Errors as `read_any`.
-    """
+    """Recording read from a file of another tool, the file's hash in `source`; options and errors as `read_any`."""
     progress.begin_stage(f"reading {file}")
     recording = read_any(file, progress=progress, **options)
     if recording.sha256 is None or has_native_recording_suffix(file):

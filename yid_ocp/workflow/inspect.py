@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -12,19 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from yid_ocp.analysis.step_diagnostics import (
-    CheckedStepLinearisation,
-    ParameterEquationDependence,
-    SparsityPattern,
-    full_nlp_size,
-    kkt_sparsity_pattern,
-    linearise_and_check,
-    linearise_step_equations,
-    nlp_stage_sparsity,
-    parameter_dependences,
-    step_size_summary,
-    step_sparsity_patterns,
-)
+from yid_ocp.analysis import step_diagnostics
 from yid_ocp.analysis.step_symbols import EquationEntry, StepSymbols
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
@@ -37,13 +24,11 @@ from yid_ocp.integrator.step_model import StepEquationLinearizations
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_sparsity_patterns
-from yid_ocp.report.summaries import inspect_summary
 from yid_ocp.workflow.build import build_step, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings
+from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
-_RESULT_FORMAT = "yid-inspect/1"
 _SHOWN_STEPS = 2  # of the NLP in its picture: what comes after looks the same
 _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
 _PARAMETER_KEYS = ("value", "unit", "lower", "upper", "description")
@@ -59,12 +44,6 @@ class _LinearisationPoint:
     torque: Array
     theta: Array
     prescribed_positions: Array
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
-    asked = tuple(arguments.entries), arguments.export
-    return run_command_with_settings(arguments, _run_inspect, inspect_summary, *asked)
 
 
 def _run_inspect(
@@ -108,7 +87,7 @@ def _run_inspect(
         blocks = {"rows": symbols.row_blocks, "columns": symbols.column_blocks}
         at = _columns_at(step, point) if chosen else np.zeros(0)
         result = {
-            "format": _RESULT_FORMAT,
+            "format": "yid-inspect/1",
             "build_seconds": seconds,
             "compiled": step.is_compiled,
             "variables": [
@@ -119,7 +98,7 @@ def _run_inspect(
                 entry.name: {key: getattr(entry, key) for key in _PARAMETER_KEYS} | {"free": entry.name in free}
                 for entry in parameters
             },
-            "equations": step_size_summary(step),
+            "equations": step_diagnostics.step_size_summary(step),
             "blocks": {
                 kind: [{"name": b.name, "meaning": b.meaning, "names": list(b.full_names)} for b in own if b.labels]
                 for kind, own in blocks.items()
@@ -140,6 +119,9 @@ def _run_inspect(
         shown = {"pictures": [path for path in pictures if path.exists()]}
         written = folder.write_result_and_report(run, progress, result, section_data=shown)
     return CommandResult(folder.path, written, None)
+
+
+run = command_with_settings(_run_inspect, "entries", "export")
 
 
 def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint:
@@ -165,14 +147,16 @@ def _point(step: Step, problem: EstimationProblem | None) -> _LinearisationPoint
     return _LinearisationPoint(words, False, np.zeros(sizes["nx"]), np.zeros(sizes["nu"]), theta, np.zeros(sizes["nc"]))
 
 
-def _linearised(step: Step, point: _LinearisationPoint) -> tuple[CheckedStepLinearisation, StepEquationLinearizations]:
+def _linearised(
+    step: Step, point: _LinearisationPoint
+) -> tuple[step_diagnostics.CheckedStepLinearisation, StepEquationLinearizations]:
     at = point.state, point.torque, point.theta, point.prescribed_positions
     try:
-        found = linearise_and_check(step, *at)
+        found = step_diagnostics.linearise_and_check(step, *at)
     except np.linalg.LinAlgError as error:
         what = "the step cannot be linearised: its equations are singular"
         raise ModelError(what, where=point.description) from error
-    return found, linearise_step_equations(step, *at)
+    return found, step_diagnostics.linearise_step_equations(step, *at)
 
 
 def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
@@ -185,25 +169,27 @@ def _columns_at(step: Step, point: _LinearisationPoint) -> Array:
 
 def _patterns(
     symbols: StepSymbols, matrices: Mapping[str, Array], rows: StepEquationLinearizations, point: _LinearisationPoint
-) -> dict[str, SparsityPattern]:
-    kept = np.setdiff1d(
-        np.arange(rows.residual_by_new.shape[1]), list(symbols.equations.system.prescribed_coordinate_indices)
-    )
+) -> dict[str, step_diagnostics.SparsityPattern]:
+    prescribed = list(symbols.equations.system.prescribed_coordinate_indices)
+    kept = np.setdiff1d(np.arange(rows.residual_by_new.shape[1]), prescribed)
     values = {
         **matrices,
         "dR_dy": rows.residual_by_new[0][np.ix_(kept, kept)],
         "dR_dtheta": np.vstack([rows.residual_by_theta[0], rows.p1_by_theta[0]]),
     }
-    where, found = ("the rest" if point.is_equilibrium else "this point", step_sparsity_patterns(symbols))
+    where, found = (
+        "the rest" if point.is_equilibrium else "this point",
+        step_diagnostics.step_sparsity_patterns(symbols),
+    )
     return {name: entry.with_numerical_nonzeros_marked(values[name], where) for name, entry in found.items()}
 
 
 def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> dict[str, Any]:
     """Size of the NLP with a node at every step and what it leaves out; draws the picture of its first steps."""
     episode = problem.episodes[0]
-    sensors = [samples.sensor for samples in episode.measurements]
-    followed = () if episode.tracking_feedback is None else tuple(map(int, episode.tracking_feedback.state_indices))
-    stage = nlp_stage_sparsity(
+    sensors, feedback = [samples.sensor for samples in episode.measurements], episode.tracking_feedback
+    followed = () if feedback is None else tuple(map(int, feedback.state_indices))
+    stage = step_diagnostics.nlp_stage_sparsity(
         symbols,
         problem.shared_parameters,
         [sensor for sensor in sensors if not sensor.effort_joints],
@@ -211,9 +197,10 @@ def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> dic
         problem.predictor.estimated_initial_state_indices,
     )
     steps = [entry.grid.steps for entry in problem.episodes]
-    draw_sparsity_patterns(picture, [[kkt_sparsity_pattern(stage, min(_SHOWN_STEPS, *steps))]])
+    kkt = step_diagnostics.kkt_sparsity_pattern(stage, min(_SHOWN_STEPS, *steps))
+    draw_sparsity_patterns(picture, [[kkt]])
     left_out = [*(sensor.group_name for sensor in sensors if sensor.effort_joints), *problem.local_parameters]
-    return {**full_nlp_size(stage, steps), "left_out": left_out}
+    return {**step_diagnostics.full_nlp_size(stage, steps), "left_out": left_out}
 
 
 def _dependence(
@@ -222,10 +209,10 @@ def _dependence(
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
     rows: StepEquationLinearizations,
-) -> tuple[ParameterEquationDependence, ...]:
+) -> tuple[step_diagnostics.ParameterEquationDependence, ...]:
     """Where every parameter enters and who sees it; along the recordings where the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
-    found = parameter_dependences(step, symbols, episode, point.state, point.theta, rows)
+    found = step_diagnostics.parameter_dependences(step, symbols, episode, point.state, point.theta, rows)
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)
     if problem is None or at_start is None or not at_start.ok or at_start.jacobian is None:
         return found
@@ -234,7 +221,7 @@ def _dependence(
     return tuple(replace(entry, along=along.get(entry.parameter)) for entry in found)
 
 
-def _pattern_result(pattern: SparsityPattern) -> dict[str, Any]:
+def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]:
     marked = pattern.marked_mask
     return {
         "shape": list(pattern.nonzero_mask.shape),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -19,6 +18,7 @@ from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_r
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 from yid_ocp.export.signals import export_csv, joint_trajectory_message
+from yid_ocp.files import attributes_to_json
 from yid_ocp.integrator.step import Step
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.motion_plan import ParameterCovariance, TargetMotionPlan, plan_motion_to_target
@@ -27,27 +27,23 @@ from yid_ocp.problem.recorded_inputs import prescribed_path
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import ModelTrajectory, make_animation
-from yid_ocp.report.summaries import plan_summary
 from yid_ocp.workflow.build import build_step, clamped_cable_topology, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings
+from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_history import ESTIMATE_RESULT_FORMATS, read_result_file
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings
 
-_RESULT_FORMAT = "yid-plan/1"
 _EFFORT_STD, _POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
 _MAX_DISCRIMINATED_EFFECTS = 3  # effects that one motion is asked to separate, the likeliest ones
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
-    return run_command_with_settings(arguments, run_plan, plan_summary)
+_Plan = TargetMotionPlan | InformativeMotionPlan
 
 
 def run_plan(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> CommandResult[TargetMotionPlan | InformativeMotionPlan]:
+) -> CommandResult[_Plan]:
     """Plan the motion of a run's goal; write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
 
     Successful where the goal was reached within all limits; the run folder says why not.
@@ -55,7 +51,7 @@ def run_plan(
     with atomic_run_folder(run, out, "plan") as folder:
         folder.record_run_start(run, "plan")
         progress.begin_stage("building the model and its compiled step")
-        found: TargetMotionPlan | InformativeMotionPlan
+        found: _Plan
         if run.plan.goal == "information":
             found, source = _plan_from_settings(run, progress)
         else:
@@ -78,6 +74,9 @@ def run_plan(
         result = _motion_result(run, found, source) | told
         written = folder.write_result_and_report(run, progress, result, animations=[scene], section_data=more)
     return CommandResult(folder.path, written, found, found.is_successful)
+
+
+run = command_with_settings(run_plan)
 
 
 def compile_step_for_planning(run: RunSettings) -> Step:
@@ -133,7 +132,7 @@ def identified_parameters_with_covariance(
     return theta, ParameterCovariance(certain, np.nan_to_num(covariance[np.ix_(usable, usable)])), source
 
 
-def _plan_as_recording(run: RunSettings, found: TargetMotionPlan | InformativeMotionPlan) -> Recording:
+def _plan_as_recording(run: RunSettings, found: _Plan) -> Recording:
     q, v = found.joint_positions, found.joint_velocities
     known: dict[str, Any] = {"position_command": q, "velocity_command": v, "clock": "nominal"}
     known |= {"effort_kind": "sample", "effort_std": _EFFORT_STD}
@@ -148,12 +147,10 @@ def _plan_as_recording(run: RunSettings, found: TargetMotionPlan | InformativeMo
     return validate_recording(Recording(joints, points, text, "yid_ocp plan", "recording", true_parameters=truth))
 
 
-def _motion_result(
-    run: RunSettings, found: TargetMotionPlan | InformativeMotionPlan, source: dict[str, Any]
-) -> dict[str, Any]:
+def _motion_result(run: RunSettings, found: _Plan, source: dict[str, Any]) -> dict[str, Any]:
     joints = [found.simulator.step.system.mechanism.joints[i] for i in found.simulator.moved_joint_indices]
     return {
-        "format": _RESULT_FORMAT,
+        "format": "yid-plan/1",
         "status": "done" if found.is_successful else "failed",
         "message": found.message,
         "goal": run.plan.goal,
@@ -176,17 +173,10 @@ def _share(values: Array, limit: float) -> float | None:
 
 
 def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
-    return {
-        "point": run.plan.point,
-        "place": found.target_position.tolist(),
-        "error": found.max_position_error,
-        "swing": found.max_residual_speed,
-        "off_path": found.max_path_deviation,
-        "time_step": found.simulator.step.time_step,
-        "std": None if found.end_position_std is None else found.end_position_std.tolist(),
-        "tolerance": run.plan.position_tolerance,
-        "evaluations": found.n_evaluations,
-    }
+    names = "place=target_position error=max_position_error swing=max_residual_speed off_path=max_path_deviation"
+    own = attributes_to_json(found, f"{names} std=end_position_std evaluations=n_evaluations")
+    asked = {"point": run.plan.point, "tolerance": run.plan.position_tolerance}
+    return own | asked | {"time_step": found.simulator.step.time_step}
 
 
 def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:
@@ -235,52 +225,32 @@ def parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, fl
     """Parameter values of a solve or diagnosis result, and effect sizes of a diagnosis, in display units."""
     if "parameters" in result:
         return {name: entry["value"] for name, entry in result["parameters"].items()}, {}
-    sizes = {
-        f"{entry['kind']}@{entry['location']}": {
-            name: quantity["value"] for name, quantity in entry["parameters"].items() if quantity["value"] is not None
-        }
-        for entry in result["which"]
-    }
+    sizes = {}
+    for entry in result["which"]:
+        values = {name: quantity["value"] for name, quantity in entry["parameters"].items()}
+        sizes[f"{entry['kind']}@{entry['location']}"] = {name: x for name, x in values.items() if x is not None}
     return {name: entry["before"] for name, entry in result["absorption"].items()}, sizes
 
 
 def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> dict[str, Any]:
     """Entries of `yid-plan/1` for an informative motion."""
-    said = {"inform": run.plan.identify, "separate": run.plan.discriminate}
+    stds = "std_relative_before=std_recorded std_relative_after=std_planned std_relative_together=std_combined"
+    starts = "first=initial_criterion value=final_criterion judged=configured_criterion finished=is_converged"
     return {
-        **{key: None if names is None else list(names) for key, names in said.items()},
+        **attributes_to_json(run.plan, "inform=identify separate=discriminate"),
         "parameters": {
-            name: {
-                "std_relative_before": _number(known.std_recorded),
-                "std_relative_after": _number(known.std_planned),
-                "std_relative_together": _number(known.std_combined),
-                "verdict": known.verdict,
-            }
-            for name, known in found.parameter_precisions.items()
+            name: attributes_to_json(known, f"{stds} verdict") for name, known in found.parameter_precisions.items()
         },
         "distances": [
             {"effect": first, "explained_by": second, "before": before, "after": after}
             for (first, second), (before, after) in found.effect_distances.items()
         ],
-        "starts": [
-            {
-                "first": start.initial_criterion,
-                "value": start.final_criterion,
-                "judged": _number(start.configured_criterion),
-                "finished": start.is_converged,
-                "rounds": start.n_iterations,
-            }
-            for start in found.start_results
-        ],
+        "starts": [attributes_to_json(start, f"{starts} rounds=n_iterations") for start in found.start_results],
         "best": found.best_start_index,
         "limits_reached": {what: list(names) for what, names in found.active_limits.items()},
         "unseen": dict(found.unobservable_parameters),
         "open": list(found.unidentifiable_directions),
     }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def discrimination_plan_settings(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,10 @@ from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettin
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError, YidError
-from yid_ocp.files import file_sha256, is_file, read_input_json
+from yid_ocp.files import attributes_to_json, file_sha256, is_file, read_input_json
 from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
-from yid_ocp.report.diagnosis_summaries import history_summary
 from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import resolve_recording_path
@@ -29,7 +28,6 @@ ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"
 """Format identifiers of result.json by command, for commands that estimate parameters."""
 _OLD_FORMATS = ("yid-diagnosis/1",)  # of earlier versions, which had other keys
 _RENAMED_KEYS_HINT = "CHANGELOG.md has the table old -> new under Unreleased"
-_RESULT_FORMAT = "yid-history/1"
 _COMPARED_MODEL_SECTIONS = ("robot", "arms", "clamps", "object", "grasp", "springs", "gravity")
 """Sections of `model` in which a baseline's settings must be the same, so that parameters mean the same thing."""
 _SAME_MODEL = f"the same {', '.join(_COMPARED_MODEL_SECTIONS)} under `model`"
@@ -145,9 +143,9 @@ def _dependent(folders: Sequence[str | Path]) -> str:
     known = [Path(folder).resolve() for folder in folders]
     for folder in known:
         said = read_result_file(folder / "result.json").get("baseline") or {}
-        twice = [own for own in said.get("runs", ()) if Path(own).resolve() in known]
-        if twice:
-            return f"{folder} has {twice[0]} as its baseline already, which would count twice"
+        for own in said.get("runs", ()):
+            if Path(own).resolve() in known:
+                return f"{folder} has {own} as its baseline already, which would count twice"
     return ""
 
 
@@ -247,7 +245,7 @@ def require_distinct_recordings(
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
     paths = [Path(folder) for folder in arguments.runs]
-    return run_command_and_print(arguments, lambda shown: _run_report(paths, arguments.out, shown), history_summary)
+    return run_command_and_print(arguments, lambda shown: _run_report(paths, arguments.out, shown))
 
 
 def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandResult[None]:
@@ -270,32 +268,20 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     return CommandResult(folder.path, written, None)
 
 
-_RESULT_KEYS = {
-    "run_name": "name",
-    "degrees_of_freedom": "degrees",
-    "worst_parameter": "worst",
-    "is_fit_adequate": "explains",
-    "is_outlier": "distrusted",
-}
-"""Keys of `yid-history/1` by attribute of a `RunConsistency`, where they differ."""
-
-
 def estimate_history_result(found: EstimateHistory) -> dict[str, Any]:
     """Parameter estimates over several runs as a `yid-history/1` result, without inputs and versions."""
     parameters = {}
     for entry in found.parameter_drifts:
         known = zip(entry.run_names, entry.values, entry.std, strict=True)
-        own = {key: getattr(entry, key) for key in ("unit", "mean", "mean_std", "chi2", "p_value")}
         values = {name: {"value": value, "std": std} for name, value, std in known}
-        parameters[entry.name] = own | {"values": values, "drifted": entry.has_drifted}
+        own = attributes_to_json(entry, "unit mean mean_std chi2 p_value drifted=has_drifted")
+        parameters[entry.name] = own | {"values": values}
+    names = "name=run_name chi2 degrees=degrees_of_freedom p_value worst=worst_parameter"
     return {
-        "format": _RESULT_FORMAT,
-        "level": found.significance_level,
-        "chi2": found.chi2,
-        "degrees": found.degrees_of_freedom,
-        "p_value": found.p_value,
+        "format": "yid-history/1",
+        **attributes_to_json(found, "level=significance_level chi2 degrees=degrees_of_freedom p_value"),
         "runs": [
-            {_RESULT_KEYS.get(key, key): value for key, value in asdict(entry).items()}
+            attributes_to_json(entry, f"{names} explains=is_fit_adequate distrusted=is_outlier")
             for entry in found.run_consistencies
         ],
         "parameters": parameters,

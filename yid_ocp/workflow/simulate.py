@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,21 +16,14 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, make_animation, recording_animation
-from yid_ocp.report.summaries import simulate_summary
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import problem_options
-from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings
+from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
 from yid_ocp.workflow.prediction_outputs import predicted_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import read_recordings
 
-_RESULT_FORMAT = "yid-simulate/1"
 _DEFAULT_DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
-    return run_command_with_settings(arguments, run_simulate, simulate_summary, arguments.seed, arguments.noise)
 
 
 def run_simulate(
@@ -58,18 +50,25 @@ def run_simulate(
             made, scenes = _predicted(run, system, progress, seed if noise else None)
         else:
             made, scenes = _virtual(run, system, progress, seed)
-        result: dict[str, Any] = {"format": _RESULT_FORMAT, "status": "done", "message": "", "seed": seed}
+        result: dict[str, Any] = {"format": "yid-simulate/1", "status": "failed", "message": made, "seed": seed}
         recording = None if isinstance(made, str) else made
-        if recording is None:
-            result |= {"status": "failed", "message": made}
-        else:
+        if recording is not None:
             write_recording(recording, folder.path / "recording.h5")
             groups = {g.name: {"samples": len(g.t)} for g in recording.all_groups}
             truth = dict(recording.true_parameters)
-            result |= {"duration": recording.duration, "groups": groups, "truth": truth}
+            result |= {
+                "status": "done",
+                "message": "",
+                "duration": recording.duration,
+                "groups": groups,
+                "truth": truth,
+            }
         more = {"recordings": [] if recording is None else [recording], "system": system}
         written = folder.write_result_and_report(run, progress, result, animations=scenes, section_data=more)
     return CommandResult(folder.path, written, recording, recording is not None)
+
+
+run = command_with_settings(run_simulate, "seed", "noise")
 
 
 def _virtual(

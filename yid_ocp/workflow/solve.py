@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -10,22 +9,16 @@ from typing import Any, Literal
 
 import numpy as np
 
+from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.clock_checks import check_fit_residuals
 from yid_ocp.analysis.compare import CableMemoryDecision, decide_cable_memory
-from yid_ocp.analysis.discretisation import (
-    AlternatingErrorGrowth,
-    DiscretisationEstimateShift,
-    FinerDiscretisationProblem,
-    discretisation_estimate_shifts,
-    fine_joints_by_coarse_joint,
-    inflate_estimates_by_discretisation,
-    largest_alternating_error_growth,
-)
+from yid_ocp.analysis.discretisation import AlternatingErrorGrowth, DiscretisationEstimateShift
 from yid_ocp.analysis.profile import with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
 from yid_ocp.errors import YidError
+from yid_ocp.files import attributes_to_json
 from yid_ocp.inference.uncertainty import covariance_to_dict, estimates_marked_not_trusted, typical_parameter_magnitudes
 from yid_ocp.integrator.step import step_with_time_step
 from yid_ocp.model.objects.base import CableTopology
@@ -34,18 +27,11 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.predictions import rmse_by_channel
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.summaries import solve_summary
 from yid_ocp.solvers import Iterate, Solution, Status, solve
+from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, divided_link_parameter_scale
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings
-from yid_ocp.workflow.prediction_outputs import (
-    channels_worse_than_baseline,
-    estimated_torque_offsets,
-    prediction_error_entry,
-    worse_than_baseline_issues,
-    write_solve_trajectories,
-)
+from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
 _Refinement = Literal["links", "time_step"]
@@ -53,11 +39,6 @@ _Refinement = Literal["links", "time_step"]
 _MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time
 _Prediction = tuple[Episode, EpisodePrediction | str]
 _RESULT_FORMAT = "yid-solve/1"
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
-    return run_command_with_settings(arguments, run_solve, solve_summary)
 
 
 def run_solve(
@@ -82,7 +63,7 @@ def run_solve(
         # the ± and the verdict of everything below count how far the estimate is from a fine model's
         data_std = solution.std
         sizes = {} if solution.problem is None else typical_parameter_magnitudes(solution.problem, solution.x)
-        inflated = inflate_estimates_by_discretisation(solution.parameters, shifts, sizes)
+        inflated = discretisation.inflate_estimates_by_discretisation(solution.parameters, shifts, sizes)
         solution = replace(solution, parameters=inflated)
         progress.begin_stage("predicting the held-out recordings")
         held_out = problem.predict_held_out(solution.x)
@@ -90,7 +71,8 @@ def run_solve(
         solution, doubts = solution_and_fit_issues(problem, solution, held_out, cable)
         end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
         folder.log_event("end", **end)
-        write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
+        prediction_outputs.write_solve_trajectories(folder.path / "trajectories.h5", problem, solution, held_out)
+        offsets = prediction_outputs.estimated_torque_offsets
         more = {
             "doubts": issues_to_plain_data(doubts),
             "safeguard": safe.message,
@@ -98,12 +80,15 @@ def run_solve(
             "discretisation": discretisation_shift_results(shifts, data_std),
             "discretisation_notes": notes,
             "stability": stability,
-            "torque_offsets": {} if solution.evaluation is None else estimated_torque_offsets(problem, solution.x),
+            "torque_offsets": {} if solution.evaluation is None else offsets(problem, solution.x),
         }
         result = solve_result(problem, solution, held_out, cable) | more
         known = {"problem": problem, "solution": solution, "held_out": tuple(held_out)}
         written = folder.write_result_and_report(run, progress, result, **known)
     return CommandResult(folder.path, written, solution, solution.status == Status.CONVERGED)
+
+
+run = command_with_settings(run_solve)
 
 
 def solve_and_log(
@@ -126,17 +111,13 @@ def solution_and_fit_issues(
 ) -> tuple[Solution, tuple[Issue, ...]]:
     """The solution, its verdicts set to untrusted where the fit is poor, and all issues of data and fit.
 
-    Parameters
-    ----------
-    held_out : sequence of (Episode, EpisodePrediction or str)
-        From `EstimationProblem.predict_held_out`.
-    cable : CableTopology, optional
-        For the baselines that it has.
+    `held_out` is from `EstimationProblem.predict_held_out`, `cable` for the baselines that it has.
     """
     if solution.evaluation is None:
         return solution, problem.options.data_issues
     errors, units, _ = _prediction_errors(problem, solution, held_out, cable)
-    found = check_fit_residuals(problem, solution.x, solution.evaluation) + worse_than_baseline_issues(errors, units)
+    found = check_fit_residuals(problem, solution.x, solution.evaluation)
+    found += prediction_outputs.worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
         marked = estimates_marked_not_trusted(solution.parameters)
@@ -157,6 +138,7 @@ def solve_result(
 ) -> dict[str, Any]:
     """Contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = _prediction_errors(problem, solution, held_out, cable)
+    worse = prediction_outputs.channels_worse_than_baseline(errors, units)
     return {
         "format": _RESULT_FORMAT,
         "status": solution.status.value,
@@ -166,7 +148,7 @@ def solve_result(
         "iterations": solution.n_iterations,
         "evaluations": solution.n_evaluations,
         "seconds": solution.wall_time,
-        "fit": asdict(solution.goodness_of_fit) | {"worse_than_guess": channels_worse_than_baseline(errors, units)},
+        "fit": asdict(solution.goodness_of_fit) | {"worse_than_guess": worse},
         "residuals": residuals,
         "held_out": errors[: len(held_out)],
     }
@@ -184,7 +166,8 @@ def _prediction_errors(
         residuals = rmse_by_channel([result for result, _ in able], [episode for _, episode in able])
         pairs += fitted
     units = {channel: entry["unit"] for channel, entry in residuals.items()}
-    return [prediction_error_entry(problem, *pair, cable) for pair in pairs], units, residuals
+    entry = prediction_outputs.prediction_error_entry
+    return [entry(problem, *pair, cable) for pair in pairs], units, residuals
 
 
 # -- discretisation ---------------------------------------------------------------------------------------------------
@@ -218,14 +201,7 @@ def measure_discretisation_shifts(
     """Shifts of the estimates when every link is divided in two and when the time step is halved.
 
     Of every shared free parameter, none where nothing was tried; and why something that was asked for is not known.
-
-    Parameters
-    ----------
-    x : ndarray, shape (nx,)
-    at_x : Evaluation
-        With its Jacobian.
-    models_alone : bool
-        For a point that is no estimate.
+    `x`, shape (nx,), is the estimate, `at_x` its evaluation with Jacobian; `models_alone` for a point that is none.
     """
     found: dict[str, dict[str, float]] = {}
     notes: list[str] = []
@@ -236,7 +212,9 @@ def measure_discretisation_shifts(
         progress.begin_stage(f"trying {words}")
         try:
             refined = _refined_problem(run, problem, key)
-            own = discretisation_estimate_shifts(refined, problem, x, at_x, model_difference_only=models_alone)
+            own = discretisation.discretisation_estimate_shifts(
+                refined, problem, x, at_x, model_difference_only=models_alone
+            )
         except YidError as error:
             own = error.what
         if isinstance(own, str):
@@ -248,12 +226,14 @@ def measure_discretisation_shifts(
     return {name: DiscretisationEstimateShift(links.get(name), steps.get(name)) for name in names}, notes
 
 
-def _refined_problem(run: RunSettings, problem: EstimationProblem, what: _Refinement) -> FinerDiscretisationProblem:
+def _refined_problem(
+    run: RunSettings, problem: EstimationProblem, what: _Refinement
+) -> discretisation.FinerDiscretisationProblem:
     """The problem with half the time step or with twice the links."""
     recordings, options = [episode.recording for episode in problem.episodes], problem.options
     if what == "time_step":
         step = step_with_time_step(problem.step, problem.step.time_step / 2)
-        return FinerDiscretisationProblem(EstimationProblem(step, recordings, problem.free, options))
+        return discretisation.FinerDiscretisationProblem(EstimationProblem(step, recordings, problem.free, options))
     system = build_system(run, link_division=2)
     steps = sum(episode.grid.steps for episode in problem.episodes)
     compiled = problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE
@@ -262,7 +242,8 @@ def _refined_problem(run: RunSettings, problem: EstimationProblem, what: _Refine
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
     options = replace(options, prior_stds=priors, multivariate_prior=options.multivariate_prior.scaled_by(factors))
     made = EstimationProblem(step, recordings, problem.free, options)
-    return FinerDiscretisationProblem(made, factors, fine_joints_by_coarse_joint(problem.system, system))
+    joints = discretisation.fine_joints_by_coarse_joint(problem.system, system)
+    return discretisation.FinerDiscretisationProblem(made, factors, joints)
 
 
 def stability_checked_solution(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
@@ -271,8 +252,9 @@ def stability_checked_solution(problem: EstimationProblem, solution: Solution) -
     Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not
     stable and leave that place; one that ends there has followed the step's own errors.
     """
-    begin = largest_alternating_error_growth(problem, problem.initial_unknowns)
-    end = largest_alternating_error_growth(problem, solution.x)
+    begin, end = (
+        discretisation.largest_alternating_error_growth(problem, x) for x in (problem.initial_unknowns, solution.x)
+    )
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.is_stable:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
@@ -284,12 +266,5 @@ def stability_checked_solution(problem: EstimationProblem, solution: Solution) -
 
 
 def _growth_result(growth: AlternatingErrorGrowth | None) -> dict[str, Any] | None:
-    if growth is None:
-        return None
-    return {
-        "recording": growth.recording_name,
-        "decades": growth.growth_decades,
-        "factor": growth.max_step_factor,
-        "time": growth.max_growth_time,
-        "time_step": growth.time_step,
-    }
+    names = "recording=recording_name decades=growth_decades factor=max_step_factor time=max_growth_time time_step"
+    return None if growth is None else attributes_to_json(growth, names)

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,12 +18,13 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import OutputSettings, RecordingSettings, RunSettings, dump_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
-from yid_ocp.errors import DataError, OutputError, YidError
+from yid_ocp.errors import DataError, YidError
 from yid_ocp.files import (
+    attributes_to_json,
     dataclass_from_plain_data,
     file_sha256,
     json_sha256,
-    os_error_reason,
+    make_folder,
     read_input_text,
     to_lossless_plain_data,
     write_text,
@@ -32,8 +33,8 @@ from yid_ocp.model.system import System
 from yid_ocp.parallel import InlineExecutor, Task, TaskResult, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import Progress
 from yid_ocp.report.animation import ModelTrajectory, make_animation
-from yid_ocp.report.summaries import track_summary
 from yid_ocp.vision import camera_registration as registration
+from yid_ocp.vision import track_result
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
@@ -43,27 +44,20 @@ from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibrati
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.surface_meshes import CameraScene
 from yid_ocp.vision.track import FrameTracker
-from yid_ocp.vision.track_result import (
-    FrameReport,
-    TrackResult,
-    count_drop_reasons,
-    draw_frame_processing_stages,
-    draw_tracked_points,
-)
+from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.vision.virtual_camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, render_virtual_frames
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import issues_to_plain_data, single_recording_issues
-from yid_ocp.workflow.command_runner import CommandResult, run_command_with_settings, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResult, command_with_settings, workers_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path
 
-_RESULT_FORMAT = "yid-track/1"
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    return run_command_with_settings(arguments, _run_track, track_summary, workers_from_arguments(arguments))
+    return command_with_settings(partial(_run_track, workers=workers_from_arguments(arguments)))(arguments)
 
 
 def _run_track(
@@ -99,11 +93,11 @@ def _run_track(
         for frame in _drawn(frames, settings.n_drawn_frames):
             stages = tracker.frame_processing_stages(frame, common)
             if stages is not None:
-                draw_frame_processing_stages(stages, folder.path / "pictures")
+                track_result.draw_frame_processing_stages(stages, folder.path / "pictures")
         result = _track_result(frames, common, tracker.foreign_objects(frames), found) | {"root": note}
-        told, tracked = [], None
+        told = []
         if found is not None:
-            draw_tracked_points(found, folder.path / "track.png")
+            track_result.draw_tracked_points(found, folder.path / "track.png")
             tracked = found.recording_with_points(recording)
             write_recording(tracked, folder.path / "recording.h5")
             # what was tracked may be elsewhere than the object reaches, where the model says where it stands
@@ -119,8 +113,7 @@ def _run_track(
         more = {"pictures": [path for path in files if path.exists()]}
         written = folder.write_result_and_report(run, progress, result, animations=told, section_data=more)
         tasks.delete_files()
-    if tracked is None:
-        assert refused is not None
+    if refused is not None:
         hint = f"{refused.hint}; {folder.path} has the reason of every frame and pictures"
         raise DataError(refused.what, where=refused.where, allowed=refused.allowed, hint=hint)
     return CommandResult(folder.path, written, None)
@@ -150,33 +143,26 @@ def _track_result(
     """`yid-track/1` without doubts, inputs and versions; `found` is None where no frame is good."""
     spent = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
     return {
-        "format": _RESULT_FORMAT,
+        "format": "yid-track/1",
         "camera": _camera_result(common.camera_calibration),
         "sizes": _sizes_result(common.dimensions),
         "things": [asdict(thing) for thing in things],
         "points": {} if found is None else _points(found),
         "truth_errors": {},
-        "dropped": count_drop_reasons(frames),
+        "dropped": track_result.count_drop_reasons(frames),
         "fit_seconds": float(np.mean(spent)) if spent else 0.0,
         "frames": [_frame_result(frame, frame.shape_fit) for frame in frames],
     }
 
 
 def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, Any]:
-    return {
-        "name": frame.name,
-        "stamp": frame.stamp,
-        "t": frame.joint_time,
-        "reason": frame.drop_reason,
-        "raw_points": frame.n_raw_points,
-        "object_points": frame.n_filtered_points,
-        "nodes": frame.n_skeleton_nodes,
-        "delay": None if np.isnan(frame.stamp_delay) else frame.stamp_delay,
+    names = "name stamp t=joint_time reason=drop_reason raw_points=n_raw_points object_points=n_filtered_points"
+    found = {
         "distance": fit and fit.mean_distance,
         "covered": fit and fit.visible_length_coverage,
         "contested": fit and fit.contested_fraction,
-        "seconds": frame.cpu_seconds,
     }
+    return found | attributes_to_json(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
 
 
 def _sizes_result(sizes: TubeDimensionCheck) -> dict[str, Any]:
@@ -200,24 +186,19 @@ def _sizes_result(sizes: TubeDimensionCheck) -> dict[str, Any]:
 def _camera_result(calibration: CameraCalibration) -> dict[str, Any]:
     state, told = calibration.camera_state, calibration.prior_state
     change, std = state.difference_from(told), np.sqrt(np.diag(calibration.state_covariance))
-    return {
+    names = "pose depth_factor=depth_scale depth_offset clock_offset clock_about=clock_reference_stamp clock_drift"
+    return attributes_to_json(state, names) | {
         "message": calibration.message,
         "estimated": calibration.n_frames > 0,
         "frames": calibration.n_frames,
-        "pose": state.pose,
         "told_pose": told.pose,
         "turned": float(np.linalg.norm(change[registration.ROTATION_SLICE])),
         "turn_std": std[registration.ROTATION_SLICE],
         "shifted": float(np.linalg.norm(change[registration.TRANSLATION_SLICE])),
         "shift_std": std[registration.TRANSLATION_SLICE],
-        "depth_factor": state.depth_scale,
         "depth_factor_std": std[registration.DEPTH_SCALE_INDEX],
-        "depth_offset": state.depth_offset,
         "depth_offset_std": std[registration.DEPTH_OFFSET_INDEX],
-        "clock_offset": state.clock_offset,
         "clock_offset_std": std[registration.CLOCK_OFFSET_INDEX],
-        "clock_about": state.clock_reference_stamp,
-        "clock_drift": state.clock_drift,
         "clock_drift_std": std[registration.CLOCK_DRIFT_INDEX],
         "presence": None if calibration.arm_visibility is None else asdict(calibration.arm_visibility),
     }
@@ -263,19 +244,17 @@ def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tu
         posture = grasping_joint_angles(system, offsets=settings.grasp_start_offsets)
         simulation = SimulationOptions(settings.duration)
         excitation = MultisineOptions(gripper_travel=settings.max_gripper_travel, duration=settings.duration)
-        motion = random_multisine_motion(
-            system, seed=settings.seed, initial_joint_angles=posture, excitation=excitation
-        )
-        experiment = VirtualExperiment(
-            simulation=simulation, camera=None, seed=settings.seed, recording_name=run.name, description=run.description
-        )
+        seed = settings.seed
+        motion = random_multisine_motion(system, seed=seed, initial_joint_angles=posture, excitation=excitation)
+        named: dict[str, Any] = {"recording_name": run.name, "description": run.description}
+        experiment = VirtualExperiment(simulation=simulation, camera=None, seed=seed, **named)
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
         recording = record_simulation(system, None, experiment, truth)
         late = (settings.latency, settings.latency_std)
         timing = FrameTiming(settings.frame_rate, settings.dropped_fraction, *late)
         pose = look_at_pose(settings.camera_position, settings.camera_target)
         depth = DepthCamera(outlier_probability=settings.outlier_fraction)
-        camera = VirtualCamera(pose, depth, timing, seed=settings.seed)
+        camera = VirtualCamera(pose, depth, timing, seed=seed)
         made = render_virtual_frames(camera_scene(run, system), truth.t, truth.q, camera)
     return recording, made
 
@@ -388,11 +367,7 @@ def _frame_tasks(
         inputs = {key: file_sha256(Path(path)) for key, path in files.items() if path is not None}
         text = dump_config(own)
         work_folder = work / json_sha256([text, inputs])[:16]
-        try:
-            work_folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            what = f"the folder cannot be made ({os_error_reason(error)})"
-            raise OutputError(what, where=str(work_folder)) from error
+        make_folder(work_folder)
         write_text(work_folder / _CONFIG_FILE, text)
     if said.frames_path is not None:
         folder.input_hashes[said.frames_path] = inputs["frames"]
@@ -403,20 +378,17 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     """Task: sequence calibration of a run as plain data, or the reason why it failed."""
     del inputs  # they belong to what the result depends on
     try:
-        made: dict[str, Any] = to_lossless_plain_data(_tracker(read_input_text(config), config).calibrate_sequence())
+        return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).calibrate_sequence()))
     except DataError as error:
-        return {"refused": {"what": error.what, "where": error.where, "allowed": error.allowed, "hint": error.hint}}
-    return made
+        return {"refused": attributes_to_json(error, "what where allowed hint")}
 
 
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     """Task: tracking result of one frame as plain data."""
     del inputs
     tracker = _tracker(read_input_text(config), config)
-    made: dict[str, Any] = to_lossless_plain_data(
-        tracker.track_frame(index, dataclass_from_plain_data(SequenceCalibration, common))
-    )
-    return made
+    found = tracker.track_frame(index, dataclass_from_plain_data(SequenceCalibration, common))
+    return dict(to_lossless_plain_data(found))
 
 
 @lru_cache(maxsize=1)
