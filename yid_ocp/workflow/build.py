@@ -28,13 +28,8 @@ from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.workflow.run_inputs import (
-    add_setting_location_to_errors,
-    input_files,
-    load_plugins,
-    read_recordings,
-    unknown_name_error,
-)
+from yid_ocp.workflow import run_inputs
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings, unknown_name_error
 
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping beside those of the joints
 _DEFAULT_JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
@@ -46,20 +41,13 @@ _OTHER_SIDE = {"left": "right", "right": "left"}
 def build_system(run: RunSettings, link_division: int = 1) -> System:
     """The mechanical model of a run, its parameters at the values and bounds of the settings.
 
-    Parameters
-    ----------
-    link_division : int
-        Into how many links each of the object's is divided, the stiffness and damping of a tube kept; to see what the
-        number of links does. A cable's edges stay as they are.
-
-    Raises
-    ------
-    ConfigError, ModelError
-        Names that do not exist, values outside their bounds; the error names the setting.
+    Each of the object's links is divided into `link_division`, the stiffness and damping of a tube kept; a cable's
+    edges stay as they are. `ConfigError` or `ModelError`, which name the setting, for names that do not exist and
+    values outside their bounds.
     """
     model, arms = run.model, run.model.arms
-    input_files(run)
-    load_plugins(run)
+    run_inputs.input_files(run)
+    run_inputs.load_plugins(run)
     if isinstance(model.object, ClampedObject):
         return _completed(run, _clamped_system(run, model.object, model.object.kind))
     robot = None
@@ -164,8 +152,6 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
 
 def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
     """The system of an object that brings its clamps."""
-    cable = clamped_cable_topology(run)
-    assert cable is not None
     for key in ("robot", "grasp", "springs", "clamps", "frames"):
         if getattr(run.model, key):
             what = f"a {kind} takes no {key}: its clamps hold it"
@@ -175,7 +161,8 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
         what = f"a {kind}'s lengths come from recordings"
         raise run.config_error(what, "recordings", "estimate", hint="list at least one")
     with add_setting_location_to_errors(run, "model", "object"):
-        return item.clamped_system(median_point_pair_distances(cable.edges, recordings), run.model.gravity)
+        lengths = median_point_pair_distances(item.topology().edges, recordings)
+        return item.clamped_system(lengths, run.model.gravity)
 
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
@@ -253,11 +240,10 @@ def _section_parameter_settings(run: RunSettings, parameters: Parameters) -> dic
     """What sections of the model say of parameters: ordinary friction is free, a known motor has values and priors."""
     found: dict[str, ParameterSettings] = {}
     friction, motor = run.model.friction, run.model.arms.servo.motor
-    law = None if friction is None else friction.law
     values: dict[str, float] = {}
     if motor.preset is not None and run.model.arms.mode == "servo":
         data = MOTOR_PRESETS[motor.preset]
-        by_load = data.load_dependent if law is not None and law.startswith("load") else None
+        by_load = data.load_dependent if friction is not None and friction.law.startswith("load") else None
         constants = data.plain if by_load is None else by_load
         for joint in (name.rpartition(".")[0] for name in parameters.names if name.endswith(".servo_gain")):
             own = {f"{joint}.{name}": value for name, value in data.servo_values(constants).items()}

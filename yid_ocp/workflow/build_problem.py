@@ -13,20 +13,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from yid_ocp.analysis import joint_checks, point_checks
 from yid_ocp.analysis.discretisation import min_grasp_closure_errors
-from yid_ocp.analysis.joint_checks import (
-    RecordedJointsModel,
-    check_efforts_by_inverse_dynamics,
-    check_inertial_effort_excitation,
-    check_joint_excitation,
-    check_joint_limits,
-)
-from yid_ocp.analysis.point_checks import (
-    check_cable_point_geometry,
-    check_object_points_by_rollout,
-    check_point_distances,
-    check_robot_held_points,
-)
+from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.channel_checks import median_point_pair_distances
@@ -42,15 +31,8 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.recorded_inputs import recorded_servo_gain_factors
 from yid_ocp.sensors.base import declared_channel_kinds
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_measured_by_arm
-from yid_ocp.workflow.build import (
-    arms_are_estimated_states,
-    build_step,
-    build_system,
-    clamped_cable_topology,
-    free_parameter_names,
-    marker_positions_from_reference_pose,
-    settings_by_parameter_name,
-)
+from yid_ocp.workflow import build
+from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, free_parameter_names
 from yid_ocp.workflow.run_inputs import read_recordings, unknown_name_error
 
 _START_FRAMES = 2  # of a cable's free points, from which every prediction starts
@@ -75,19 +57,19 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     Values that differ from recording to recording (a cable's edges, places of markers) are those of `recordings`.
     """
     parameters = system.parameters
-    chosen = settings_by_parameter_name(run, parameters)
+    chosen = build.settings_by_parameter_name(run, parameters)
     for name in run.problem.start_fit_parameters:
         if name not in parameters:
             raise unknown_name_error(run, "parameter", name, parameters.names, "problem", "start_fit_parameters")
     sensors = dict(run.sensors)
     groups = [group for recording in recordings for group in recording.points]
-    if arms_are_estimated_states(run):
+    if build.arms_are_estimated_states(run):
         # what the encoders say is what counts of the arms, as it does where they are prescribed
         sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
         for name in {group.name for group in groups if is_measured_by_arm(group)}:
             sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
     cable = clamped_cable_topology(run)
-    own = marker_positions_from_reference_pose(run, system, recordings)
+    own = build.marker_positions_from_reference_pose(run, system, recordings)
     for name, factors in recorded_servo_gain_factors(system, recordings).items():
         # what the settings say of a gain goes before what a recording states
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
@@ -118,14 +100,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
 def build_problem(
     run: RunSettings, step: Step | None = None, reference_recordings: Sequence[Recording] = ()
 ) -> EstimationProblem:
-    """The estimation problem of a run.
-
-    Parameters
-    ----------
-    step : Step, optional
-        Built when absent.
-    reference_recordings : sequence of Recording
-        That will be predicted only; the options say where markers sit in them.
+    """The estimation problem of a run; its options say as well where markers sit in reference recordings.
 
     Raises
     ------
@@ -147,7 +122,7 @@ def build_problem(
         hint = "list at least one recording"
         raise run.config_error("there is no recording to estimate on", "recordings", "estimate", hint=hint)
     _check_sensors(run, [*estimate, *held_out])
-    estimate, held_out, issues = _check_recordings(run, system, clamped_cable_topology(run), free, estimate, held_out)
+    estimate, held_out, issues = _check_recordings(run, system, free, estimate, held_out)
     options = problem_options(run, system, [*estimate, *held_out, *reference_recordings])
     step = build_step(run, system) if step is None else step
     said = replace(options, data_issues=issues)
@@ -205,10 +180,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
 
 
 def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:
-    """The estimation problem of a configuration file, of the embedded one when absent.
-
-    Parameters and errors as `load_config`; errors as `build_problem`.
-    """
+    """The estimation problem of a configuration file, of the embedded one when absent; errors as `build_problem`."""
     return build_problem(load_config(path, overrides))
 
 
@@ -216,15 +188,11 @@ def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) 
 
 
 def _check_recordings(
-    run: RunSettings,
-    system: System,
-    cable: CableTopology | None,
-    free: Sequence[str],
-    estimate: Sequence[Recording],
-    held_out: Sequence[Recording],
+    run: RunSettings, system: System, free: Sequence[str], estimate: Sequence[Recording], held_out: Sequence[Recording]
 ) -> tuple[list[Recording], list[Recording], tuple[Issue, ...]]:
     """Recordings to estimate on and to hold out, without duplicates and cut at gaps, and all issues found."""
     doubts: list[Issue] = []
+    cable = clamped_cable_topology(run)
     kept: tuple[list[Recording], list[Recording]] = [], []
     arm = None if cable is not None else RecordedJointsModel.from_system(system, system.parameters.vector())
     anywhere = run.problem.initial_state != "equilibrium" or not system.unprescribed_coordinate_indices
@@ -299,16 +267,17 @@ def _beside_the_model(
     gravity = np.array(run.model.gravity, float)
     recording = recording.with_effort_kind(_choice(run)(JOINT_EFFORT_GROUP_NAME).effort_kind)
     if cable is not None:
-        return list(check_cable_point_geometry(cable, recording, gravity))
+        return list(point_checks.check_cable_point_geometry(cable, recording, gravity))
     found: list[Issue] = []
     if arm is not None and arm.has_all_angles_recorded(recording):
-        found += check_joint_limits(arm, recording)
+        found += joint_checks.check_joint_limits(arm, recording)
         if any(doubt.weight == "refused" for doubt in found):
             return found
-        told = list(check_efforts_by_inverse_dynamics(arm, recording))
-        told += check_robot_held_points(arm, recording, _choice(run))
+        told = list(joint_checks.check_efforts_by_inverse_dynamics(arm, recording))
+        told += point_checks.check_robot_held_points(arm, recording, _choice(run))
         found += [doubt for doubt in told if not _is_modelled(system, doubt)]
-    return found + list(check_point_distances(arm, system, system.parameters.vector(), recording, _choice(run)))
+    theta = system.parameters.vector()
+    return found + list(point_checks.check_point_distances(arm, system, theta, recording, _choice(run)))
 
 
 def _excitation(
@@ -320,11 +289,11 @@ def _excitation(
         joint, _, quantity = name.rpartition(".")
         if joint in arm.joint_names and quantity in ("damping", "stiffness"):
             asked.setdefault(joint, []).append(name)
-    found = list(check_joint_excitation(recordings, asked, _choice(run)(JOINT_POSITION_GROUP_NAME)))
+    found = list(joint_checks.check_joint_excitation(recordings, asked, _choice(run)(JOINT_POSITION_GROUP_NAME)))
     if any(word in name for name in free for word in _MOTION_PARAMETER_WORDS):
         options = _choice(run)(JOINT_EFFORT_GROUP_NAME)
         whole = [one for one in recordings if arm.has_all_angles_recorded(one)]
-        weak = [list(check_inertial_effort_excitation(arm, one, options)) for one in whole]
+        weak = [list(joint_checks.check_inertial_effort_excitation(arm, one, options)) for one in whole]
         if all(weak):  # one recording that tells is enough
             found += [doubt for doubts in weak for doubt in doubts]
     return found
@@ -352,7 +321,7 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
     for i, episode in enumerate(problem.episodes):
         result = problem.predictor.predict_episode(episode, *problem.split(problem.initial_unknowns, i), False, None)
         if isinstance(result, EpisodePrediction):
-            found += check_object_points_by_rollout(episode, result, size)
+            found += point_checks.check_object_points_by_rollout(episode, result, size)
     return found
 
 

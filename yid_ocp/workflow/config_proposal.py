@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
@@ -15,6 +15,7 @@ from yid_ocp.data.channel_checks import quantization_step, white_noise_std
 from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, nearest_name_hint
+from yid_ocp.files import attributes_to_json
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
@@ -32,23 +33,12 @@ _COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
 _POSITION_STEP_PERCENT = 5  # places along a segment are told apart in so many percent
 _SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
-_RESULT_KEYS = {
-    "unused_joints": "left_out",
-    "unrecorded_joints": "not_recorded",
-    "tool_frames": "frames",
-    "holder_frame": "holder",
-    "arm_mode": "mode",
-    "arm_mode_reason": "mode_why",
-    "initial_state": "start",
-    "initial_state_reason": "start_why",
-    "point_placements": "places",
-    "noise_by_group": "noise",
-    "path_cutoff": "cutoff",
-    "clock_descriptions": "clocks",
-    "still_joints": "still",
-    "reason": "why",
-}
-"""Keys of `yid-init/1` by attribute, where they differ."""
+_KEYS = (
+    "joints left_out=unused_joints not_recorded=unrecorded_joints holder=holder_frame grasps mode=arm_mode time_step"
+)
+_MORE_KEYS = "mode_why=arm_mode_reason start=initial_state start_why=initial_state_reason cutoff=path_cutoff"
+_LAST_KEYS = "clocks=clock_descriptions still=still_joints"
+"""Keys of `yid-init/1`, with the attribute where it has another name."""
 
 
 @dataclass(frozen=True)
@@ -100,18 +90,21 @@ class ConfigProposal:
 
     def to_dict(self) -> dict[str, Any]:
         """The proposal as plain data, under the keys of `yid-init/1`."""
-        return dict(_with_result_keys(asdict(self)))
+        return attributes_to_json(self, f"{_KEYS} {_MORE_KEYS} {_LAST_KEYS}") | {
+            "arms": [attributes_to_json(arm, "joints frames=tool_frames") for arm in self.arms],
+            "places": {
+                group: [attributes_to_json(place, "point frame why=reason") for place in places]
+                for group, places in self.point_placements.items()
+            },
+            "noise": {
+                group: attributes_to_json(noise, "std unit why=reason") for group, noise in self.noise_by_group.items()
+            },
+        }
 
     @property
     def is_object_measured_only_by_effort(self) -> bool:
         """Whether joint efforts of arms with prescribed motion are the only measurements that depend on the object."""
         return self.arm_mode == "prescribed" and not self.point_placements
-
-
-def _with_result_keys(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {_RESULT_KEYS.get(key, key): _with_result_keys(entry) for key, entry in value.items()}
-    return [_with_result_keys(entry) for entry in value] if isinstance(value, tuple) else value
 
 
 def propose_config(

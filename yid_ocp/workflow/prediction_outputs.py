@@ -35,14 +35,8 @@ def prediction_error_entry(
     """Prediction errors of one recording: RMSE per channel for the model and for every baseline.
 
     A group of several points has an entry of its own beside its channels: the square root of the mean squared distance
-    over all its points and frames but those that fixed the start.
-
-    Parameters
-    ----------
-    outcome : EpisodePrediction or str
-        Prediction, or why there is none.
-    cable : CableTopology, optional
-        For the baselines that only a cable held by clamps has.
+    over all its points and frames but those that fixed the start. `outcome` is a prediction or why there is none,
+    `cable` for the baselines that only a cable held by clamps has.
     """
     entry: dict[str, Any] = {"recording": episode.name, "rmse": {}, "baselines": {}}
     options = problem.options
@@ -79,13 +73,9 @@ def channels_worse_than_baseline(
     for entry in entries:
         for channel in entry["rmse"]:
             if better := _clearly_better_baseline(entry, [channel]):
-                best, guess, error = better
-                said = {
-                    "recording": entry["recording"],
-                    "channel": channel,
-                    "unit": channel_or_group_unit(units, channel),
-                }
-                worse.append(said | {"rmse": error, "baseline": best, "guess": guess})
+                said = {"recording": entry["recording"], "channel": channel}
+                said |= {"unit": channel_or_group_unit(units, channel)}
+                worse.append(said | dict(zip(("baseline", "guess", "rmse"), better, strict=True)))
     return worse
 
 
@@ -104,14 +94,14 @@ def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapp
             if better := _clearly_better_baseline(entry, channels):
                 best, guess, error = better
                 unit = units[channels[0]]
-                what = (
-                    f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by {guess:.3g}"
-                )
+                what = f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by"
                 evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_ISSUE_EVIDENCE
                 advice = "look at the residuals, and let `yid-ocp diagnose` say what the model lacks"
                 sensor, _, channel = group.partition(".")
                 at = (entry["recording"], sensor, channel)
-                found.append(Issue("worse_than_guess", f"{what} {unit}", "not_trusted", evidence, advice, *at))
+                found.append(
+                    Issue("worse_than_guess", f"{what} {guess:.3g} {unit}", "not_trusted", evidence, advice, *at)
+                )
     return found
 
 
@@ -156,11 +146,8 @@ def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | N
 def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, dict[str, dict[str, float]]]:
     """Estimated torque offset by recording and joint: `value`, `std`, `prior_std` [N m], held-out included.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-        With weights frozen near `x`; without them, or where offsets are no part of the model, the result is empty.
-    x : ndarray, shape (nx,)
+    The problem's weights are frozen near `x`, shape (nx,); without them, or where offsets are no part of the model, the
+    result is empty.
     """
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
