@@ -9,8 +9,8 @@ import h5py
 import numpy as np
 import pytest
 
-from yid_ocp.data import hdf5_io
-from yid_ocp.data.hdf5_io import create_hdf5_atomically, open_checked_hdf5
+from yid_ocp.data import recording_hdf5
+from yid_ocp.data.recording_hdf5 import create_hdf5_atomically, open_checked_hdf5
 from yid_ocp.errors import DataError, OutputError
 
 needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="files are tried in forks")
@@ -92,7 +92,7 @@ def test_the_trial_has_a_limit_on_its_memory(file):
         return f"took {len(bytearray(4 << 30))} bytes"
 
     with pytest.raises(DataError, match="ends the HDF5 library") as caught:
-        hdf5_io.check_readable_in_fork(file, greedy, "HDF5")
+        recording_hdf5.check_readable_in_fork(file, greedy, "HDF5")
     assert "took" not in caught.value.what
 
 
@@ -106,14 +106,14 @@ def test_what_is_declared_but_not_there_is_refused(file):
 
 @needs_fork
 def test_a_file_that_ends_the_library_does_not_end_us(file, monkeypatch):
-    monkeypatch.setattr(hdf5_io, "_foreign", lambda group: os.kill(os.getpid(), signal.SIGSEGV))
+    monkeypatch.setattr(recording_hdf5, "_foreign", lambda group: os.kill(os.getpid(), signal.SIGSEGV))
     with pytest.raises(DataError, match="SIGSEGV"), open_checked_hdf5(file):
         pass
 
 
 @needs_fork
 def test_a_file_that_never_ends_is_given_up(file, monkeypatch):
-    monkeypatch.setattr(hdf5_io, "_READ_TIMEOUT", 0.3)
-    monkeypatch.setattr(hdf5_io, "_foreign", lambda group: signal.pause())
+    monkeypatch.setattr(recording_hdf5, "_READ_TIMEOUT", 0.3)
+    monkeypatch.setattr(recording_hdf5, "_foreign", lambda group: signal.pause())
     with pytest.raises(DataError, match=r"within 0\.3 s"), open_checked_hdf5(file):
         pass

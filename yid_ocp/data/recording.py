@@ -5,7 +5,7 @@ from __future__ import annotations
 import numbers
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, get_args
 
@@ -54,25 +54,15 @@ _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its en
 class JointGroup(ReprMixin):
     """Joint measurements of a robot: N samples of nj joints on one clock; arrays are copied and read-only.
 
+    The channels have shape (N, nj): `position`, `velocity` and `effort` as measured [rad], [rad/s], [N m], the two
+    commands as the controller asked for them, `external_effort` what is left when the robot's own model is taken away
+    [N m], `torque_enable` one where a servo's motor is on and zero where it is off. What is stated once is a number, or
+    (nj,): standard deviations of noise, white from sample to sample, and of a constant error of the effort, where known
+    [rad], [rad/s], [N m]; the step of the encoder, `position_resolution` [rad]; the `proportional_gain` of a servo's
+    firmware, in a unit of its own. `names` are those of the URDF, `t` is strictly increasing, shape (N,) [s].
+
     Attributes
     ----------
-    names : tuple of str, length nj
-        As in the URDF.
-    t : ndarray, shape (N,)
-        Strictly increasing time [s].
-    position, velocity, effort : ndarray, shape (N, nj)
-        Measured [rad], [rad/s], [N m].
-    position_command, velocity_command : ndarray, shape (N, nj), or None
-        What the controller asked for [rad], [rad/s].
-    external_effort : ndarray, shape (N, nj), or None
-        Effort left when the robot's own model is taken away [N m].
-    position_std, velocity_std, effort_std, effort_bias_std : float or ndarray, shape (nj,), or None
-        Standard deviations of noise, white from sample to sample, and of a constant error of a joint's effort, where
-        known [rad], [rad/s], [N m].
-    torque_enable : ndarray, shape (N, nj), or None
-        One where a servo's motor is on, zero where it is off.
-    position_resolution, proportional_gain : float or ndarray, shape (nj,), or None
-        Step of the encoder [rad]; proportional gain of a servo's firmware, in a unit of its own.
     effort_kind : {'sample', 'mean', 'command'} or None
         What `effort[k]` is of the true one: its value at t_k, its mean from t_k to t_{k+1}, or held until then.
     clock : {'recorded', 'nominal'}
@@ -101,13 +91,10 @@ class JointGroup(ReprMixin):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
-        for name in ("t", *JOINT_CHANNEL_UNITS):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, read_only_array(getattr(self, name), f"joints/{name}"))
+        _freeze_arrays(self, ("t", *JOINT_CHANNEL_UNITS))
         for name in JOINT_CONSTANT_NAMES:
             if getattr(self, name) is not None:
-                std = read_only_array(getattr(self, name), f"joints, attribute {name}")
-                object.__setattr__(self, name, float(std) if std.ndim == 0 else std)
+                object.__setattr__(self, name, _constant(getattr(self, name), f"joints, attribute {name}"))
 
     @property
     def channels(self) -> dict[str, Array]:
@@ -120,10 +107,9 @@ class JointGroup(ReprMixin):
         return self.effort_kind or "sample"
 
     def _summary(self) -> ReprSummary:
+        count = count_with_noun(len(self.names), "joint")
         rows = [("joint",), *((name,) for name in self.names)]
-        return ReprSummary(
-            f"{count_with_noun(len(self.names), 'joint')}, {_sampled(self.t)}: {', '.join(self.channels)}", rows
-        )
+        return ReprSummary(f"{count}, {_sampled(self.t)}: {', '.join(self.channels)}", rows)
 
     def _rows(self, rows: BoolArray) -> JointGroup:
         changes: dict[str, Any] = {name: value[rows] for name, value in self.channels.items()}
@@ -134,21 +120,10 @@ class JointGroup(ReprMixin):
 class PointGroup(ReprMixin):
     """Positions of np named points over M frames of one sensor, on its own clock; arrays are copied and read-only.
 
-    Attributes
-    ----------
-    name : str
-        `points`, or `points_` and a word of one's own (`points_camera`, `points_arm`).
-    t : ndarray, shape (M,)
-        Strictly increasing time [s].
-    position : ndarray, shape (M, np, 3)
-        Position in `frame` [m], NaN (all three coordinates) where a point was not seen.
-    std : ndarray, shape (M, np, 3), or None
-        Standard deviation of the noise [m]; a number given for it is spread over the shape.
-    sensor, frame : str
-        What saw the points, and their frame of reference.
-    pose : ndarray, shape (4, 4), or None
-        Of a camera: the transform from camera to world coordinates [m].
-    clock : {'recorded', 'nominal'}
+    The group's `name` is `points`, or `points_` and a word of one's own (`points_camera`). Positions, shape
+    (M, np, 3), are in `frame` at strictly increasing times `t` (M,) [s], and NaN (all three coordinates) where a point
+    was not seen; `std` is the standard deviation of their noise, the same shape or one number [m]. `sensor` saw them,
+    from the `pose` (4, 4) of a camera in the world.
     """
 
     name: str
@@ -163,20 +138,16 @@ class PointGroup(ReprMixin):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
-        for name in ("t", "position", "std", "pose"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, read_only_array(getattr(self, name), f"{self.name}/{name}"))
+        _freeze_arrays(self, ("t", "position", "std", "pose"))
         if self.std is not None and self.std.ndim == 0:
-            object.__setattr__(
-                self, "std", read_only_array(np.full(self.position.shape, float(self.std)), f"{self.name}/std")
-            )
+            object.__setattr__(self, "std", np.full(self.position.shape, float(self.std)))
+            _freeze_arrays(self, ("std",))
 
     def _summary(self) -> ReprSummary:
         seen = np.isfinite(self.position).all(axis=2).sum(axis=0)
         rows = [("point", "seen"), *((name, str(count)) for name, count in zip(self.names, seen, strict=True))]
-        return ReprSummary(
-            f"{self.name}, {count_with_noun(len(self.names), 'point')}, {_sampled(self.t)}, in {self.frame}", rows
-        )
+        count = count_with_noun(len(self.names), "point")
+        return ReprSummary(f"{self.name}, {count}, {_sampled(self.t)}, in {self.frame}", rows)
 
     def _rows(self, rows: BoolArray) -> PointGroup:
         std = None if self.std is None else self.std[rows]
@@ -185,23 +156,11 @@ class PointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChannelGroup(ReprMixin):
-    """Values of channels that sensors declare (`sensors.ChannelKind`), on one clock.
+    """Values of channels that sensors declare (`sensors.ChannelKind`), on one clock; arrays are copied and read-only.
 
-    Arrays are copied, made float64 and read-only.
-
-    Attributes
-    ----------
-    name : str
-        Declared group, `motors` for example, or that, `_` and a word of one's own.
-    names : tuple of str, length k
-        Of joints, or whatever the columns are.
-    t : ndarray, shape (M,)
-        Strictly increasing time [s].
-    values : mapping of quantity to ndarray, shape (M, k) or (M, k, components)
-        In the channel's unit.
-    stds : mapping of str to float or ndarray, shape (k,)
-        Noise by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), where known, in the channel's unit.
-    clock : {'recorded', 'nominal'}
+    The group's `name` is a declared one, `motors` for example, or that, `_` and a word of one's own. `values` are by
+    quantity, shape (M, k) or (M, k, components) for k `names`, at strictly increasing times `t` (M,) [s]; `stds` are by
+    attribute (`QUANTITY_std`, `QUANTITY_bias_std`), a number or (k,), where known; both are in the channel's unit.
     """
 
     name: str
@@ -213,11 +172,11 @@ class ChannelGroup(ReprMixin):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
-        object.__setattr__(self, "t", read_only_array(self.t, f"{self.name}/t"))
+        _freeze_arrays(self, ("t",))
         values = {key: read_only_array(value, f"{self.name}/{key}") for key, value in self.values.items()}
-        stds = {key: read_only_array(std, f"{self.name}, attribute {key}") for key, std in self.stds.items()}
+        stds = {key: _constant(std, f"{self.name}, attribute {key}") for key, std in self.stds.items()}
         object.__setattr__(self, "values", values)
-        object.__setattr__(self, "stds", {key: float(std) if std.ndim == 0 else std for key, std in stds.items()})
+        object.__setattr__(self, "stds", stds)
 
     def _summary(self) -> ReprSummary:
         return ReprSummary(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {', '.join(self.values)}")
@@ -232,22 +191,16 @@ class Recording(ReprMixin):
 
     Attributes
     ----------
-    points : tuple of PointGroup
-        What cameras, motion capture or an arm measured of points; every group has its own clock.
-    description, source : str
-        What was recorded, and where it comes from.
-    name : str
-        Short name, the stem of the file.
-    sha256 : str or None
-        Hash of the file read.
+    points, channel_groups : tuple of PointGroup, tuple of ChannelGroup
+        What cameras, motion capture or an arm measured of points, and other sensors of anything; on their own clocks.
+    name, sha256 : str, str or None
+        Short name, the stem of the file, and hash of the file read.
     true_parameters : mapping of str to float
         The parameter values of a virtual experiment, in the parameters' own units; empty for a real one.
     marker_reference_pose : ndarray, shape (np, 3), or None
         Positions of the points of the first group while the object was held straight, in that group's frame [m].
     notes : tuple of str
         What an import left out or changed, in words.
-    channel_groups : tuple of ChannelGroup
-        What further sensors measured; every group has its own clock.
     """
 
     joints: JointGroup | None = None
@@ -262,26 +215,21 @@ class Recording(ReprMixin):
     channel_groups: tuple[ChannelGroup, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "points", tuple(self.points))
-        object.__setattr__(self, "channel_groups", tuple(self.channel_groups))
         object.__setattr__(self, "true_parameters", dict(self.true_parameters))
-        object.__setattr__(self, "notes", tuple(self.notes))
+        for name in ("points", "channel_groups", "notes"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
         if self.marker_reference_pose is not None:
             object.__setattr__(self, "marker_reference_pose", read_only_array(self.marker_reference_pose, "straight"))
 
     def _summary(self) -> ReprSummary:
-        joints, points = (
-            count_with_noun(len(self.joint_names), "joint"),
-            count_with_noun(len(self.point_names), "point"),
-        )
+        names = {"joint": self.joint_names, "point": self.point_names}
+        counts = " and ".join(count_with_noun(len(own), noun) for noun, own in names.items())
         rows = [("group", "names", "samples", "channels")]
-        if self.joints is not None:
-            own = self.joints
-            rows.append(("joints", ", ".join(own.names), _sampled(own.t), ", ".join(own.channels)))
-        rows += [(g.name, ", ".join(g.names), _sampled(g.t), "position") for g in self.points]
-        rows += [(g.name, ", ".join(g.names), _sampled(g.t), ", ".join(g.values)) for g in self.channel_groups]
+        for g in self.all_groups:
+            channels = g.channels if isinstance(g, JointGroup) else getattr(g, "values", ("position",))
+            rows.append((g.name, ", ".join(g.names), _sampled(g.t), ", ".join(channels)))
         span = f", {self.duration:.4g} s" if self.all_groups else ""
-        return ReprSummary(f"'{self.name}', {joints} and {points}{span}", rows)
+        return ReprSummary(f"'{self.name}', {counts}{span}", rows)
 
     @property
     def groups(self) -> tuple[JointGroup | PointGroup, ...]:
@@ -324,39 +272,25 @@ class Recording(ReprMixin):
     def time_slice(self, start: float, stop: float) -> Recording:
         """Cut out the samples with start <= t <= stop [s], without groups that have none; times stay as they are.
 
-        Raises
-        ------
-        DataError
-            Nothing was recorded in between, or `start` is not before `stop`.
+        `DataError` where nothing was recorded in between, or `start` is not before `stop`.
         """
         masks = [(g.t >= start - _TIME_TOLERANCE) & (g.t <= stop + _TIME_TOLERANCE) for g in self.all_groups]
         kept = [group._rows(mask) for group, mask in zip(self.all_groups, masks, strict=True) if mask.any()]
         first, last = min(g.t[0] for g in self.all_groups), max(g.t[-1] for g in self.all_groups)
         what, allowed = f"nothing was recorded from {start:g} s to {stop:g} s", f"within {first:g} s to {last:g} s"
-        raise_data_error_unless(
-            start < stop and bool(kept), what, f"recording '{self.name}'", f"start < stop, {allowed}"
-        )
+        require_data(start < stop and kept, what, f"recording '{self.name}'", f"start < stop, {allowed}")
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
         points = tuple(group for group in kept if isinstance(group, PointGroup))
-        first_kept = bool(points) and points[0].name == self.points[0].name
-        return replace(
-            self,
-            joints=joints,
-            points=points,
-            channel_groups=tuple(group for group in kept if isinstance(group, ChannelGroup)),
-            marker_reference_pose=self.marker_reference_pose if first_kept else None,
-        )
+        channels = tuple(group for group in kept if isinstance(group, ChannelGroup))
+        straight = self.marker_reference_pose if points and points[0].name == self.points[0].name else None
+        return replace(self, joints=joints, points=points, channel_groups=channels, marker_reference_pose=straight)
 
 
 def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
     """Check shapes, clocks, names, values and units of a recording, which is returned.
 
-    Parameters
-    ----------
-    allow_nan_effort : bool
-        Whether `effort` and `external_effort` may hold NaN.
-    where : str
-        What errors call the recording, its file for example; its name where empty.
+    `allow_nan_effort` says whether `effort` and `external_effort` may hold NaN, `where` what errors call the recording,
+    its file for example; its name where empty.
 
     Raises
     ------
@@ -368,24 +302,22 @@ def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, 
         machine; `straight` does not match the first group of points.
     """
     origin = where or f"recording '{recording.name}'"
-    raise_data_error_unless(
-        bool(recording.all_groups), "the recording has no group", origin, "joints, points, points_<name>"
-    )
+    require_data(recording.all_groups, "the recording has no group", origin, "joints, points, points_<name>")
     _check_text(origin, recording.description, recording.source, *recording.notes)
     for key, value in recording.true_parameters.items():
         good = isinstance(value, numbers.Real) and not isinstance(value, bool) and bool(np.isfinite(value))
-        raise_data_error_unless(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
+        require_data(good, f"the true value of '{key}' is {value!r}", f"{origin}: truth", "finite numbers")
     if recording.joints is not None:
         _validate_joints(recording.joints, f"{origin}: joints", allow_nan_effort)
     names = [group.name for group in recording.points]
     for group in recording.points:
-        legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name) is not None
-        raise_data_error_unless(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
-        raise_data_error_unless(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
+        legal = POINT_GROUP_NAME_PATTERN.fullmatch(group.name)
+        require_data(legal, f"a group of points is called '{group.name}'", origin, "points, points_<name>")
+        require_data(names.count(group.name) == 1, f"two groups of points are called '{group.name}'", origin)
         _validate_points(group, f"{origin}: {group.name}")
     for channels in recording.channel_groups:
         repeated = sum(group.name == channels.name for group in recording.channel_groups) > 1
-        raise_data_error_unless(not repeated, f"two groups are called '{channels.name}'", origin)
+        require_data(not repeated, f"two groups are called '{channels.name}'", origin)
         _validate_channels(channels, f"{origin}: {channels.name}")
     if recording.marker_reference_pose is not None:
         _validate_straight(recording.marker_reference_pose, recording.points, f"{origin}: straight")
@@ -398,9 +330,9 @@ def _sampled(t: Array) -> str:
     return f"{count_with_noun(len(t), 'sample')} at {rate:.4g} Hz" if rate else count_with_noun(len(t), "sample")
 
 
-def raise_data_error_unless(ok: bool, what: str, where: str, allowed: str = "", hint: str = "") -> None:
+def require_data(condition: object, what: str, where: str, allowed: str = "", hint: str = "") -> None:
     """Raise a `DataError` unless a condition holds."""
-    if not ok:
+    if not condition:
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
@@ -414,6 +346,18 @@ def read_only_array(value: ArrayLike, where: str) -> Array:
     return array
 
 
+def _constant(value: ArrayLike, where: str) -> float | Array:
+    array = read_only_array(value, where)
+    return float(array) if array.ndim == 0 else array
+
+
+def _freeze_arrays(group: JointGroup | PointGroup | ChannelGroup, names: Iterable[str]) -> None:
+    """Make read-only arrays of the named fields that are not None, while a group is made."""
+    for name in names:
+        if getattr(group, name) is not None:
+            object.__setattr__(group, name, read_only_array(getattr(group, name), f"{group.name}/{name}"))
+
+
 def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> None:
     _check_names_and_clock(joints, where)
     for channel, value in joints.channels.items():
@@ -423,37 +367,29 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         bad = np.isinf(value) if is_effort and allow_nan_effort else ~np.isfinite(value)
         if bad.any():
             row, column = (int(index[0]) for index in np.nonzero(bad))
-            raise DataError(
-                f"channel '{channel}' of joint '{joints.names[column]}' is not finite at t = {joints.t[row]:g} s "
-                f"({int(bad.sum())} such values in the channel)",
-                where=place,
-                allowed="finite numbers; NaN is for points only",
-                hint="cut the recording or leave the channel out"
-                + (", or read with allow_nan_effort=True" if is_effort else ""),
-            )
+            what = f"channel '{channel}' of joint '{joints.names[column]}' is not finite at t = {joints.t[row]:g} s "
+            what += f"({int(bad.sum())} such values in the channel)"
+            hint = "cut the recording or leave the channel out"
+            hint += ", or read with allow_nan_effort=True" if is_effort else ""
+            raise DataError(what, where=place, allowed="finite numbers; NaN is for points only", hint=hint)
         unit = JOINT_CHANNEL_UNITS[channel]
-        largest = float(np.nanmax(np.abs(value), initial=0.0))
-        degrees = f"these look like degrees: convert them to radians, or read a CSV with units={{'{channel}': 'deg'}}"
-        raise_data_error_unless(
-            largest <= _LARGEST[unit],
-            f"channel '{channel}' reaches {largest:g} {unit}",
-            place,
-            f"at most {_LARGEST[unit]:g} {unit}",
-            degrees if unit == "rad" else "convert it again from what was recorded: no machine does that",
-        )
+        largest, allowed = float(np.nanmax(np.abs(value), initial=0.0)), f"at most {_LARGEST[unit]:g} {unit}"
+        hint = "convert it again from what was recorded: no machine does that"
+        if unit == "rad":
+            hint = f"these look like degrees: convert them to radians, or read a CSV with units={{'{channel}': 'deg'}}"
+        what = f"channel '{channel}' reaches {largest:g} {unit}"
+        require_data(largest <= _LARGEST[unit], what, place, allowed, hint)
     enabled = joints.torque_enable
-    ok = enabled is None or bool(np.isin(enabled, (0.0, 1.0)).all())
-    raise_data_error_unless(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
+    ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()
+    require_data(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
     for name in JOINT_CONSTANT_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")
     if joints.effort_kind is not None:
         place, kinds = f"{where}, attribute effort_kind", get_args(EffortKind)
-        hint = "leave the attribute out where it is not known"
-        raise_data_error_unless(
-            joints.effort_kind in kinds, f"the kind is '{joints.effort_kind}'", place, ", ".join(kinds), hint
-        )
+        what, hint = f"the kind is '{joints.effort_kind}'", "leave the attribute out where it is not known"
+        require_data(joints.effort_kind in kinds, what, place, ", ".join(kinds), hint)
 
 
 def _validate_points(group: PointGroup, where: str) -> None:
@@ -464,47 +400,41 @@ def _validate_points(group: PointGroup, where: str) -> None:
     bad = ~np.isfinite(group.position).all(axis=2) & ~unseen
     if bad.any():
         row, column = (int(index[0]) for index in np.nonzero(bad))
-        raise DataError(
-            f"point '{group.names[column]}' is {group.position[row, column]} at t = {group.t[row]:g} s",
-            where=f"{where}/position",
-            allowed="three finite coordinates, or three NaN where the point was not seen",
-        )
-    largest = float(np.abs(group.position[~unseen]).max(initial=0.0))
-    raise_data_error_unless(
-        largest <= _LARGEST_DISTANCE,
-        f"a coordinate reaches {largest:g} m",
-        f"{where}/position",
-        f"at most {_LARGEST_DISTANCE:g} m",
-        "these look like millimetres: convert them to metres, or read a CSV with units={'points': 'mm'}",
-    )
+        what = f"point '{group.names[column]}' is {group.position[row, column]} at t = {group.t[row]:g} s"
+        allowed = "three finite coordinates, or three NaN where the point was not seen"
+        raise DataError(what, where=f"{where}/position", allowed=allowed)
+    _check_distances(group.position[~unseen], f"{where}/position", ", or read a CSV with units={'points': 'mm'}")
     if group.std is not None:
         _check_shape(group.std, group.position.shape, f"{where}/std", "one number or (M, np, 3)")
         seen = group.std[~unseen]
         wrong = seen[~((seen >= 0) & (seen <= _LARGEST_SPREAD))]
-        what = f"the standard deviation of a point that was seen is {wrong[:1]}"
-        raise_data_error_unless(
-            wrong.size == 0, what, f"{where}/std", f"not negative, and at most {_LARGEST_SPREAD:g} m"
-        )
+        what, allowed = f"the standard deviation of a point that was seen is {wrong[:1]}", "not negative, and at most"
+        require_data(wrong.size == 0, what, f"{where}/std", f"{allowed} {_LARGEST_SPREAD:g} m")
     if group.pose is not None:
         _check_pose(group.pose, f"{where}, attribute pose")
+
+
+def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
+    largest, hint = float(np.abs(positions).max(initial=0.0)), "these look like millimetres: convert them to metres"
+    what, allowed = f"a coordinate reaches {largest:g} m", f"at most {_LARGEST_DISTANCE:g} m"
+    require_data(largest <= _LARGEST_DISTANCE, what, where, allowed, hint + remedy)
 
 
 def _validate_channels(group: ChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
     declared = {channel.quantity: channel for channel in declared_channel_kinds(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
-    raise_data_error_unless(bool(group.values), "the group has no values", where, ", ".join(declared))
+    require_data(group.values, "the group has no values", where, ", ".join(declared))
     for noun, found, known in (("dataset", group.values, declared), ("attribute", group.stds, fields)):
         for name in found:
             what = f"no sensor declares a {noun} '{name}' here"
             allowed = ", ".join(known) or "groups that a sensor declares"
-            raise_data_error_unless(name in known, what, where, allowed, nearest_name_hint(name, known))
+            require_data(name in known, what, where, allowed, nearest_name_hint(name, known))
     for quantity, values in group.values.items():
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
         _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
-        finite = bool(np.isfinite(values).all())
-        raise_data_error_unless(finite, "a value is not finite", f"{where}/{quantity}", "finite numbers")
+        require_data(np.isfinite(values).all(), "a value is not finite", f"{where}/{quantity}", "finite numbers")
     for name, std in group.stds.items():
         _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
 
@@ -512,84 +442,68 @@ def _validate_channels(group: ChannelGroup, where: str) -> None:
 def _validate_std(std: float | Array, count: int, name: str, where: str, letters: str) -> None:
     if np.ndim(std) > 0:
         _check_shape(np.asarray(std), (count,), where, letters)
-    good = bool(np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD)))
-    raise_data_error_unless(good, f"{name} is {std}", where, f"not negative, and at most {_LARGEST_SPREAD:g}")
+    good = np.all((np.asarray(std) >= 0) & (np.asarray(std) <= _LARGEST_SPREAD))
+    require_data(good, f"{name} is {std}", where, f"not negative, and at most {_LARGEST_SPREAD:g}")
 
 
 def _validate_straight(straight: Array, groups: Sequence[PointGroup], where: str) -> None:
-    raise_data_error_unless(
-        bool(groups), "the positions of a straight object belong to no points", where, "a group of points"
-    )
+    require_data(groups, "the positions of a straight object belong to no points", where, "a group of points")
     _check_shape(straight, (len(groups[0].names), 3), where, "(np, 3), for the first group of points")
-    raise_data_error_unless(
-        bool(np.isfinite(straight).all()), "a position is not finite", where, "finite coordinates of every point"
-    )
-    largest = float(np.abs(straight).max())
-    what, allowed = f"a coordinate reaches {largest:g} m", f"at most {_LARGEST_DISTANCE:g} m"
-    raise_data_error_unless(
-        largest <= _LARGEST_DISTANCE, what, where, allowed, "these look like millimetres: convert them to metres"
-    )
+    finite, allowed = np.isfinite(straight).all(), "finite coordinates of every point"
+    require_data(finite, "a position is not finite", where, allowed)
+    _check_distances(straight, where)
     # a file lists its groups by name, so only that order survives it
     first = min(groups, key=lambda group: group.name.encode())
     what = f"the positions belong to '{groups[0].name}', but a file would list '{first.name}' first"
-    raise_data_error_unless(first is groups[0], what, where, "groups of points sorted by name")
+    require_data(first is groups[0], what, where, "groups of points sorted by name")
 
 
 def _check_pose(pose: Array, where: str) -> None:
     _check_shape(pose, (4, 4), where, "(4, 4)")
     rotation, allowed = pose[:3, :3], "a rotation, a translation [m] and the last row 0 0 0 1"
-    raise_data_error_unless(bool(np.isfinite(pose).all()), "the pose has a value that is not finite", where, allowed)
-    raise_data_error_unless(_close(pose[3], np.eye(4)[3]), f"the last row of the pose is {pose[3]}", where, allowed)
-    raise_data_error_unless(
-        _close(rotation.T @ rotation, np.eye(3)), "the axes of the pose are not orthonormal", where, allowed
+    require_data(np.isfinite(pose).all(), "the pose has a value that is not finite", where, allowed)
+    last_is_unit, orthonormal = (
+        np.allclose(array, expected, rtol=0, atol=1e-6)
+        for array, expected in ((pose[3], np.eye(4)[3]), (rotation.T @ rotation, np.eye(3)))
     )
-    raise_data_error_unless(bool(np.linalg.det(rotation) > 0), "the pose is a reflection", where, allowed)
-
-
-def _close(array: Array, expected: Array) -> bool:
-    return bool(np.allclose(array, expected, rtol=0, atol=1e-6))
+    require_data(last_is_unit, f"the last row of the pose is {pose[3]}", where, allowed)
+    require_data(orthonormal, "the axes of the pose are not orthonormal", where, allowed)
+    require_data(np.linalg.det(rotation) > 0, "the pose is a reflection", where, allowed)
 
 
 def _check_names_and_clock(group: JointGroup | PointGroup | ChannelGroup, where: str) -> None:
     place, allowed = f"{where}, names", "one for every column, each once"
-    raise_data_error_unless(bool(group.names), "the group has no names", where, allowed, "write the attribute `names`")
+    require_data(group.names, "the group has no names", where, allowed, "write the attribute `names`")
     allowed, hint = "one sample or more", "record again, or leave the group out"
-    raise_data_error_unless(group.t.size > 0, "the group has no samples", where, allowed, hint)
+    require_data(group.t.size > 0, "the group has no samples", where, allowed, hint)
     for name, count in Counter(group.names).items():
-        usable = isinstance(name, str) and bool(name) and not _CONTROL_CHARACTER.search(name)
+        usable = isinstance(name, str) and name and not _CONTROL_CHARACTER.search(name)
         what, allowed = f"the name {name!r} cannot be used", "text without control characters, not empty"
-        raise_data_error_unless(usable, what, place, allowed, "rename it")
+        require_data(usable, what, place, allowed, "rename it")
         what = f"the name '{name}' occurs {count} times"
-        raise_data_error_unless(count == 1, what, place, "every name once", "rename all but one")
-    clocks = get_args(ClockKind)
-    raise_data_error_unless(
-        group.clock in clocks, f"the clock is '{group.clock}'", f"{where}, attribute clock", ", ".join(clocks)
-    )
+        require_data(count == 1, what, place, "every name once", "rename all but one")
+    clocks, place = get_args(ClockKind), f"{where}, attribute clock"
+    require_data(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))
-    raise_data_error_unless(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
+    require_data(bad.size == 0, f"the time at index {bad[:1]} is not finite", f"{where}/t", "finite seconds")
     backward = np.flatnonzero(np.diff(group.t) <= 0)
     if backward.size:
         index = int(backward[0])
         before, after = float(group.t[index]), float(group.t[index + 1])
-        raise DataError(
-            f"the clock does not advance from index {index} to {index + 1}: {before!r} s, then {after!r} s",
-            where=f"{where}/t",
-            allowed="strictly increasing times",
-            hint="remove repeated samples and sort by time",
-        )
+        what = f"the clock does not advance from index {index} to {index + 1}: {before!r} s, then {after!r} s"
+        allowed, hint = "strictly increasing times", "remove repeated samples and sort by time"
+        raise DataError(what, where=f"{where}/t", allowed=allowed, hint=hint)
 
 
 def _check_shape(array: Array, shape: tuple[int, ...], where: str, letters: str) -> None:
-    raise_data_error_unless(
-        array.shape == shape, f"the array has shape {array.shape}", where, f"{shape}, that is {letters}"
-    )
+    what, allowed = f"the array has shape {array.shape}", f"{shape}, that is {letters}"
+    require_data(array.shape == shape, what, where, allowed)
 
 
 def _check_text(where: str, *texts: str) -> None:
     for text in texts:
         # HDF5 ends text at the first null character and stores it as UTF-8
         storable = "\0" not in text and not any("\ud800" <= letter <= "\udfff" for letter in text)
-        raise_data_error_unless(
-            storable, f"the text {text!r} cannot be stored", where, "Unicode text without null characters"
-        )
+        what, allowed = f"the text {text!r} cannot be stored", "Unicode text without null characters"
+        require_data(storable, what, where, allowed)

@@ -1,10 +1,20 @@
-"""Reading and writing of recordings as HDF5 files (`yid-recording/1`), with strict checks and atomic writes."""
+"""Recordings as HDF5 files (`yid-recording/1`) with strict checks, and safe access to any HDF5 file.
+
+The HDF5 library ends the process that meets a full disk while it writes, or certain damage while it reads, and takes
+links into other files for its own. None of this can be caught, so it is kept away from the process that does the work:
+writes are atomic, and another process reads the file first.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence, Set
+import select
+import signal
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +22,6 @@ import h5py
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.hdf5_io import create_hdf5_atomically, open_checked_hdf5
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
     JOINT_CONSTANT_NAMES,
@@ -21,12 +30,19 @@ from yid_ocp.data.recording import (
     JointGroup,
     PointGroup,
     Recording,
-    raise_data_error_unless,
     read_only_array,
+    require_data,
     validate_recording,
 )
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
-from yid_ocp.files import file_sha256
+from yid_ocp.files import (
+    MAX_INPUT_NUMBERS,
+    atomic_write,
+    check_input_file,
+    file_sha256,
+    limited_memory,
+    os_error_reason,
+)
 from yid_ocp.sensors import CHANNEL_KINDS
 from yid_ocp.sensors.base import declared_channel_kinds
 
@@ -41,12 +57,7 @@ _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 
 
 def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
-    """Read and check a `yid-recording/1` file.
-
-    Parameters
-    ----------
-    allow_nan_effort : bool
-        Whether `effort` and `external_effort` may hold NaN.
+    """Read and check a `yid-recording/1` file, whose `effort` and `external_effort` may hold NaN where that is allowed.
 
     Raises
     ------
@@ -56,10 +67,9 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     """
     path = Path(path)
     digest = file_sha256(path)
+    allowed = f"HDF5 in the format {_RECORDING_FORMAT}"
     hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.data.read_any"
-    raise_data_error_unless(
-        h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), f"HDF5 in the format {_RECORDING_FORMAT}", hint
-    )
+    require_data(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), allowed, hint)
     with open_checked_hdf5(path) as file:
         recording = _from_file(file, path, digest)
     return validate_recording(recording, allow_nan_effort=allow_nan_effort, where=str(path))
@@ -68,12 +78,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Check a recording, whose efforts may hold NaN, and write it as `yid-recording/1`, whole or not at all.
 
-    Raises
-    ------
-    DataError
-        As `validate_recording`.
-    OutputError
-        The file cannot be written; one that was there before is left as it was.
+    Errors as `validate_recording`, and `OutputError` where the file cannot be written; an older one is left as it was.
     """
     validate_recording(recording, allow_nan_effort=True)
     with create_hdf5_atomically(path) as file:
@@ -117,56 +122,44 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
         for key in ("format", "description", "source", "truth", "notes")
     }
     what = f"the format of the file is '{texts['format']}'" if texts["format"] else "the file does not say its format"
-    raise_data_error_unless(
-        texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT
-    )
-    joints, points, straight, channels = None, [], None, []
-    gain = {}
+    require_data(texts["format"] == _RECORDING_FORMAT, what, f"{origin}, attribute format", _RECORDING_FORMAT)
+    joints, points, straight, channels, gain = None, [], None, [], {}
     if _GAIN in file.attrs:  # of all joints alike
         gain = {_GAIN: read_only_array(file.attrs[_GAIN], f"{origin}, attribute {_GAIN}")}
     further = sorted({CHANNEL_KINDS[kind].group for kind in CHANNEL_KINDS} - {"joints", "points"})
     allowed = ", ".join(["joints, points, points_<name>", *(f"{name}, {name}_<name>" for name in further), _STRAIGHT])
     for name in map(str, file):
         where, declared = f"{origin}: {name}", declared_channel_kinds(name)
-        legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) is not None or bool(declared)
+        legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) or declared
         hint = "" if legal else nearest_name_hint(name, ("joints", "points", *further, _STRAIGHT))
-        raise_data_error_unless(legal, f"the format has no group '{name}'", origin, allowed, hint)
+        require_data(legal, f"the format has no group '{name}'", origin, allowed, hint)
         if name == _STRAIGHT:
             straight = _read_dataset(file[name], where, "m")
             continue
-        raise_data_error_unless(
-            isinstance(file[name], h5py.Group), f"'{name}' is not a group", where, "a group of datasets"
-        )
+        group = file[name]
+        require_data(isinstance(group, h5py.Group), f"'{name}' is not a group", where, "a group of datasets")
         if name == "joints":
-            found = _read_group(file[name], where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",))
-            joints = JointGroup(**gain | found)
+            joints = JointGroup(**gain | _read_group(group, where, _JOINT_UNITS, _JOINT_ATTRIBUTES, ("names",)))
         elif declared:
             units = {c.quantity: c.unit for c in declared}
             fields = tuple(entry for c in declared for entry in c.std_attribute_names)
-            found = _read_group(
-                file[name], where, {"t": "s", **units}, ("names", "clock", *fields), ("names",), needed={"t"}
-            )
+            known = ("names", "clock", *fields)
+            found = _read_group(group, where, {"t": "s", **units}, known, ("names",), needed={"t"})
             parts = ({key: found[key] for key in keys if key in found} for keys in (units, fields, ("clock",)))
             values, stds, clock = parts
             channels.append(ChannelGroup(name, found["names"], found["t"], values, stds, **clock))
         else:
             required = ("names", "sensor", "frame")
-            values = _read_group(file[name], where, _POINT_UNITS, _POINT_ATTRIBUTES, required)
-            points.append(PointGroup(name=name, **values))
-    truth = _truth(texts["truth"], f"{origin}, attribute truth") if texts["truth"] else {}
-    notes = _notes(texts["notes"], f"{origin}, attribute notes") if texts["notes"] else ()
-    return Recording(
-        joints,
-        tuple(points),
-        texts["description"],
-        texts["source"],
-        path.stem,
-        digest,
-        truth,
-        straight,
-        notes,
-        tuple(channels),
+            points.append(PointGroup(name, **_read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, required)))
+    truth = _json(texts["truth"] or "{}", f"{origin}, attribute truth")
+    require_data(
+        isinstance(truth, dict), "the JSON text is not an object", f"{origin}, attribute truth", '{"name": number, ...}'
     )
+    notes = _json(texts["notes"] or "[]", f"{origin}, attribute notes")
+    good = isinstance(notes, list) and all(isinstance(note, str) for note in notes)
+    require_data(good, "the JSON text is not a list of text", f"{origin}, attribute notes", '["sentence", ...]')
+    said = texts["description"], texts["source"], path.stem, digest, truth, straight, tuple(notes)
+    return Recording(joints, tuple(points), *said, tuple(channels))
 
 
 def _read_group(
@@ -187,7 +180,7 @@ def _read_group(
         for name in sorted(wanted - found):
             raise DataError(f"the {noun} '{name}' is missing", where=where, allowed=", ".join(known))
     both = "std" in group and "std" in group.attrs
-    raise_data_error_unless(not both, "`std` is both a dataset and an attribute", where, "one of the two")
+    require_data(not both, "`std` is both a dataset and an attribute", where, "one of the two")
     values: dict[str, Any] = {name: _read_dataset(group[name], f"{where}/{name}", units[name]) for name in group}
     for name, value in group.attrs.items():
         place = f"{where}, attribute {name}"
@@ -202,10 +195,10 @@ def _read_group(
 
 def _read_dataset(dataset: Any, where: str, unit: str) -> Array:
     numeric = isinstance(dataset, h5py.Dataset) and dataset.dtype.kind in "fiu" and dataset.shape is not None
-    raise_data_error_unless(numeric, "not a dataset of real numbers", where, "floating point or integer numbers")
+    require_data(numeric, "not a dataset of real numbers", where, "floating point or integer numbers")
     found = _text(dataset.attrs["unit"], f"{where}, attribute unit") if "unit" in dataset.attrs else unit
     hint = f"convert the values to {unit}: recordings are never converted silently"
-    raise_data_error_unless(found == unit, f"the unit is '{found}'", where, unit, hint)
+    require_data(found == unit, f"the unit is '{found}'", where, unit, hint)
     return np.asarray(dataset[()], dtype=np.float64)
 
 
@@ -219,7 +212,7 @@ def _text(value: object, where: str) -> str:
             return value.decode("utf-8")
         except UnicodeDecodeError as error:
             raise DataError("the text is not UTF-8", where=where) from error
-    raise_data_error_unless(isinstance(value, str), f"found {value!r}", where, "text")
+    require_data(isinstance(value, str), f"found {value!r}", where, "text")
     return str(value)
 
 
@@ -231,15 +224,130 @@ def _json(text: str, where: str) -> Any:
         raise DataError(what, where=where, allowed="a list in JSON", hint=hint) from error
 
 
-def _notes(text: str, where: str) -> tuple[str, ...]:
-    notes = _json(text, where)
-    if not isinstance(notes, list) or not all(isinstance(note, str) for note in notes):
-        raise DataError("the JSON text is not a list of text", where=where, allowed='["sentence", ...]')
-    return tuple(notes)
+# -- safe access -------------------------------------------------------------------------------------------------------
+
+_READ_TIMEOUT = 10.0  # for reading a whole file [s]
+_MAX_GROUP_DEPTH = 10
 
 
-def _truth(text: str, where: str) -> dict[str, float]:
-    truth = _json(text, where)
-    if not isinstance(truth, dict):
-        raise DataError("the JSON text is not an object", where=where, allowed='{"name": number, ...}')
-    return truth
+def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
+    """Check in a forked process that a file can be read.
+
+    A fork, as a new process would take a second and a process of a pool may have no children. In it, `complaint` reads
+    the file and says what stands against it, nothing where all of it can be read. `DataError` where the file is no
+    regular one, with what the trial said of a file of the format `noun`, or how it ended.
+    """
+    check_input_file(path)
+    if not hasattr(os, "fork"):
+        return
+    here, there = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # of threads, none of which the fork needs
+        child = os.fork()
+    if child == 0:
+        try:
+            faulthandler.disable()
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
+            with limited_memory():
+                said = complaint(path)
+            os.write(there, f".{said}".encode(errors="replace")[:2000])
+        finally:
+            os._exit(0)
+    os.close(there)
+    try:
+        ready, _, _ = select.select([here], [], [], _READ_TIMEOUT)
+        answer = os.read(here, 4000).decode(errors="replace") if ready else None
+    finally:
+        os.close(here)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+    if answer is None:
+        what = f"the {noun} file cannot be read within {_READ_TIMEOUT:g} s: it is damaged, or far too large"
+    elif not answer:
+        number = os.WTERMSIG(status) if os.WIFSIGNALED(status) else 0
+        how = signal.Signals(number).name if number else "an exit"
+        what = f"the {noun} file is damaged (it ends the {noun} library with {how})"
+    else:
+        what = answer[1:]
+    if what:
+        raise DataError(what, where=str(path), hint="copy or record it again, as one file of its own")
+
+
+@contextlib.contextmanager
+def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
+    """Context manager of a new HDF5 file in memory, written atomically when the block ends without error.
+
+    `OutputError` where the file cannot be written; one that was there before is left as it was.
+    """
+    with atomic_write(Path(path)) as temporary:
+        with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
+            yield file
+            file.flush()
+            image = file.id.get_file_image()
+        temporary.write_bytes(image)
+
+
+@contextlib.contextmanager
+def open_checked_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
+    """Context manager of an HDF5 file, opened after another process has checked that it can be read.
+
+    `DataError` where the file is damaged, holds more than `MAX_INPUT_NUMBERS`, takes too long to read, or refers to
+    other files, whose contents no hash of this one covers; errors of the library in the block, too.
+    """
+    check_readable_in_fork(Path(path), _complaint, "HDF5")
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:  # all of them come from h5py
+        what = f"the HDF5 file is truncated or damaged ({os_error_reason(error)})"
+        raise DataError(what, where=str(path), hint="copy or record it again") from error
+
+
+def _complaint(path: Path) -> str:
+    """What stands against reading a file; nothing where all of it can be read."""
+    try:
+        with h5py.File(path, "r") as file:
+            complaint = _foreign(file) or _excess(file)
+            if not complaint:
+                dict(file.attrs)
+                file.visititems(_read)
+            return complaint
+    except Exception as error:  # whatever h5py says of damaged files
+        return f"the HDF5 file is truncated or damaged ({os_error_reason(error)})"
+
+
+def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
+    dict(item.attrs)
+    if isinstance(item, h5py.Dataset):
+        item[()]
+
+
+def _foreign(group: h5py.Group, depth: int = 0) -> str:
+    """Which entry stands in another file."""
+    for name in group:
+        link = group.get(name, getlink=True)
+        item = None if isinstance(link, h5py.ExternalLink) else group.get(name)
+        if item is None:
+            return f"'{name}' in the HDF5 file is a link into another file, or into nowhere"
+        if isinstance(item, h5py.Dataset) and (item.is_virtual or item.external):
+            return f"the values of '{name}' in the HDF5 file stand in another file"
+        if isinstance(item, h5py.Group):
+            endless = "groups in the HDF5 file stand in one another"
+            if found := _foreign(item, depth + 1) if depth < _MAX_GROUP_DEPTH else endless:
+                return found
+    return ""
+
+
+def _excess(file: h5py.File) -> str:
+    """Whether a file declares more than can be meant, whatever its types and its compression make of it in the file."""
+    numbers = 0.0
+
+    def count(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        nonlocal numbers
+        if isinstance(item, h5py.Dataset) and item.shape is not None:
+            numbers += max(1.0, item.dtype.itemsize / 8) * item.size
+
+    file.visititems(count)
+    meant = f"{MAX_INPUT_NUMBERS / 1e6:.0f} million are the most that can be meant"
+    return f"the HDF5 file declares {numbers / 1e6:.0f} million numbers; {meant}" if numbers > MAX_INPUT_NUMBERS else ""

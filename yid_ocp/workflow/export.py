@@ -15,8 +15,8 @@ from yid_ocp.arrays import Array
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import ParameterSettings, RunSettings, dump_config
 from yid_ocp.data import read_recording
-from yid_ocp.data.hdf5_io import open_checked_hdf5
 from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording_hdf5 import open_checked_hdf5
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.export import models
 from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FormatSupport

@@ -15,7 +15,7 @@ from yid_ocp.analysis import step_diagnostics
 from yid_ocp.analysis.step_symbols import EquationEntry, StepSymbols
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.hdf5_io import create_hdf5_atomically
+from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.errors import ModelError
 from yid_ocp.export.equations import export_step_functions, write_equation_sheet
 from yid_ocp.integrator.statics import EquilibriumSolver

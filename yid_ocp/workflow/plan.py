@@ -13,9 +13,8 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.hdf5_io import open_checked_hdf5
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
-from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.data.recording_hdf5 import open_checked_hdf5, write_recording
 from yid_ocp.errors import DataError
 from yid_ocp.export.signals import export_csv, joint_trajectory_message
 from yid_ocp.files import attributes_to_json

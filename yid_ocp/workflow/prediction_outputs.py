@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.hdf5_io import create_hdf5_atomically
 from yid_ocp.data.issues import MAX_ISSUE_EVIDENCE, Issue
+from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.localise import smoothed_unknown_units
 from yid_ocp.inference import whitening

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.arrays import Array, BoolArray
-from yid_ocp.data.hdf5_io import check_readable_in_fork
 from yid_ocp.data.readers.base import (
     FILE_PREVIEWERS,
     READERS,
@@ -23,6 +22,7 @@ from yid_ocp.data.readers.base import (
     convert_to_si_and_validate,
 )
 from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.data.recording_hdf5 import check_readable_in_fork
 from yid_ocp.errors import DataError
 from yid_ocp.files import file_sha256
 
