@@ -30,21 +30,16 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
     """Read and check a recording of any known format, chosen by its suffix.
 
     It is an HDF5 recording, a CSV file, a rosbag, an MCAP file, a ROS 2 bag folder, a C3D file or a LeRobot dataset.
-    The options are those of the reader in `READERS`, by name.
-
-    Raises
-    ------
-    DataError
-        The format or an option is not known, or the reader refuses the file.
+    The options are those of the reader in `READERS`, by name. `DataError` where the format or an option is not known,
+    or the reader refuses the file.
     """
     path = Path(path)
     known_as = _format_of(path)
     reader = READERS[known_as]
     parameters = inspect.signature(reader).parameters
     default = parameters["options"].default if "options" in parameters else None
-    known = [name for name in parameters if name not in ("path", "progress")]
-    if default:
-        known = [entry.name for entry in fields(default)]
+    names = [entry.name for entry in fields(default)] if default else parameters
+    known = [name for name in names if name not in ("path", "progress")]
     for name in options:
         if name not in known:
             what = f"the reader of '{known_as}' files has no option '{name}'"

@@ -9,7 +9,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from yid_ocp.data.readers.base import (
     check_unique_point_names,
     convert_to_si_and_validate,
     guess_units,
+    import_optional,
     merge_on_fastest_clock,
     parse_renamings,
     zero_order_hold_positions,
@@ -61,13 +62,12 @@ class BagMessage:
     content: Any
 
 
-@dataclass(frozen=True)
-class _BagTopic:
+class _BagTopic(NamedTuple):
     """A topic of a bag with its type and number of messages."""
 
     name: str
     kind: str
-    count: int
+    n_messages: int
 
 
 _MAX_METADATA_BYTES = 1 << 18  # of a bag's YAML, which is read slowly
@@ -76,19 +76,14 @@ _MAX_METADATA_BYTES = 1 << 18  # of a bag's YAML, which is read slowly
 class OpenBag:
     """An open ROS 1 bag, ROS 2 bag or MCAP file, with its `topics` and the `reader` of rosbags.
 
-    Raises
-    ------
-    DataError
-        If `rosbags` is not installed or the bag cannot be read.
+    `DataError` where `rosbags` is not installed or the bag cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            from rosbags.highlevel import AnyReader
-            from rosbags.typesys import Stores, get_typestore
-        except ImportError as error:
-            hint = "pip install 'yid-ocp[bags]'"
-            raise DataError("reading bags needs the package rosbags", where=str(path), hint=hint) from error
+        highlevel, typesys = (
+            import_optional(f"rosbags.{name}", "bags", "reading bags needs the package rosbags", path)
+            for name in ("highlevel", "typesys")
+        )
         self.path = path
         for file in path.iterdir() if path.is_dir() else (path,):
             if not file.is_dir():
@@ -96,11 +91,12 @@ class OpenBag:
         counted: Counter[tuple[str, str]] = Counter()
         with self.read_errors_as_data_errors():
             # older ROS 2 bags do not hold the definitions of their messages; these have not changed since
-            self.reader: Any = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+            self.reader: Any = highlevel.AnyReader([path], default_typestore=store)
             self.reader.open()
             for c in self.reader.connections:
                 counted[c.topic, c.msgtype] += c.msgcount
-        self.topics = tuple(_BagTopic(topic, kind, count) for (topic, kind), count in sorted(counted.items()))
+        self.topics = tuple(_BagTopic(*key, count) for key, count in sorted(counted.items()))
 
     @contextmanager
     def read_errors_as_data_errors(self) -> Iterator[None]:
@@ -153,8 +149,8 @@ class _Contents:
     """A bag and the messages of it that can be used, in its order."""
 
     file: OpenBag
-    states: tuple[BagMessage, ...]
-    places: tuple[BagMessage, ...]
+    states: Sequence[BagMessage]
+    places: Sequence[BagMessage]
 
 
 @dataclass(frozen=True)
@@ -164,20 +160,12 @@ class BagOptions(SelectionAndUnitOptions):
     Joints are needed where the messages of a topic do not all have the same ones; messages that lack one are skipped.
     Points are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`; all topics of points, poses and transforms
     under the last telling part of their names where absent, and none of `/tf`.
-
-    Attributes
-    ----------
-    joint_topics : sequence of str, optional
-        Topics of the joint states; all that there are when absent.
-    command_topic : str, optional
-        Topic of joint states whose positions are what the controller asked for: `position_command`, held in between.
-    pose_axes : float, optional
-        Distance from a pose's origin [m] at which NAME_x, NAME_y and NAME_z on its axes become points too, so that
-        its orientation is kept.
     """
 
-    joint_topics: Sequence[str] | None = None
+    joint_topics: Sequence[str] | None = None  # topics of the joint states; all that there are when absent
+    # topic of joint states whose positions are what the controller asked for: `position_command`, held in between
     command_topic: str | None = None
+    # distance from a pose's origin at which NAME_x, NAME_y and NAME_z on its axes become points too [m]
     pose_axes: float | None = None
     sensor: str = "unknown"  # what saw the points
     description: str = ""  # what was recorded
@@ -200,15 +188,11 @@ def read_bag(
     are the headers' stamps (the times of recording if a message has none), from the first message on. A joint channel
     that is empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.
 
-    Raises
-    ------
-    DataError
-        If `rosbags` is not installed, the bag cannot be read, holds no such topic or leaves a choice open, or as
-        `validate_recording`.
+    `DataError` where `rosbags` is not installed, the bag cannot be read, holds no such topic or leaves a choice open,
+    and as `validate_recording`.
     """
-    path = Path(path)
+    path, pose_axes = Path(path), options.pose_axes
     digest = file_sha256(path)
-    pose_axes = options.pose_axes
     if pose_axes is not None and not 0 < pose_axes < float("inf"):
         raise DataError(f"pose_axes = {pose_axes:g}", where=str(path), allowed="a distance above 0 [m]")
     bag = _contents(path, tuple(source for source in options.points or () if ":" in source), progress)
@@ -220,18 +204,18 @@ def read_bag(
     places = [message for entries in seen.values() for _, message in entries]
     seconds = relative_message_time_function([*(m for entry in groups for m in entry.messages), *places])
     joint_group, more = _on_one_clock(groups, seconds, str(path))
-    found = []
+    points = []
     for frame, entries in seen.items():
         position = _positions(_with_axes(entries, pose_axes), seconds, str(path))
         name = "points" if len(seen) == 1 else "points_" + frame.replace("/", "_")
-        found.append(PointGroup(name, *position, None, options.sensor, frame))
+        points.append(PointGroup(name, *position, None, options.sensor, frame))
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and pose_axes is None:
         more = (*more, f"orientations of {', '.join(sorted(turned))} were left out (pose_axes keeps them)")
-    left = [f"{t.name} was left out ({t.kind}, {t.count})" for t in bag.file.topics if t.name not in used]
+    left = [f"{t.name} was left out ({t.kind}, {t.n_messages})" for t in bag.file.topics if t.name not in used]
     own = options.description, path.name, path.stem, digest
-    raw = Recording(joint_group, tuple(found), *own, notes=(*notes, *more, *left))
+    raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left))
     return convert_to_si_and_validate(raw, str(path), replace(options, joints=None, points=None))
 
 
@@ -244,16 +228,13 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     path = Path(path)
     file_sha256(path)
     bag = _contents(path, None, progress)
-    names = _names_of(bag)
-    options: dict[str, Any] = {}
-    notes: list[str] = []
+    names, options, notes = _names_of(bag), dict[str, Any](), list[str]()
     sources = [_preview_source(topic, bag, names) for topic in bag.file.topics]
     states = bag.file.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE)
-    owners: dict[str, list[str]] = {}
+    owners: dict[str, set[str]] = {}
     for message in bag.states:
         for joint in message.content.name:
-            if message.source not in owners.setdefault(joint, []):
-                owners[joint].append(message.source)
+            owners.setdefault(joint, set()).add(message.source)
     shared = {topic for topics in owners.values() if len(topics) > 1 for topic in topics}
     if shared:
         options["joint_topics"] = [states[0], *(topic for topic in states[1:] if topic not in shared)]
@@ -264,8 +245,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
         options["points"] = names
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
         notes.append("poses have orientations: --pose-axes 0.1 keeps them as points 0.1 m along the axes")
-    raw = _for_guess(bag)
-    units, why = guess_units(raw) if raw is not None else ({}, ())
+    units, why = guess_units(_for_guess(bag))
     if units:
         options["units"] = units
     return FilePreview(tuple(sources), options, (*notes, *why))
@@ -273,10 +253,8 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
 
 def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Contents:
     """Decode what can be used of a bag; of trees of transforms the named frames, all of them for None."""
-    states: list[BagMessage] = []
-    places: list[BagMessage] = []
+    bag, states, places = OpenBag(path), list[BagMessage](), list[BagMessage]()
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
-    bag = OpenBag(path)
     with bag.read_errors_as_data_errors(), closing(bag.reader) as reader:
         wanted = [connection for connection in reader.connections if connection.msgtype in wanted_kinds]
         total = sum(connection.msgcount for connection in wanted)
@@ -292,7 +270,7 @@ def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _C
             plain = _plain(content, connection.msgtype)
             message = BagMessage(connection.topic, int(logged), _stamp(content), plain)
             (states if connection.msgtype == JOINT_STATE_MESSAGE_TYPE else places).append(message)
-    return _Contents(bag, tuple(states), tuple(places))
+    return _Contents(bag, states, places)
 
 
 def _stamp(content: Any) -> int:
@@ -313,41 +291,36 @@ def _plain(content: Any, kind: str) -> SimpleNamespace:
         values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
         return SimpleNamespace(frame=frame, name=names, **values)
     if kind == _POINT_STAMPED:
-        return SimpleNamespace(frame=frame, point=_triple(content.point), axes=None)
+        return SimpleNamespace(frame=frame, point=_numbers(content.point, "xyz"), axes=None)
     if kind == _POSES[2]:
         place, turn = content.transform.translation, content.transform.rotation
     else:
         pose = content.pose.pose if kind == _POSES[1] else content.pose
         place, turn = pose.position, pose.orientation
-    return SimpleNamespace(frame=frame, point=_triple(place), axes=tuple(float(getattr(turn, k)) for k in "xyzw"))
+    return SimpleNamespace(frame=frame, point=_numbers(place, "xyz"), axes=_numbers(turn, "xyzw"))
 
 
-def _triple(content: Any) -> tuple[float, float, float]:
-    x, y, z = (float(getattr(content, axis)) for axis in "xyz")
-    return x, y, z
+def _numbers(content: Any, names: str) -> tuple[float, ...]:
+    return tuple(float(getattr(content, name)) for name in names)
 
 
 # -- joints -----------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _States:
+class _States(NamedTuple):
     """Joint states of one topic: names recorded and wanted, and the messages; whether they are commands."""
 
     topic: str
     names: tuple[str, ...]
     wanted: tuple[str, ...]
-    messages: tuple[BagMessage, ...]
+    messages: Sequence[BagMessage]
     command: bool = False
 
 
 def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_States], tuple[str, ...]]:
     """Choose topics, joints and the messages that have them; with what was left out."""
-    known, topics, command = (
-        bag.file.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE),
-        options.joint_topics,
-        options.command_topic,
-    )
+    known, command = bag.file.topic_names_of_types(JOINT_STATE_MESSAGE_TYPE), options.command_topic
+    topics = options.joint_topics
     for topic in (*(topics or ()), *((command,) if command else ())):
         bag.file.check_topic_is_known(topic, known, "joint states")
     chosen = [topic for topic in (known if topics is None else topics) if topic != command]
@@ -359,19 +332,16 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
         messages = [message for message in bag.states if message.source == topic]
         sets = {tuple(sorted(message.content.name)): tuple(message.content.name) for message in messages}
         if wanted is None and len(sets) > 1:
-            raise DataError(
-                f"the messages have {len(sets)} different sets of joints",
-                where=f"{where}: {topic}",
-                allowed="; ".join(", ".join(names) for names in sets.values()),
-                hint="choose joints that come together: --joints NAME,NAME",
-            )
+            what, hint = f"the messages have {len(sets)} different sets of joints", "choose joints that come together"
+            allowed = "; ".join(", ".join(names) for names in sets.values())
+            raise DataError(what, where=f"{where}: {topic}", allowed=allowed, hint=f"{hint}: --joints NAME,NAME")
         names = next(iter(sets.values()), ()) if wanted is None else _own(wanted, sets.values())
         kept = [message for message in messages if names and set(names) <= set(message.content.name)]
         if len(kept) < len(messages) and names:
             notes.append(f"{len(messages) - len(kept)} of {len(messages)} messages of {topic} lack a joint")
         if kept:
             renamed = names if wanted is None else tuple(wanted[name] for name in names)
-            found.append(_States(topic, names, renamed, tuple(kept)))
+            found.append(_States(topic, names, renamed, kept))
     if command is not None:
         messages = [message for message in bag.states if message.source == command]
         names = tuple(name for entry in found for name in entry.names)
@@ -379,7 +349,7 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
         if not kept or not names:
             what = f"no message of '{command}' has all joints"
             raise DataError(what, where=where, allowed=", ".join(names) or "joints of another topic")
-        found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), tuple(kept), True))
+        found.append(_States(command, names, tuple(n for entry in found for n in entry.wanted), kept, True))
     return found, tuple(notes)
 
 
@@ -407,12 +377,11 @@ def _on_one_clock(
 ) -> tuple[JointGroup | None, tuple[str, ...]]:
     if not groups:
         return None, ()
-    made = [(entry.topic, _joint_group(entry, seconds, f"{where}: {entry.topic}")) for entry in groups]
-    together, notes = merge_on_fastest_clock(
-        [pair for pair, e in zip(made, groups, strict=True) if not e.command], where
-    )
-    for entry, (_, group) in zip(groups, made, strict=True):
+    made = [(e.topic, _joint_group(e, seconds, f"{where}: {e.topic}")) for e in groups if not e.command]
+    together, notes = merge_on_fastest_clock(made, where)
+    for entry in groups:
         if entry.command:
+            group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
             together = replace(together, position_command=zero_order_hold_positions(group, together.t))
     return together, notes
 
@@ -448,7 +417,7 @@ _MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 
 def _names_of(bag: _Contents) -> dict[str, str]:
     """Topics that become points by themselves, and the last part of each that says what was seen."""
-    names = {}
+    names = dict[str, str]()
     for topic in bag.file.topic_names_of_types(*_PLACES):
         parts = [part for part in topic.split("/") if part]
         telling = [part for part in parts if part.lower() not in _PLAIN_WORDS]
@@ -494,12 +463,12 @@ def _positions(
     entries: Iterable[tuple[str, BagMessage]], seconds: Callable[[BagMessage], float], where: str
 ) -> tuple[tuple[str, ...], Array, Array]:
     """Names, times and positions (N, np, 3) of some points, NaN where one was not seen."""
-    seen: dict[tuple[float, str], tuple[float, float, float]] = {}
+    seen: dict[tuple[float, str], tuple[float, ...]] = {}
     for point, message in entries:
-        key, position = (seconds(message), point), message.content.point
+        key = seconds(message), point
         if key in seen:
             raise DataError(f"point '{point}' comes twice at {key[0]:g} s", where=f"{where}: {message.source}")
-        seen[key] = position
+        seen[key] = message.content.point
     times, names = sorted({time for time, _ in seen}), sorted({point for _, point in seen})
     rows, columns = ({key: index for index, key in enumerate(keys)} for keys in (times, names))
     array = np.full((len(times), len(names), 3), np.nan)
@@ -515,7 +484,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     own = [m for m in (*bag.states, *bag.places) if m.source.partition(":")[0] == topic.name]
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
-    rate = (topic.count - 1) / span if span > 0 else float("nan")
+    rate = (topic.n_messages - 1) / span if span > 0 else float("nan")
     becomes, note = "", "not a type that is understood"
     if topic.kind == JOINT_STATE_MESSAGE_TYPE:
         joints = list(dict.fromkeys(joint for message in own for joint in message.content.name))
@@ -526,15 +495,13 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     elif topic.kind in _TREES:
         children = sorted({message.source.partition(":")[2] for message in own})
         note = f"frames {', '.join(children)}: --points {topic.name}:FRAME=POINT"
-    return FileDataSourceSummary(
-        topic.name, topic.kind, topic.count, rate, becomes, note if topic.count else "no messages"
-    )
+    return FileDataSourceSummary(*topic, rate, becomes, note if topic.n_messages else "no messages")
 
 
-def _for_guess(bag: _Contents) -> Recording | None:
+def _for_guess(bag: _Contents) -> Recording:
     """Angles and points as they stand in a bag, whatever joints they are of, to see what units they have."""
     widest = [float(np.nanmax(np.abs(m.content.position), initial=0.0)) for m in bag.states]
     joints = JointGroup(("any",), np.arange(float(len(widest))) * 1e-3, np.array(widest)[:, None]) if widest else None
     own = np.array([m.content.point for m in bag.places if ":" not in m.source], float).reshape(-1, 1, 3)
     points = (PointGroup("points", ("any",), np.arange(float(len(own))) * 1e-3, own),) if len(own) else ()
-    return Recording(joints, points) if joints is not None or points else None
+    return Recording(joints, points)

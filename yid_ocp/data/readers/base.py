@@ -6,11 +6,15 @@ import fnmatch
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
+from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from yid_ocp.arrays import Array, BoolArray
+from yid_ocp.data.issues import median_sample_period
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validate_recording
 from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.registry import Registry
@@ -33,19 +37,11 @@ class FileDataSourceSummary:
 
 @dataclass(frozen=True)
 class FilePreview:
-    """Preview of a file of another tool: summaries of its data sources, and the reader options to import it.
-
-    Attributes
-    ----------
-    reader_options : mapping of str to object
-        Named options of the reader.
-    notes : tuple of str
-        What else should be known, such as guesses of units.
-    """
+    """Preview of a file of another tool: summaries of its data sources, and the reader options to import it."""
 
     sources: tuple[FileDataSourceSummary, ...]
-    reader_options: Mapping[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    reader_options: Mapping[str, Any] = field(default_factory=dict)  # named options of the reader
+    notes: tuple[str, ...] = ()  # what else should be known, such as guesses of units
 
 
 READERS: Registry[_RecordingReader] = Registry("recording format")
@@ -75,8 +71,7 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
 
     `DataError` of what is no unit, and of two units of one quantity.
     """
-    units: dict[str, str] = {}
-    exact: dict[str, str] = {}
+    units, exact = dict[str, str](), dict[str, str]()
     for word in words:
         quantity, equals, unit = word.partition("=")
         if equals:
@@ -84,8 +79,9 @@ def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
             continue
         of = next((si for si, known in _TO_SI.items() if _spaceless(word) in map(_spaceless, known)), None)
         if of is None:
-            known = [unit for table in _TO_SI.values() for unit in table]
-            raise DataError(f"'{word}' is no unit", where="units", **unknown_name_details(word, known))
+            raise DataError(
+                f"'{word}' is no unit", where="units", **unknown_name_details(word, chain(*_TO_SI.values()))
+            )
         for quantity in (quantity for quantity, si in _QUANTITIES.items() if si == of):
             _set_unit(units, quantity, word)
     return units | exact
@@ -149,49 +145,35 @@ class SelectionAndUnitOptions:
 def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAndUnitOptions) -> Recording:
     """Convert a recording as it stands in a file to SI units, select its joints and points, and validate it.
 
-    Raises
-    ------
-    DataError
-        A joint, point, quantity or unit that is not known, a current without torque constants, as `validate_recording`.
+    `DataError` for a joint, point, quantity or unit that is not known, a current without torque constants, and as
+    `validate_recording`.
     """
-    units, points = options.units or {}, options.points
-    factors = _factors(units, where)
+    factors = _factors(options.units or {}, where)
     group = raw.joints
     if group is not None and options.joints is not None:
         group = _chosen_joints(group, parse_renamings(options.joints, "joint", where), where)
-    seen = raw.points if points is None else _chosen_points(raw.points, points, where)
     if group is not None:
         channels: dict[str, Any] = {name: factors[name] * values for name, values in group.channels.items()}
         if "effort" in channels:
             channels["effort"] = channels["effort"] * _torque_factors(group.names, options, where)
         group = replace(group, t=factors["t"] * group.t, **channels)
-    length = factors["points"]
-    seen = tuple(
-        replace(
-            entry,
-            t=factors["t"] * entry.t,
-            position=length * entry.position,
-            std=None if entry.std is None else length * entry.std,
-        )
-        for entry in seen
-    )
-    return validate_recording(replace(raw, joints=group, points=seen), where=where)
+    seen = []
+    for entry in raw.points if options.points is None else _chosen_points(raw.points, options.points, where):
+        std = None if entry.std is None else factors["points"] * entry.std
+        t, position = factors["t"] * entry.t, factors["points"] * entry.position
+        seen.append(replace(entry, t=t, position=position, std=std))
+    return validate_recording(replace(raw, joints=group, points=tuple(seen)), where=where)
 
 
 def _chosen_joints(group: JointGroup, chosen: Mapping[str, str], where: str) -> JointGroup:
-    for name in chosen:
-        if name not in group.names:
-            raise DataError(f"there is no joint '{name}'", where=where, **unknown_name_details(name, group.names))
+    _check_known(chosen, group.names, "joint", where)
     at = [group.names.index(name) for name in chosen]
     channels: dict[str, Any] = {name: values[:, at] for name, values in group.channels.items()}
     return replace(group, names=tuple(chosen.values()), **channels)
 
 
 def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], where: str) -> tuple[PointGroup, ...]:
-    known = [name for group in groups for name in group.names]
-    for name in chosen:
-        if name not in known:
-            raise DataError(f"there is no point '{name}'", where=where, **unknown_name_details(name, known))
+    _check_known(chosen, [name for group in groups for name in group.names], "point", where)
     check_unique_point_names(chosen, where)
     kept = []
     for group in groups:
@@ -202,6 +184,12 @@ def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], wher
             names = tuple(chosen[name] for name in own)
             kept.append(replace(group, names=names, position=group.position[:, at], std=std))
     return tuple(kept)
+
+
+def _check_known(chosen: Iterable[str], known: Sequence[str], noun: str, where: str) -> None:
+    for name in chosen:
+        if name not in known:
+            raise DataError(f"there is no {noun} '{name}'", where=where, **unknown_name_details(name, known))
 
 
 def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
@@ -242,6 +230,14 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
     return factors
 
 
+def import_optional(module: str, extra: str, what: str, where: Path) -> Any:
+    """A module of an optional dependency; `DataError` with what needs it where it is not installed."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise DataError(what, where=str(where), hint=f"pip install 'yid-ocp[{extra}]'") from error
+
+
 def mean_sample_rate(t: Array) -> float:
     """Mean rate of samples [Hz]; NaN for fewer than two."""
     span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
@@ -263,7 +259,7 @@ def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
         units["points"] = "mm"
         notes.append(f"points reach {farthest:.3g}: they look like millimetres")
     for group in recording.groups:
-        period = float(np.median(np.diff(group.t))) if len(group.t) > 1 else 0.0
+        period = median_sample_period(group.t)
         unit = next((unit for unit, least in (("ns", 1e4), ("us", 200.0), ("ms", 0.5)) if period > least), "")
         slow = isinstance(group, PointGroup) and unit == "ms" and period < 30  # a slow camera, in seconds
         if unit and not slow and "t" not in units:
@@ -272,29 +268,21 @@ def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
     return units, tuple(notes)
 
 
-_MAX_INTERPOLATED_PERIODS = 5.0
-"""Longest gap of a source that is interpolated, in its sample periods."""
+_MAX_INTERPOLATED_PERIODS = 5.0  # of a source, in the longest gap that is interpolated
 
 
 def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
     """Merge the joints of several named sources onto the clock of the fastest one, and say in words what was done.
 
     Values of the others are interpolated linearly between their samples. A time at which one of them has no sample
-    within `_MAX_INTERPOLATED_PERIODS` of its periods on both sides is left out, so that a gap stays a gap.
-
-    Raises
-    ------
-    DataError
-        Two sources have a joint in common, one lacks a channel that another has, or they share no time.
+    within five of its periods on both sides is left out, so that a gap stays a gap. `DataError` where two sources have
+    a joint in common, one lacks a channel that another has, or they share no time.
     """
     if len(groups) == 1:
         return groups[0][1], ()
     _check_separate(groups, where)
-    fastest = max(range(len(groups)), key=lambda i: len(groups[i][1].t) / max(np.ptp(groups[i][1].t), 1e-12))
-    name, clock = groups[fastest]
-    kept = np.ones(len(clock.t), bool)
-    for _, group in groups:
-        kept &= _can_interpolate(group.t, clock.t)
+    name, clock = max(groups, key=lambda source: len(source[1].t) / max(np.ptp(source[1].t), 1e-12))
+    kept = np.all([_can_interpolate(group.t, clock.t) for _, group in groups], axis=0)
     if not kept.any():
         listed = "; ".join(f"{name}: {group.t[0]:.6g} to {group.t[-1]:.6g} s" for name, group in groups)
         raise DataError("the joint states share no time", where=where, allowed=listed, hint="choose one of the topics")
@@ -306,8 +294,7 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
 
     channels: dict[str, Any] = {channel: joined(channel) for channel in clock.channels}
     notes = []
-    others = [entry for i, entry in enumerate(groups) if i != fastest]
-    moved = [source for source, group in others if not np.isin(t, group.t).all()]
+    moved = [source for source, group in groups if not np.isin(t, group.t).all()]
     if moved:
         notes.append(f"joint states of {', '.join(moved)} were interpolated to the times of {name}")
     if len(t) < len(clock.t):
@@ -326,7 +313,7 @@ def _can_interpolate(known: Array, t: Array) -> BoolArray:
     after = np.searchsorted(known, t)
     before = np.searchsorted(known, t, side="right") - 1
     inside = (after < len(known)) & (before >= 0)
-    period = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    period = median_sample_period(known)
     gap = known[np.minimum(after, len(known) - 1)] - known[np.maximum(before, 0)]
     return np.asarray(inside & (gap <= _MAX_INTERPOLATED_PERIODS * period + 1e-12))
 
@@ -334,12 +321,10 @@ def _can_interpolate(known: Array, t: Array) -> BoolArray:
 def _check_separate(groups: Sequence[tuple[str, JointGroup]], where: str) -> None:
     choose = "choose topics: --joint-topic TOPIC, once for each"
     owner: dict[str, str] = {}
-    for source, group in groups:
-        for joint in group.names:
-            if joint in owner:
-                what = f"the joint '{joint}' is on {owner[joint]} and on {source}"
-                raise DataError(what, where=where, allowed="every joint on one topic", hint=choose)
-            owner[joint] = source
+    for source, joint in ((source, joint) for source, group in groups for joint in group.names):
+        if owner.setdefault(joint, source) != source:
+            what = f"the joint '{joint}' is on {owner[joint]} and on {source}"
+            raise DataError(what, where=where, allowed="every joint on one topic", hint=choose)
     every = {channel for _, group in groups for channel in group.channels}
     for source, group in groups:
         lacking = sorted(every - set(group.channels))

@@ -6,13 +6,13 @@ import math
 import os
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from itertools import chain, count, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from yid_ocp.arrays import Array, BoolArray
+from yid_ocp.arrays import Array
 from yid_ocp.data.readers.base import (
     FILE_PREVIEWERS,
     READERS,
@@ -20,6 +20,7 @@ from yid_ocp.data.readers.base import (
     FilePreview,
     SelectionAndUnitOptions,
     convert_to_si_and_validate,
+    import_optional,
 )
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import check_readable_in_fork
@@ -31,8 +32,7 @@ _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")
 _UNITS = ("m", "cm", "mm")
 
 
-@dataclass(frozen=True)
-class _Markers:
+class _Markers(NamedTuple):
     """Markers of a file in its own unit: names, times, positions (N, np, 3), NaN where unseen; what else there is."""
 
     names: tuple[str, ...]
@@ -60,10 +60,7 @@ def read_c3d(
     moments, powers) and analog channels. `points` are markers to keep, each with its name; all labelled ones that were
     ever seen when absent.
 
-    Raises
-    ------
-    DataError
-        If `ezc3d` is not installed, the file cannot be read or has no markers, or as `validate_recording`.
+    `DataError` where `ezc3d` is not installed, the file cannot be read or has no markers, and as `validate_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
@@ -72,9 +69,8 @@ def read_c3d(
     group = PointGroup("points", found.names, found.t, found.position, None, sensor, frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
-    return convert_to_si_and_validate(
-        raw, str(path), SelectionAndUnitOptions(points=points, units={**own, **(units or {})})
-    )
+    options = SelectionAndUnitOptions(points=points, units={**own, **(units or {})})
+    return convert_to_si_and_validate(raw, str(path), options)
 
 
 @FILE_PREVIEWERS.register(".c3d")
@@ -84,29 +80,18 @@ def _preview_c3d(path: str | os.PathLike[str]) -> FilePreview:
     file_sha256(path)
     found = _markers(path)
     rate = 1.0 / float(found.t[1] - found.t[0]) if len(found.t) > 1 else math.nan
-    seen: BoolArray = np.asarray(np.isfinite(found.position).all(axis=2))
-    sources = [
-        FileDataSourceSummary(
-            name,
-            "marker",
-            int(seen[:, i].sum()),
-            rate,
-            f"point {name}",
-            "" if seen[:, i].all() else f"seen in {seen[:, i].mean():.0%} of the frames",
-        )
-        for i, name in enumerate(found.names)
-    ]
+    sources = []
+    for i, name in enumerate(found.names):
+        seen = np.isfinite(found.position[:, i]).all(axis=1)
+        note = "" if seen.all() else f"seen in {seen.mean():.0%} of the frames"
+        sources.append(FileDataSourceSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
     notes = [f"the file says that its unit is {found.unit}"] if found.unit else ["the file says no unit: --units mm?"]
     options = {"points": {name: name for name in found.names}}
     return FilePreview((*sources, *found.others), options, tuple(notes))
 
 
 def _markers(path: Path) -> _Markers:
-    try:
-        import ezc3d
-    except ImportError as error:
-        hint = "pip install 'yid-ocp[c3d]'"
-        raise DataError("reading C3D files needs the package ezc3d", where=str(path), hint=hint) from error
+    ezc3d = import_optional("ezc3d", "c3d", "reading C3D files needs the package ezc3d", path)
     check_readable_in_fork(path, _complaint, "C3D")
     try:
         file = ezc3d.c3d(str(path))
@@ -126,9 +111,7 @@ def _markers(path: Path) -> _Markers:
     if unit and unit not in _UNITS:
         raise DataError(f"the unit of the markers is '{unit}'", where=str(path), allowed=", ".join(_UNITS))
     position = position[:, : len(labels)]
-    unseen: BoolArray = np.asarray(
-        (residuals[:, : len(labels)] < 0) | (position == 0).all(axis=2) | ~np.isfinite(position).all(axis=2)
-    )
+    unseen = (residuals[:, : len(labels)] < 0) | (position == 0).all(axis=2) | ~np.isfinite(position).all(axis=2)
     position[unseen] = np.nan
     why = {}
     for i, label in enumerate(labels):
@@ -140,13 +123,12 @@ def _markers(path: Path) -> _Markers:
     if not kept:
         what = "no labelled marker of the C3D file was ever seen"
         raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label them and export it again")
-    counts = (~unseen).sum(axis=0)
     others = [
-        FileDataSourceSummary(labels[i] or f"marker {i + 1}", "marker", int(counts[i]), rate, "", why[i]) for i in why
+        FileDataSourceSummary(labels[i] or f"marker {i + 1}", "marker", int(np.sum(~unseen[:, i])), rate, "", reason)
+        for i, reason in why.items()
     ]
     others += [FileDataSourceSummary(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
-    names = _short([labels[i] for i in kept])
-    t = np.arange(len(position)) / rate
+    names, t = _short([labels[i] for i in kept]), np.arange(len(position)) / rate
     return _Markers(names, t, position[:, kept], unit, tuple(others))
 
 
@@ -168,13 +150,8 @@ def _unreadable(path: Path, why: str) -> DataError:
 
 def _listed(group: Mapping[str, Any], key: str) -> list[str]:
     """A list of a group of parameters with its continuations (`LABELS2` and so on), of more than 255 entries."""
-    found: list[str] = []
-    name, count = key, 1
-    while name in group:
-        found += [str(label).strip() for label in group[name]["value"]]
-        count += 1
-        name = f"{key}{count}"
-    return found
+    names = takewhile(group.__contains__, chain([key], (f"{key}{number}" for number in count(2))))
+    return [str(label).strip() for name in names for label in group[name]["value"]]
 
 
 def _short(labels: list[str]) -> tuple[str, ...]:

@@ -36,36 +36,27 @@ _PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CH
 _NUMBERED = {"q": "position", "dq": "velocity", "cmd": "position_command"}
 """What Isaac Sim's system identification calls the columns of joints 1, 2, ..., whatever the case."""
 _AXES = ("x", "y", "z")
-_MOST_BAD = 0.5
-"""Part of a table's lines that may be bad; beyond it the table is not understood at all."""
+_Meaning = tuple[str, str] | None
+"""Of a column: ("t", ""), (channel, joint), (axis, point), or None for one to leave out."""
+_MOST_BAD = 0.5  # of a table's lines; beyond it the table is not understood at all
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
 _LINE_COST = 16  # in cells: what a line takes beside them
-_LISTED = 5
-"""Numbers of bad lines that a note lists."""
+_LISTED = 5  # numbers of bad lines in a note
 
 
 @dataclass(frozen=True)
 class CsvOptions(SelectionAndUnitOptions):
     """Options of `read_csv`: what the columns of the table mean, and which of them are kept.
 
-    Attributes
-    ----------
-    columns : mapping of column to meaning, optional
-        Where its name does not say it: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a column's name stands
-        for any text, which a `*` in the meaning repeats: `*_pos` is `position:*`.
-    header : bool
-        Whether the first row has names; where not, columns are called `1`, `2` and so on.
-    skip_bad_lines : bool
-        Whether a line with another number of cells, or a cell that is no number, is left out and counted in `notes`.
-    clock : {'recorded', 'nominal'}
-        Whether the times were measured.
+    `columns` say what a column means where its name does not: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a
+    column's name stands for any text, which a `*` in the meaning repeats: `*_pos` is `position:*`.
     """
 
     columns: Mapping[str, str] | None = None
-    header: bool = True
-    skip_bad_lines: bool = False
+    header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
+    skip_bad_lines: bool = False  # leave out lines that are no rows of numbers, and count them in `notes`
     delimiter: str = ","  # one character between cells
-    clock: ClockKind = "recorded"
+    clock: ClockKind = "recorded"  # whether the times were measured
     sensor: str = "unknown"  # what saw the points
     frame: str = "world"  # their frame of reference
     description: str = ""  # what was recorded
@@ -84,10 +75,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     `<point>_y`, `<point>_z`. An empty cell is NaN; lines that begin with `#` are comments. Where a table has joints and
     points, a row in which all cells of one of them are empty is a time at which only the other was measured.
 
-    Raises
-    ------
-    DataError
-        If the file, a column, a cell, an option or a unit cannot be understood, or as `validate_recording`.
+    `DataError` where the file, a column, a cell, an option or a unit cannot be understood, and as `validate_recording`.
     """
     path = Path(path)
     digest = file_sha256(path)
@@ -111,14 +99,11 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     if joint_names and point_names:
         joint_rows = np.flatnonzero(~np.isnan(np.hstack(list(channels.values()))).all(axis=1))
         point_rows = np.flatnonzero(~np.isnan(position).all(axis=(1, 2)))
-    group, seen = None, []
-    if joint_names:
-        own: dict[str, Any] = {name: values[joint_rows] for name, values in channels.items()}
-        group = JointGroup(joint_names, t[joint_rows], clock=options.clock, **own)
-    if point_names:
-        said = options.sensor, options.frame, None, options.clock
-        seen = [PointGroup("points", point_names, t[point_rows], position[point_rows], None, *said)]
-    return Recording(group, tuple(seen))
+    own: dict[str, Any] = {name: values[joint_rows] for name, values in channels.items()}
+    group = JointGroup(joint_names, t[joint_rows], clock=options.clock, **own) if joint_names else None
+    said = options.sensor, options.frame, None, options.clock
+    points = PointGroup("points", point_names, t[point_rows], position[point_rows], None, *said)
+    return Recording(group, (points,) if point_names else ())
 
 
 @FILE_PREVIEWERS.register(".csv")
@@ -126,17 +111,15 @@ def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
     """What a table holds: columns, what their names say, and units that its values look like."""
     path = Path(path)
     file_sha256(path)
-    options: dict[str, Any] = {}
-    first = next(_rows(path, ","), (1, []))[1]
-    if len(first) == 1:
-        mark = next((mark for mark in ";\t " if mark in first[0].strip()), ",")
-        if mark != ",":
-            options["delimiter"] = mark
-    lines = _rows(path, options.get("delimiter", ","))
+    options, first = dict[str, Any](), next(_rows(path, ","), (1, []))[1]
+    delimiter = next((mark for mark in ";\t " if mark in first[0].strip()), ",") if len(first) == 1 else ","
+    if delimiter != ",":
+        options["delimiter"] = delimiter
+    lines = _rows(path, delimiter)
     names = [cell.strip() for cell in next(lines, (1, []))[1]]
     head = next(lines, None)
     if len(names) < 2 or head is None:  # as reading it would say
-        _read_table(path, CsvOptions(delimiter=options.get("delimiter", ",")))
+        _read_table(path, CsvOptions(delimiter=delimiter))
     n_lines, numbers, blank = 0, array("d"), bytearray()
     first_lines = [head] if head else []
     if all(_is_number(cell) for cell in names):
@@ -167,17 +150,11 @@ def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
         options["columns"] = unknown
     known = [(m, i) for i, m in enumerate(meanings) if m and numeric[i]]
     t = table[:, next((i for m, i in known if m == ("t", "")), 0)]
-    sources = tuple(
-        FileDataSourceSummary(
-            name,
-            "numbers" if ok else "text",
-            int(np.isfinite(column).sum()),
-            mean_sample_rate(t) if ok and len(t) > 1 else math.nan,
-            ":".join(part for part in (meaning or ()) if part),
-            "" if meaning else "its name does not say what it is",
-        )
-        for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True)
-    )
+    sources = []
+    for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
+        kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
+        becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "its name does not say what it is"
+        sources.append(FileDataSourceSummary(name, kind, count, mean_sample_rate(t) if ok else math.nan, becomes, note))
     notes = [f"{bad} of {n_lines} lines are no rows of numbers"] if bad else []
     clean = table[np.isfinite(t)]
     try:
@@ -186,7 +163,7 @@ def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
         units, why = {}, ()
     if units:
         options["units"] = units
-    return FilePreview(sources, options, (*notes, *why))
+    return FilePreview(tuple(sources), options, (*notes, *why))
 
 
 def _proposed(name: str, numeric: bool) -> str:
@@ -236,24 +213,18 @@ def _read_table(path: Path, options: CsvOptions) -> tuple[list[tuple[str, str]],
     number, first = next(lines, (1, []))
     names = [cell.strip() for cell in first]
     _check_header(names, path, options)
-    numbers = array("d")
-    bad: list[int] = []
+    numbers, bad = array("d"), list[int]()
     if not options.header:
         names = [str(i + 1) for i in range(len(first))]
+        lines = chain([(number, first)], lines)
     meanings = _meanings(names, options.columns or {}, f"{path}, line {number}")
-
-    def read(line: int, cells: Sequence[str]) -> None:
+    for line, cells in lines:
         try:
-            numbers.extend(_numbers(cells, names, meanings, path, line))
+            numbers.extend(_numbers(cells, names, meanings, f"{path}, line {line}"))
         except DataError:
             if not options.skip_bad_lines:
                 raise
             bad.append(line)
-
-    if not options.header:
-        read(number, first)
-    for line, cells in lines:
-        read(line, cells)
     table = np.array(numbers).reshape(-1, sum(meaning is not None for meaning in meanings))
     if not len(table):
         allowed, hint = "one header row, then one row per time", "see whether the export was cut off"
@@ -298,11 +269,8 @@ def _number(cell: str) -> float:
         return math.nan
 
 
-def _numbers(
-    cells: Sequence[str], header: Sequence[str], meanings: Sequence[tuple[str, str] | None], path: Path, line: int
-) -> list[float]:
+def _numbers(cells: Sequence[str], header: Sequence[str], meanings: Sequence[_Meaning], where: str) -> list[float]:
     if len(cells) != len(header):
-        where = f"{path}, line {line}"
         raise DataError(f"the row has {len(cells)} cells", where=where, allowed=f"{len(header)} cells, as the header")
     numbers = []
     for cell, name, meaning in zip(cells, header, meanings, strict=True):
@@ -310,14 +278,12 @@ def _numbers(
             try:
                 numbers.append(float(cell) if cell.strip() else math.nan)
             except ValueError as error:
-                where = f"{path}, line {line}"
                 allowed = "a number with a decimal point, or nothing where there was no measurement"
                 raise DataError(f"column '{name}' holds '{cell}'", where=where, allowed=allowed) from error
     return numbers
 
 
-def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> list[tuple[str, str] | None]:
-    """Say for each column: ("t", ""), (channel, joint), (axis, point), or None for one to leave out."""
+def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> list[_Meaning]:
     given: dict[str, str] = {}
     for key, meaning in sorted(columns.items(), key=lambda item: "*" not in item[0]):  # what is exact overrides
         pattern = re.escape(key).replace(r"\*", "(.*)")
@@ -327,7 +293,7 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
             raise DataError(what, where=where, **unknown_name_details(key, header))
         for name, match in found.items():
             given[name] = meaning.replace("*", match.group(1)) if "*" in key else meaning
-    meanings: dict[str, tuple[str, str] | None] = {}
+    meanings: dict[str, _Meaning] = {}
     meant: dict[tuple[str, str], str] = {}
     for name in header:
         own = _given_meaning(name, given[name], where) if name in given else _conventional_meaning(name)
@@ -346,7 +312,7 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
     return list(meanings.values())
 
 
-def _conventional_meaning(column: str) -> tuple[str, str] | None:
+def _conventional_meaning(column: str) -> _Meaning:
     if column.lower() in ("t", "time"):
         return "t", ""
     numbered = re.fullmatch(r"([a-z]+)([1-9]\d*)", column.lower())
@@ -359,7 +325,7 @@ def _conventional_meaning(column: str) -> tuple[str, str] | None:
     return (axis, point) if point and axis in _AXES else None
 
 
-def _given_meaning(column: str, given: str, where: str) -> tuple[str, str] | None:
+def _given_meaning(column: str, given: str, where: str) -> _Meaning:
     if given == SKIPPED_COLUMN_MEANING:
         return None
     if given == "t":
@@ -367,11 +333,8 @@ def _given_meaning(column: str, given: str, where: str) -> tuple[str, str] | Non
     kind, _, name = given.partition(":")
     known = (*JOINT_CHANNEL_UNITS, *_AXES)
     if not name or kind not in known:
-        what, allowed = (
-            f"column '{column}' is given the meaning '{given}'",
-            f"t, {SKIPPED_COLUMN_MEANING}, or KIND:NAME with a ",
-        )
-        allowed += f"joint's or a point's name and one of {', '.join(known)}"
+        what, choice = f"column '{column}' is given the meaning '{given}'", f"one of {', '.join(known)}"
+        allowed = f"t, {SKIPPED_COLUMN_MEANING}, or KIND:NAME with a joint's or a point's name and {choice}"
         hint = nearest_name_hint(kind, known) if kind not in known else f"{kind}:NAME"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name

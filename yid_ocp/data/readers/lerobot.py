@@ -6,9 +6,8 @@ import os
 import re
 import string
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, Field, ValidationError
 
@@ -21,6 +20,7 @@ from yid_ocp.data.readers.base import (
     SelectionAndUnitOptions,
     convert_to_si_and_validate,
     guess_units,
+    import_optional,
 )
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError, unknown_name_details
@@ -55,8 +55,7 @@ class _Info(BaseModel):
     robot_type: str | None = None
 
 
-@dataclass(frozen=True)
-class _Dataset:
+class _Dataset(NamedTuple):
     """A dataset's folder and what its `meta/info.json` says."""
 
     folder: Path
@@ -82,25 +81,17 @@ def read_lerobot_episode(
     are those of `SelectionAndUnitOptions`: a gripper that is not in the model is left out with `joints`; many of these
     robots record degrees.
 
-    Raises
-    ------
-    DataError
-        If `pyarrow` is not installed, the dataset is not understood or has no such episode, or as `validate_recording`.
+    `DataError` where `pyarrow` is not installed, the dataset is not understood or has no such episode, and as
+    `validate_recording`.
     """
     dataset = _dataset(Path(path))
     table, file = _episode(dataset, episode)
     names, channels, left = _channels(dataset, table)
-    t = _times(dataset, table)
-    raw = Recording(
-        JointGroup(names, t - t[0], clock="nominal", **channels),
-        (),
-        description,
-        f"{dataset.folder.name}, episode {episode}",
-        f"{dataset.folder.name}_{episode:06d}",
-        file_sha256(file),
-        notes=tuple(f"{name} was left out ({why})" for name, why in left),
-    )
-    where = f"{dataset.folder}, episode {episode}"
+    t, source = _times(dataset, table), f"{dataset.folder.name}, episode {episode}"
+    group = JointGroup(names, t - t[0], clock="nominal", **channels)
+    own = source, f"{dataset.folder.name}_{episode:06d}", file_sha256(file)
+    notes = tuple(f"{name} was left out ({why})" for name, why in left.items())
+    raw, where = Recording(group, (), description, *own, notes=notes), f"{dataset.folder}, episode {episode}"
     return convert_to_si_and_validate(raw, where, SelectionAndUnitOptions(joints, None, units, torque_constants, gears))
 
 
@@ -111,25 +102,18 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> FilePreview:
     table, _ = _episode(dataset, 0)
     names, channels, left = _channels(dataset, table)
     group = JointGroup(names, _times(dataset, table), clock="nominal", **channels)
-    why, count = dict(left), len(group.t)
-    sources = tuple(
-        FileDataSourceSummary(
-            name,
-            feature.dtype,
-            count,
-            dataset.info.fps,
-            "" if name in why else ("position_command" if name == _ACTION else f"joints {', '.join(names)}"),
-            why.get(name, ""),
-        )
-        for name, feature in dataset.info.features.items()
-    )
+    sources = []
+    for name, feature in dataset.info.features.items():
+        becomes = "position_command" if name == _ACTION else f"joints {', '.join(names)}"
+        own = (becomes, "") if name not in left else ("", left[name])
+        sources.append(FileDataSourceSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
     units, guesses = guess_units(Recording(group))
     options: dict[str, Any] = {"episode": 0, "joints": list(names)}
     if units:
         options["units"] = units | ({"position_command": units["position"]} if "position" in units else {})
     said = f"{dataset.info.total_episodes} episodes at {dataset.info.fps:g} Hz, {dataset.info.codebase_version}"
     robot = dataset.info.robot_type
-    return FilePreview(sources, options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
+    return FilePreview(tuple(sources), options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
 
 
 def _dataset(folder: Path) -> _Dataset:
@@ -151,11 +135,10 @@ def _dataset(folder: Path) -> _Dataset:
 
 def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path]:
     """Columns of one episode, shape (frames, numbers of a frame), and the file in which it stands."""
-    try:
-        from pyarrow import ArrowException, parquet
-    except ImportError as error:
-        hint = "pip install 'yid-ocp[lerobot]'"
-        raise DataError("reading LeRobot datasets needs pyarrow", where=str(dataset.folder), hint=hint) from error
+    arrow, parquet = (
+        import_optional(name, "lerobot", "reading LeRobot datasets needs pyarrow", dataset.folder)
+        for name in ("pyarrow", "pyarrow.parquet")
+    )
     where = f"{dataset.folder}, episode {episode}"
     last = dataset.info.total_episodes - 1
     allowed = f"0 to {last}" if last >= 0 else "an episode that was recorded"
@@ -171,7 +154,7 @@ def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path
             _check_types(held.schema_arrow, columns, str(file))
             table = parquet.read_table(file, columns=columns, filters=[("episode_index", "=", episode)])
             found = {name: _matrix(table[name].combine_chunks(), name, dataset.folder) for name in columns}
-        except (ArrowException, OSError, KeyError, ValueError) as error:
+        except (arrow.ArrowException, OSError, KeyError, ValueError) as error:
             what = f"the table of the episode cannot be read ({type(error).__name__}: {error})"
             raise DataError(what, where=str(file), allowed=f"a parquet file with {', '.join(columns)}") from error
         if len(found["frame_index"]):
@@ -221,9 +204,7 @@ def _times(dataset: _Dataset, table: Mapping[str, Array]) -> Array:
     return table["frame_index"][:, 0] / dataset.info.fps
 
 
-def _channels(
-    dataset: _Dataset, table: Mapping[str, Array]
-) -> tuple[tuple[str, ...], dict[str, Any], list[tuple[str, str]]]:
+def _channels(dataset: _Dataset, table: Mapping[str, Array]) -> tuple[tuple[str, ...], dict[str, Any], dict[str, str]]:
     """Joints, their channels, and the features that are left out, with the reason."""
     state = table[_STATE]
     entries = [_entry(name) for name in _names(dataset, _STATE, state.shape[1])]
@@ -235,20 +216,20 @@ def _channels(
             what = f"{_STATE} has the {channel} of {len(at)} of {len(joints)} joints"
             raise DataError(what, where=str(dataset.folder), allowed="every channel for all joints")
         channels[channel] = state[:, at]
-    left = []
+    left = {}
     for name in dataset.info.features:
         if name in (_STATE, "timestamp", "frame_index", "episode_index", "index", "task_index"):
             continue
         target = "position_command" if name == _ACTION else _CHANNELS.get(name)
         if target is None:
-            left.append((name, f"a {dataset.info.features[name].dtype or 'feature'} feature that is not understood"))
+            left[name] = f"a {dataset.info.features[name].dtype or 'feature'} feature that is not understood"
             continue
         values = table[name]
         named = [_entry(entry)[0] for entry in _names(dataset, name, values.shape[1])]
         if set(joints) <= set(named):
             channels.setdefault(target, values[:, [named.index(joint) for joint in joints]])
         else:
-            left.append((name, f"its {len(named)} entries are not those of {_STATE}"))
+            left[name] = f"its {len(named)} entries are not those of {_STATE}"
     return joints, channels, left
 
 
