@@ -30,7 +30,7 @@ from yid_ocp.planning.joint_paths import PlanOptions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
 from yid_ocp.solvers import SOLVERS, GaussNewton, MultipleShooting, SingleShooting, SteepestDescent
 from yid_ocp.solvers.base import Solver
-from yid_ocp.vision.options import TrackOptions
+from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.surface_meshes import ExtraMesh
 
 _Names = tuple[str, ...]

@@ -21,14 +21,10 @@ from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.sensors import CHANNEL_KINDS
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_DIFFERENCE_ORDER
 
-_MAX_REPEATED_FRACTION = 0.1
-"""Largest fraction of a channel's samples that may repeat the previous one."""
-_MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2
-"""Largest changes next to a rest, in smallest and in median changes of a channel."""
-_MIN_NOISE_FRACTION = 1e-2
-"""Noise below this fraction of the stated noise means that the channel was computed, not measured."""
-_MAX_SAMPLE_PERIOD = 0.02
-"""Longest sample period at which arm motion counts as slow [s]."""
+_MAX_REPEATED_FRACTION = 0.1  # of a channel's samples, which may repeat the previous one
+_MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2  # next to a rest, in smallest and median changes of a channel
+_MIN_NOISE_FRACTION = 1e-2  # of the stated noise, below which a channel was computed, not measured
+_MAX_SAMPLE_PERIOD = 0.02  # at which arm motion counts as slow [s]
 
 
 def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Array, Array]]:
@@ -36,14 +32,12 @@ def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Ar
     joints = recording.joints
     if joints is not None:
         for quantity, values in joints.channels.items():
-            for j, name in enumerate(joints.names):
-                if quantity in wanted:
-                    yield "joints", f"{quantity}.{name}", joints.t, values[:, j]
-    for group in recording.points:
+            for j, name in enumerate(joints.names if quantity in wanted else ()):
+                yield "joints", f"{quantity}.{name}", joints.t, values[:, j]
+    for group in recording.points if "points" in wanted else ():
         for i, name in enumerate(group.names):
             seen = np.isfinite(group.position[:, i]).all(axis=1)
-            if "points" in wanted:
-                yield group.name, name, group.t[seen], group.position[seen, i]
+            yield group.name, name, group.t[seen], group.position[seen, i]
 
 
 def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
@@ -82,8 +76,7 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
         if evidence >= 1:
             start, stop = float(t[begin]), float(t[end])
             what = f"{channel} repeats one value for {stop - start:.3g} s"
-            if turned > unseen:
-                what += f", while its velocity turns it by {turned:.2g} rad"
+            what += f", while its velocity turns it by {turned:.2g} rad" if turned > unseen else ""
             advice = "leave that stretch or that channel out, and look at the sensor"
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
 
@@ -113,9 +106,9 @@ def _repeated_stretches(same: BoolArray) -> list[tuple[int, int]]:
 
 def white_noise_std(t: Array, values: Array) -> float:
     """Robust standard deviation of a channel's white noise; zero for long rests or an uneven clock."""
-    even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
     if len(t) < NOISE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
+    even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
     together = np.lib.stride_tricks.sliding_window_view(even, NOISE_DIFFERENCE_ORDER).all(axis=1)
     if together.sum() < MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
@@ -144,11 +137,8 @@ def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, chann
         said = choice(f"joints.{quantity}").std
         if isinstance(said, Mapping):
             return float(said.get(name, 0.0))
-        given = (
-            said if said is not None else getattr(joints, CHANNEL_KINDS[f"joints.{quantity}"].std_attribute_names[0])
-        )
-        if given is None:
-            return 0.0
+        recorded = getattr(joints, CHANNEL_KINDS[f"joints.{quantity}"].std_attribute_names[0])
+        given = said if said is not None else recorded if recorded is not None else 0.0
         return float(np.broadcast_to(given, (len(joints.names),))[joints.names.index(name)])
     said = choice(group).std
     if isinstance(said, (int, float)):
@@ -170,9 +160,8 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
         step = max(quantization_step(column) for column in columns)
         size, wide = step / math.sqrt(12), float(np.ptp(values))
         # an angle that hardly moves has few levels by nature
-        few = step > wide / 16 and wide > (
-            5 * QUALITY_LIMITS.min_joint_motion if channel.startswith("position") else 0.0
-        )
+        least = 5 * QUALITY_LIMITS.min_joint_motion if channel.startswith("position") else 0.0
+        few = step > wide / 16 and wide > least
         setting = f"sensors.{'joints.' + channel.partition('.')[0] if group == 'joints' else group}.std"
         if step > 0 and (size > QUALITY_LIMITS.max_noise_ratio * stated > 0 or (few and stated == 0)):
             what = f"{channel} moves in steps of {step:.3g}, which is noise of {size:.2g}"
@@ -197,8 +186,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
 
     What settings state may stand for what a model misses, and only a fit can say whether it is too much. Noise need not
     be white: the largest of what all samples say, every other one, and so on up to `_MAX_SAMPLE_PERIOD` counts, and so
-    do steps.
-    What has no noise at all was computed, as commands are.
+    do steps. What has no noise at all was computed, as commands are.
     """
     found: dict[str, list[tuple[str, float, float]]] = {}
     commanded = recording.joints is not None and recording.joints.effort_kind_or_default == "command"
@@ -206,14 +194,9 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
         sensor = f"joints.{channel.partition('.')[0]}" if group == "joints" else group
         said, step = choice(sensor), median_sample_period(t)
         stated = _stated(recording, choice, group, channel)
-        if (
-            stated <= 0
-            or said.std is not None
-            or said.use is False
-            or (commanded and sensor == JOINT_EFFORT_GROUP_NAME)
-        ):
+        if stated <= 0 or said.std is not None or said.use is False:
             continue
-        if len(t) < 100 or not 0 < step <= _MAX_SAMPLE_PERIOD:
+        if (commanded and sensor == JOINT_EFFORT_GROUP_NAME) or len(t) < 100 or not 0 < step <= _MAX_SAMPLE_PERIOD:
             continue
         columns = values.reshape(len(t), -1).T
         if np.mean(np.diff(columns, axis=1) == 0) > _MAX_REPEATED_FRACTION:
@@ -224,11 +207,8 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
         found.setdefault(sensor, []).append((channel, stated, seen))
     for sensor, entries in found.items():
         seen_of = {name: max(s for _, also, s in entries if also == stated) for name, stated, _ in entries}
-        low = {
-            name
-            for name, stated, _ in entries
-            if _MIN_NOISE_FRACTION * stated < QUALITY_LIMITS.max_overstatement_ratio * seen_of[name] < stated
-        }
+        most = {name: QUALITY_LIMITS.max_overstatement_ratio * seen for name, seen in seen_of.items()}
+        low = {name for name, stated, _ in entries if _MIN_NOISE_FRACTION * stated < most[name] < stated}
         if not low:
             continue
         channel, stated = max(((name, s) for name, s, _ in entries if name in low), key=lambda e: e[1] / seen_of[e[0]])
@@ -238,7 +218,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
             line = f"{max(own.values()):.2g}"
         what = f"{channel} has noise of {seen_of[channel]:.2g} or less; {stated:.2g} is stated"
         what += f", and so for {len(low)} of {len(entries)} channels" if len(low) > 1 else ""
-        ratio = stated / (QUALITY_LIMITS.max_overstatement_ratio * seen_of[channel])
+        ratio = stated / most[channel]
         advice = "state the noise that is there: as stated every ± is too wide, and a small gap is not seen"
         setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""
         group = sensor.partition(".")[0]
@@ -259,22 +239,15 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
             near = (levels > levels[-1] - 0.05 * np.ptp(levels)) & (levels < levels[-1])
             at = sign * values == levels[-1]
             # a value that many samples share while none of its neighbours has a fifth as many, held again and again
-            held = int(np.sum(np.diff(np.flatnonzero(at)) == 1))
-            apart = int(np.sum(np.diff(np.flatnonzero(at)) > 1)) + 1
-            alone = at.sum() >= QUALITY_LIMITS.min_clipped_samples and at.sum() > 5 * np.max(counts[near], initial=0)
-            if (
-                alone
-                and len(levels) > MIN_DIFFERENCES_FOR_NOISE_STD
-                and held >= QUALITY_LIMITS.min_clipped_samples / 2
-                and apart >= 2
-            ):
+            steps, least = np.diff(np.flatnonzero(at)), QUALITY_LIMITS.min_clipped_samples
+            alone = at.sum() >= least and at.sum() > 5 * np.max(counts[near], initial=0)
+            again = np.sum(steps == 1) >= least / 2 and np.any(steps > 1)
+            if alone and again and len(levels) > MIN_DIFFERENCES_FOR_NOISE_STD:
                 begin, end = map(float, t[np.flatnonzero(at)[[0, -1]]])
                 what = f"{channel} is exactly {sign * levels[-1]:.4g} N m in {at.sum()} samples and never beyond"
-                advice = (
-                    "leave what is cut off out, or record within the sensor's range; where it is what a controller "
-                    "asked for, say sensors.joints.effort.kind: command"
-                )
-                ratio = at.sum() / QUALITY_LIMITS.min_clipped_samples
+                advice = "leave what is cut off out, or record within the sensor's range; where it is what a "
+                advice += "controller asked for, say sensors.joints.effort.kind: command"
+                ratio = at.sum() / least
                 yield Issue("saturated", what, "not_trusted", ratio, advice, "", group, channel, begin, end)
 
 
@@ -283,17 +256,8 @@ def median_point_pair_distances(
 ) -> dict[tuple[str, str], float]:
     """Distance between the points of every pair: mean over a recording's frames, median over recordings [m].
 
-    Parameters
-    ----------
-    edges : sequence of (str, str)
-        Names of the two points of each.
-    frames : int, optional
-        Use only that many frames from the start of each.
-
-    Raises
-    ------
-    DataError
-        No recording, or an edge that none of them ever shows.
+    Only so many `frames` from the start of each count, where that is given. `DataError` where there is no recording, or
+    an edge that none of them ever shows.
     """
     result: dict[tuple[str, str], float] = {}
     for edge in edges:

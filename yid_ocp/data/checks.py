@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import replace
+from itertools import chain, combinations, pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,68 +32,47 @@ from yid_ocp.data.issues import (
     SensorOptionsLookup,
     median_sample_period,
 )
-from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.display import count_with_noun
 
-_MAX_SAMPLE_GAP = 0.1
-"""Longest time between samples that is interpolated; arm motion has a bandwidth of 5 Hz [s]."""
-_MAX_MISSING_PERIODS = 5
-"""Number of sample periods that may always be missing."""
-_MIN_PART_DURATION = 0.5
-"""Shortest part of a recording that is kept [s]."""
-_MAX_ROTATION_AT_REST = 0.01
-"""Largest joint rotation in the first 0.2 s of a part that starts at rest [rad]."""
-_MAX_CLOCK_JUMP_PERIODS = 5
-"""A gap that the joints cross in fewer periods at their speed is a jump of the clock."""
-_MIN_JUMP_ROTATION = 0.05
-"""Smallest rotation at joint speed over a gap that allows a clock jump to be detected [rad]."""
-
+_MAX_SAMPLE_GAP = 0.1  # between samples that is interpolated; arm motion has a bandwidth of 5 Hz [s]
+_MAX_MISSING_PERIODS = 5  # sample periods that may always be missing
+_MIN_PART_DURATION = 0.5  # of a part of a recording that is kept [s]
+_MAX_ROTATION_AT_REST = 0.01  # of any joint in the first 0.2 s of a part that starts at rest [rad]
+_MAX_CLOCK_JUMP_PERIODS = 5  # a gap that the joints cross in fewer at their speed is a jump of the clock
+_MIN_JUMP_ROTATION = 0.05  # at joint speed over a gap, for a clock jump to be detected [rad]
 _INTERVAL_GRID = math.sqrt(2.0) * 1e-6  # at which intervals are compared; no usual one lies on its edges [s]
 _HASH_BASE = np.uint64(0x9E3779B97F4A7C15)
 
 
-@dataclass(frozen=True)
-class _RecordingParts:
+class _RecordingParts(NamedTuple):
     """Parts of a recording between its gaps, and one issue for each gap."""
 
     recordings: tuple[Recording, ...]
-    issues: tuple[Issue, ...]
+    issues: tuple[Issue, ...] = ()
 
 
 def split_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
-    """Split a recording at gaps in the signals that drive the model.
+    """Split a recording at gaps in the joints, or else in the `driving` points that clamps follow.
 
-    Parameters
-    ----------
-    driving : sequence of str
-        Points that drive it besides the joints: those that clamps follow.
-    anywhere : bool
-        Whether a rollout may start in motion; else later parts are kept only where they start at rest.
-
-    Returns
-    -------
-    Parts
-        The recording itself where there is no gap.
+    Where a rollout may not start `anywhere`, in motion too, later parts are kept only where they start at rest.
     """
     t = _times(recording, driving)
     steps = np.diff(t)
-    if len(steps) < 2:
-        return _RecordingParts((recording,), ())
-    allowed = max(_MAX_SAMPLE_GAP, _MAX_MISSING_PERIODS * float(np.median(steps)))
+    allowed = max(_MAX_SAMPLE_GAP, _MAX_MISSING_PERIODS * median_sample_period(t))
     gaps = np.flatnonzero(steps > allowed)
-    if not len(gaps):
-        return _RecordingParts((recording,), ())
+    if len(steps) < 2 or not len(gaps):
+        return _RecordingParts((recording,))
     edges = [(0, gaps[0]), *((a + 1, b) for a, b in pairwise(gaps)), (gaps[-1] + 1, len(t) - 1)]
     kept = []
     for begin, end in edges:
         part = None if t[end] - t[begin] < _MIN_PART_DURATION else recording.time_slice(float(t[begin]), float(t[end]))
-        if part is not None and (begin == 0 or anywhere or _rests(part)):
+        if part is not None and (begin == 0 or anywhere or _rests(part.joints)):
             kept.append(part)
     left = sum(part.duration for part in kept)
     parts = [f"_part{i + 1}" for i in range(len(kept))] if len(kept) > 1 else [""]
     named = tuple(replace(one, name=f"{recording.name}{part}") for one, part in zip(kept, parts, strict=False))
-    said = (
-        f"{len(kept)} part{'' if len(kept) == 1 else 's'} of it, {left:.3g} s, {'is' if len(kept) == 1 else 'are'} used"
-    )
+    said = f"{count_with_noun(len(kept), 'part')} of it, {left:.3g} s, {'is' if len(kept) == 1 else 'are'} used"
     if not anywhere and len(kept) < len(edges):
         said += "; a part counts only where it starts at rest"
     return _RecordingParts(named, tuple(_doubt(recording, t, int(gap), allowed, said) for gap in gaps))
@@ -109,12 +89,10 @@ def _times(recording: Recording, driving: Sequence[str]) -> Array:
     return recording.points[0].t
 
 
-def _rests(part: Recording) -> bool:
-    joints = part.joints
+def _rests(joints: JointGroup | None) -> bool:
     if joints is None:
         return False
-    first = joints.t <= joints.t[0] + 0.2
-    return float(np.max(np.ptp(joints.position[first], axis=0))) < _MAX_ROTATION_AT_REST
+    return bool(np.max(np.ptp(joints.position[joints.t <= joints.t[0] + 0.2], axis=0)) < _MAX_ROTATION_AT_REST)
 
 
 def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) -> Issue:
@@ -126,10 +104,8 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
         speed = 0.5 * (np.abs(before) + np.abs(after)) * (np.sign(before) == np.sign(after))
         way = np.abs(joints.position[gap + 1] - joints.position[gap])
         fastest = float(np.max(speed))
-        jumped = bool(
-            fastest * length > _MIN_JUMP_ROTATION
-            and np.max(way) < _MAX_CLOCK_JUMP_PERIODS * median_sample_period(t) * fastest
-        )
+        at_once = np.max(way) < _MAX_CLOCK_JUMP_PERIODS * median_sample_period(t) * fastest
+        jumped = fastest * length > _MIN_JUMP_ROTATION and bool(at_once)
     what = f"nothing was recorded of what drives the model for {length:.3g} s"
     if jumped:
         what = f"the clock jumps by {length - median_sample_period(t):.3g} s while the joints go on as if it had not"
@@ -140,35 +116,24 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
 
 
 def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, driving: bool = True) -> list[Issue]:
-    """Data quality issues of one recording, from all checks that need no model.
+    """Data quality issues of one recording as it was read, from all checks that need no model.
 
-    Parameters
-    ----------
-    recording : Recording
-        As it was read.
-    choice : callable
-        From a group's name to how it is used, its stated noise above all.
-    driving : bool
-        Whether joints drive the model, so that what lies between their samples matters.
+    `choice` says how a group is used, its stated noise above all; `driving`, whether joints drive the model, so that
+    what lies between their samples matters.
     """
     recording = recording.with_effort_kind(choice("joints.effort").effort_kind)
-    units = [replace(doubt, recording=recording.name) for doubt in _units_of_time(recording)]
-    if units:
-        return units  # nothing else can be said in times that are not seconds
-    return [
-        replace(doubt, recording=recording.name)
-        for found in (
-            _common_clock(recording),
-            _dropped(recording, driving),
-            _velocities(recording),
-            stuck_channel_issues(recording),
-            excess_noise_issues(recording, choice),
-            overstated_noise_issues(recording, choice),
-            saturated_effort_issues(recording),
-            _standstill(recording),
-        )
-        for doubt in found
-    ]
+    # nothing else can be said in times that are not seconds
+    found = list(_units_of_time(recording)) or chain(
+        _common_clock(recording),
+        _dropped(recording, driving),
+        _velocities(recording),
+        stuck_channel_issues(recording),
+        excess_noise_issues(recording, choice),
+        overstated_noise_issues(recording, choice),
+        saturated_effort_issues(recording),
+        _standstill(recording),
+    )
+    return [replace(doubt, recording=recording.name) for doubt in found]
 
 
 # -- clocks -----------------------------------------------------------------------------------------------------------
@@ -176,17 +141,16 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
 
 def _units_of_time(recording: Recording) -> Iterator[Issue]:
     for group in recording.all_groups:
-        step, slowest = median_sample_period(group.t), QUALITY_LIMITS.max_joint_period
-        if isinstance(group, PointGroup):
-            slowest = QUALITY_LIMITS.max_point_period
+        step, limits = median_sample_period(group.t), QUALITY_LIMITS
+        slowest = limits.max_point_period if isinstance(group, PointGroup) else limits.max_joint_period
         if step <= slowest:
             continue
-        fitting = [name for name, size in SECONDS_PER_CLOCK_UNIT.items() if 2e-4 <= step * size <= 2 * slowest]
-        rate = f"a sample every {step:.4g} s"
-        unit = fitting[0] if fitting else ""
-        guess = f": in {unit} it would be {1 / (step * SECONDS_PER_CLOCK_UNIT[unit]):.4g} Hz" if unit else ""
-        what, advice = f"{group.name}/t has {rate}{guess}", "write times in seconds"
-        advice += f" (divide by {1 / SECONDS_PER_CLOCK_UNIT[unit]:.0e})" if unit else ""
+        what, advice = f"{group.name}/t has a sample every {step:.4g} s", "write times in seconds"
+        for unit, size in SECONDS_PER_CLOCK_UNIT.items():
+            if 2e-4 <= step * size <= 2 * slowest:
+                what += f": in {unit} it would be {1 / (step * size):.4g} Hz"
+                advice += f" (divide by {1 / size:.0e})"
+                break
         yield Issue("time_unit", what, "refused", step / slowest, advice, "", group.name, "t")
 
 
@@ -258,8 +222,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     by_angle, by_velocity = _windowed_rates(joints.t, joints.position, joints.velocity)
     names = joints.names
     ratio, fit = np.full(len(names), np.nan), np.zeros(len(names))
-    for j in range(len(names)):
-        x, y = by_velocity[:, j], by_angle[:, j]
+    for j, (x, y) in enumerate(zip(by_velocity.T, by_angle.T, strict=True)):
         floor = max(0.02, 2 * white_noise_std(joints.t, joints.velocity[:, j]))
         if np.std(x) > floor and np.std(y) > 0:
             ratio[j] = np.sign(x @ y) * math.sqrt(float(y @ y) / float(x @ x))
@@ -293,21 +256,21 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
 def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: Array, ratio: Array) -> Iterator[Issue]:
     """Two angles that turn as each other's velocity says."""
     off = [j for j in range(len(names)) if math.isfinite(ratio[j]) and abs(fit[j]) < 0.5]
-    for place, i in enumerate(off):
-        for j in off[place + 1 :]:
-            across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
-            if min(across) > 0.9:
-                what = f"the angle of {names[i]} turns as the velocity of {names[j]} says, and the other way round"
-                evidence, advice = min(across) / max(abs(fit[i]), abs(fit[j]), 1e-3), "exchange the two columns"
-                channel = f"position.{names[i]}"
-                yield Issue("swapped_joints", what, "not_trusted", evidence, advice, "", "joints", channel)
+    for i, j in combinations(off, 2):
+        across = [float(np.corrcoef(by_angle[:, a], by_velocity[:, b])[0, 1]) for a, b in ((i, j), (j, i))]
+        if min(across) > 0.9:
+            what = f"the angle of {names[i]} turns as the velocity of {names[j]} says, and the other way round"
+            evidence, advice = min(across) / max(abs(fit[i]), abs(fit[j]), 1e-3), "exchange the two columns"
+            channel = f"position.{names[i]}"
+            yield Issue("swapped_joints", what, "not_trusted", evidence, advice, "", "joints", channel)
 
 
 def _standstill(recording: Recording) -> Iterator[Issue]:
     joints, moved = recording.joints, []
     if joints is not None:
-        size = float(np.max(np.ptp(_smoothed(joints.position), axis=0)))
-        moved.append(size / QUALITY_LIMITS.min_joint_motion)
+        width = 9 if len(joints.t) >= 9 else 1
+        smoothed = np.lib.stride_tricks.sliding_window_view(joints.position, width, axis=0).mean(axis=-1)
+        moved.append(float(np.max(np.ptp(smoothed, axis=0))) / QUALITY_LIMITS.min_joint_motion)
     for group in recording.points:
         seen = group.position[:, np.isfinite(group.position).any(axis=(0, 2))]
         size = float(np.max(np.nanmax(seen, axis=0) - np.nanmin(seen, axis=0), initial=0.0))
@@ -318,13 +281,6 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
         what = f"no joint turns by {QUALITY_LIMITS.min_joint_motion:g} rad and no point moves by more than its noise"
         advice = "record a motion; what a posture at rest says is all that can be found"
         yield Issue("standstill", what, "warning", 1 / max(*moved, 1e-3), advice, "")
-
-
-def _smoothed(values: Array) -> Array:
-    """Mean of nine neighbours, where there are so many."""
-    if len(values) < 9:
-        return values
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(values, 9, axis=0).mean(axis=-1))
 
 
 # -- several recordings -----------------------------------------------------------------------------------------------
@@ -343,16 +299,14 @@ def _transitions(one: JointOrPointGroup, other: JointOrPointGroup) -> tuple[IntA
         changes.append(np.hstack([rows[:-1], rows[1:], np.rint(np.diff(t) / _INTERVAL_GRID)[:, None]]))
     if changes[0].shape[1] != changes[1].shape[1]:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    _, numbers = np.unique(np.vstack(changes), axis=0, return_inverse=True)
-    numbers = numbers.ravel()
+    numbers = np.unique(np.vstack(changes), axis=0, return_inverse=True)[1].ravel()
     return numbers[: len(changes[0])], numbers[len(changes[0]) :]
 
 
 def _longest_shared_run(one: IntArray, other: IntArray) -> int:
     """Length of the longest stretch that two sequences have in common."""
-    least, most = 0, min(len(one), len(other))
+    least, most, size = 0, min(len(one), len(other)), max(len(one), len(other))
     # a stretch's hash is a difference of two sums of the powers of an odd number, modulo 2^64
-    size = max(len(one), len(other))
     powers = np.cumprod(np.full(size + 1, _HASH_BASE))
     terms = [(own.astype(np.uint64) + np.uint64(1)) * powers[: len(own)] for own in (one, other)]
     sums = [np.concatenate([np.zeros(1, np.uint64), np.cumsum(own)]) for own in terms]

@@ -100,10 +100,8 @@ class CameraIntrinsics:
         return np.asarray(measured & np.isfinite(self.pixel_rays[..., 0])) if self.has_distortion else measured
 
     def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
-        if not self.has_distortion:
-            return x, y
         square = x**2 + y**2
-        if self.model == "equidistant":
+        if self.model == "equidistant" and self.has_distortion:
             radius = np.sqrt(square)
             angle = np.arctan(radius)
             bent = angle * (1 + sum(k * angle ** (2 * n) for n, k in enumerate(self.coefficients, start=1)))
@@ -112,10 +110,8 @@ class CameraIntrinsics:
         k1, k2, p1, p2, k3, k4, k5, k6 = (*self.coefficients, *[0.0] * (8 - len(self.coefficients)))
         above = 1 + square * (k1 + square * (k2 + square * k3))
         factor = above / (1 + square * (k4 + square * (k5 + square * k6)))
-        return (
-            x * factor + 2 * p1 * x * y + p2 * (square + 2 * x**2),
-            y * factor + p1 * (square + 2 * y**2) + 2 * p2 * x * y,
-        )
+        beside_x, beside_y = p2 * (square + 2 * x**2), p1 * (square + 2 * y**2)
+        return x * factor + 2 * p1 * x * y + beside_x, y * factor + beside_y + 2 * p2 * x * y
 
 
 @lru_cache(maxsize=4)
@@ -175,14 +171,13 @@ def import_open3d() -> ModuleType:
 class FrameSequence:
     """Sequence of clouds of one camera, loaded one at a time."""
 
-    # (M,), time stamps as the camera gave them, in the order of the frames: neither sorted nor unique [s]
-    stamps: Array
+    stamps: Array  # (M,), as the camera gave them, in the order of the frames: neither sorted nor unique [s]
     frame_names: tuple[str, ...]
     camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world [m]
     # from a frame's index to its cloud in the camera's frame, shape (N, 3) [m]; `DataError` where it cannot be read
     load_cloud: Callable[[int], Array]
     intrinsics: CameraIntrinsics | None = None
-    source: str = "sequence"  # Where the frames come from, for messages
+    source: str = "sequence"  # where the frames come from, for messages
     # from a frame's index to the red, green and blue of each of its points, shape (N, 3), None where it has none
     load_colours: Callable[[int], ColourArray | None] | None = None
 
@@ -206,12 +201,11 @@ class FrameSequence:
 
 def look_at_pose(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
     """Pose of a camera (x right, y down, z ahead) at `eye` that looks at `target`, shape (4, 4) [m]."""
-    position = np.asarray(eye, float)
-    ahead = np.asarray(target, float) - position
-    ahead = ahead / np.linalg.norm(ahead)
+    ahead = np.asarray(target, float) - np.asarray(eye, float)
+    ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, np.asarray(up, float))
-    right = right / np.linalg.norm(right)
-    return homogeneous_transform(np.column_stack([right, np.cross(ahead, right), ahead]), position)
+    right /= np.linalg.norm(right)
+    return homogeneous_transform(np.column_stack([right, np.cross(ahead, right), ahead]), eye)
 
 
 def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
@@ -259,14 +253,13 @@ class OcclusionMap:
         """
         seen, depth = _picture(places, self.camera_pose)
         asked, wide = seen.T, radius / np.maximum(depth, _LEAST_DEPTH)
-        hidden = depth < _LEAST_DEPTH
         if self.intrinsics is not None:
-            camera = self.intrinsics
-            u, v = camera.fx * asked[:, 0] + camera.cx, camera.fy * asked[:, 1] + camera.cy
-            hidden |= (u < 0) | (u > camera.width - 1) | (v < 0) | (v > camera.height - 1)
+            lens, room = self.intrinsics, 0 * wide[:, None]
+            last = np.array([lens.width - 1, lens.height - 1])
+            low, high = ((edge - [lens.cx, lens.cy]) / [lens.fx, lens.fy] for edge in (0 * last, last))
         else:
-            low, high = self._borders
-            hidden |= ((asked < low + wide[:, None]) | (asked > high - wide[:, None])).any(axis=1)
+            (low, high), room = self._borders, wide[:, None]
+        hidden = (depth < _LEAST_DEPTH) | ((asked < low + room) | (asked > high - room)).any(axis=1)
         if hidden.all():
             return hidden
         tree, distance = self._about(asked[~hidden], wide[~hidden])
@@ -304,9 +297,9 @@ class OcclusionMap:
 
     def _about(self, asked: Array, wide: Array) -> tuple[cKDTree, Array]:
         """Points of the picture round about the places: where in the picture, and how deep."""
-        nearest = float(self._all[1].min()) if len(self._all[1]) else np.inf
         # a shadow of the nearest point falls so far beside its place in the picture
-        reach, narrow = max(float(wide.max()), _BASELINE / nearest), float(wide.min())
+        shadow, narrow = _BASELINE / float(self._all[1].min(initial=np.inf)), float(wide.min())
+        reach = max(float(wide.max()), shadow)
         low, high = asked.min(0) - reach, asked.max(0) + reach
         for lower, upper, least, tree, depth in self._kept:
             if (lower <= low).all() and (upper >= high).all() and narrow >= least:
@@ -316,8 +309,7 @@ class OcclusionMap:
             low, high = np.minimum(low, likely.min(1) - reach), np.maximum(high, likely.max(1) + reach)
         low, high = low - _MORE, high + _MORE
         seen, depth = self._all
-        x, y = seen
-        near = np.flatnonzero((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]))
+        near = np.flatnonzero(((seen >= low[:, None]) & (seen <= high[:, None])).all(axis=0))
         narrow *= _NARROWER
         about = len(near) * math.pi * narrow**2 / float(np.prod(high - low))
         near = near[:: max(1, int(about / _PLENTY))]
@@ -328,10 +320,7 @@ class OcclusionMap:
     @staticmethod
     def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:
         """Whether something nearer stands where the other eye would have to look through it."""
-        if limit <= _LEAST_DEPTH:
-            return False
-        nearest = float(distance.min())
-        widest = _BASELINE * (1.0 / max(nearest, _LEAST_DEPTH) - 1.0 / limit)
+        widest = _BASELINE * (1.0 / max(float(distance.min()), _LEAST_DEPTH) - 1.0 / limit) if limit > 0 else 0.0
         if widest <= 0:
             return False
         around = np.asarray(tree.query_ball_point(asked, widest), dtype=np.int64)
@@ -344,7 +333,5 @@ def _picture(points: Array, pose: Array) -> tuple[Array, Array]:
     """Where points stand in the picture, x/z and y/z, shape (2, N), and their depth z [m]."""
     local = pose[:3, :3].T @ points.T
     local -= (pose[:3, :3].T @ pose[:3, 3])[:, None]
-    depth = local[2]
-    seen = local[:2]
-    seen /= np.maximum(depth, _LEAST_DEPTH)
-    return seen, depth
+    local[:2] /= np.maximum(local[2], _LEAST_DEPTH)
+    return local[:2], local[2]

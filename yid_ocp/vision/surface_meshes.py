@@ -1,10 +1,18 @@
-"""Surfaces of the robot, of the tubes and of what stands about, each in a joint's moving frame, and their queries."""
+"""Surfaces of the robot, of the tubes and of what stands about, and a virtual depth camera that sees them.
+
+Each surface is in a joint's moving frame. Noise and steps of the camera, a structured-light sensor, are even in the
+pattern's disparity d = f b / z [pixels]; in depth they are dz = z^2/(f b) dd.
+
+References
+----------
+Khoshelham & Elberink (2012), Sensors 12:1437, doi:10.3390/s120201437, equations (5) and (10).
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -14,6 +22,7 @@ import casadi as ca
 import numpy as np
 from annotated_types import Gt
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
@@ -24,11 +33,18 @@ from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import resolve_urdf_path
 from yid_ocp.options import OptionInfo, PositiveFloat
-from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
+from yid_ocp.vision.frames import (
+    XTION_INTRINSICS,
+    CameraIntrinsics,
+    FrameSequence,
+    import_open3d,
+    validated_camera_pose,
+)
 
 UrdfMeshKind = Literal["visual", "collision"]
 _Triple = tuple[float, float, float]
 
+_MAX_MESH_BYTES = 1 << 28
 _FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
 _TOUCHING = 5e-4  # [m]
 _NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
@@ -57,10 +73,8 @@ class CameraScene:
     """Robot and object that a camera looks at."""
 
     system: System
-    # file of the robot, for its meshes (`package:baxter`); None for the object alone
-    robot_urdf: str | Path | None = None
-    # parameter values (lengths, radii, relative stiffnesses); nominal where absent
-    parameter_values: Mapping[str, float] | None = None
+    robot_urdf: str | Path | None = None  # for the robot's meshes (`package:baxter`); None for the object alone
+    parameter_values: Mapping[str, float] | None = None  # lengths and radii among them; nominal where absent
     extra_meshes: Sequence[ExtraMesh] = ()  # what stands about that is neither
 
 
@@ -84,6 +98,10 @@ class TriangleMesh:
         return TriangleMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
     @staticmethod
+    def _of(found: Any) -> TriangleMesh:
+        return TriangleMesh(np.asarray(found.vertices, float), np.asarray(found.faces, np.int64))
+
+    @staticmethod
     def box(size: ArrayLike) -> TriangleMesh:
         """A box about the origin; `size` (3,) [m]."""
         from trimesh import creation
@@ -97,10 +115,6 @@ class TriangleMesh:
 
         middle = homogeneous_transform(np.eye(3), (0.0, 0.0, 0.5 * (low + high)))
         return TriangleMesh._of(creation.cylinder(radius, high - low, _FACETS, transform=middle))
-
-    @staticmethod
-    def _of(found: Any) -> TriangleMesh:
-        return TriangleMesh(np.asarray(found.vertices, float), np.asarray(found.faces, np.int64))
 
     @staticmethod
     def sphere(radius: float) -> TriangleMesh:
@@ -131,10 +145,10 @@ class ArticulatedSurfaces:
             self._boxes.append(np.array([mesh.vertices.min(0), mesh.vertices.max(0)]))
         q = ca.SX.sym("q", len(mechanism.joints))
         kinematics = forward_kinematics(mechanism, q)
-        poses, last = [], ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]]))
-        for joint in self.part_joints:
-            turned = None if joint < 0 else (kinematics.joint_rotations[joint], kinematics.joint_origins[joint])
-            poses.append(ca.SX.eye(4) if turned is None else ca.vertcat(ca.horzcat(*turned), last))
+        poses = [ca.SX.eye(4) for _ in self.part_joints]
+        for joint, pose in zip(self.part_joints, poses, strict=True):
+            if joint >= 0:
+                pose[:3, :] = ca.horzcat(kinematics.joint_rotations[joint], kinematics.joint_origins[joint])
         self._poses = ca.Function("poses", [q], [ca.densify(ca.horzcat(*poses))])
 
     def part_poses_at(self, q: ArrayLike) -> Array:
@@ -160,12 +174,11 @@ class ArticulatedSurfaces:
         """
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at(q)):
-            if not (moving_only and self.part_joints[part] < 0):
-                asked = np.flatnonzero(~result)
-                near, local = self._near(points[asked], part, pose, reach)
-                if len(near):
-                    distance = self._scenes[part].compute_distance(_tensor(local), nthreads=1).numpy()
-                    result[asked[near]] = distance.astype(np.float64) <= reach
+            asked = np.flatnonzero(~result)
+            near, local = self._near(points[asked], part, pose, reach)
+            if len(near) and not (moving_only and self.part_joints[part] < 0):
+                distance = self._scenes[part].compute_distance(_tensor(local), nthreads=1).numpy()
+                result[asked[near]] = distance.astype(np.float64) <= reach
         return result
 
     def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
@@ -262,27 +275,17 @@ def _tensor(values: NDArray[Any]) -> Any:
 def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind = "visual") -> dict[int, TriangleMesh]:
     """Meshes of a robot's links by the joint that carries them, -1 for what does not move, in the joint's frame.
 
-    Parameters
-    ----------
-    urdf : str or Path
-        The URDF file, or `package:baxter`.
-    mechanism : Mechanism
-        That was read from it, alone or joined with others; numeric.
-
-    Raises
-    ------
-    ModelError
-        No such file, a mesh that is missing or cannot be read, or no mesh at all.
+    The numeric mechanism was read from the URDF file, or `package:baxter`, alone or joined with others. `ModelError`
+    where there is no such file, a mesh is missing or cannot be read, or there is no mesh at all.
     """
     import yourdfpy
 
     path = resolve_urdf_path(urdf)
     if not is_file(path):
         raise ModelError(f"there is no URDF file '{path}'", hint="give a path, or package:NAME")
+    bare = {"build_scene_graph": False, "load_meshes": False, "load_collision_meshes": False}
     try:
-        robot = yourdfpy.URDF.load(
-            str(check_input_file(path)), build_scene_graph=False, load_meshes=False, load_collision_meshes=False
-        )
+        robot = yourdfpy.URDF.load(str(check_input_file(path)), **bare)
     except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
         raise ModelError(f"the URDF cannot be read: {error}", where=str(path)) from error
     parts: dict[int, list[TriangleMesh]] = {}
@@ -314,20 +317,14 @@ def _solid(box: ArrayLike | None, cylinder: tuple[float, float] | None, sphere: 
     if box is not None:
         return TriangleMesh.box(box)
     if cylinder is not None:
-        radius, length = cylinder
-        return TriangleMesh.cylinder(radius, -0.5 * length, 0.5 * length)
+        return TriangleMesh.cylinder(cylinder[0], -0.5 * cylinder[1], 0.5 * cylinder[1])
     return None if sphere is None else TriangleMesh.sphere(sphere)
 
 
 def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> dict[int, list[TriangleMesh]]:
     """Meshes that the URDF does not have, by the index of the joint that carries them, -1 for the world.
 
-    Raises
-    ------
-    ConfigError
-        No such link, or not exactly one shape.
-    ModelError
-        A file that cannot be read.
+    `ConfigError` where there is no such link, or not exactly one shape; `ModelError` for a file that cannot be read.
     """
     made: dict[int, list[TriangleMesh]] = {}
     for number, entry in enumerate(extra):
@@ -337,11 +334,12 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
             found = " and ".join(given) or "no shape"
             raise ConfigError(f"there is {found}", where=where, allowed="one of mesh, box, cylinder, sphere")
         mesh = _solid(entry.box, entry.cylinder, entry.sphere)
-        if mesh is None:
-            if not is_file(Path(str(entry.mesh))):
+        if entry.mesh is not None:
+            if not is_file(Path(entry.mesh)):
                 hint = "give a file that trimesh reads: STL, OBJ, DAE"
                 raise ModelError(f"there is no mesh '{entry.mesh}'", where=where, hint=hint)
-            mesh = _load_mesh_file(Path(str(entry.mesh)))
+            mesh = _load_mesh_file(Path(entry.mesh))
+        assert mesh is not None
         joint, placement = -1, np.eye(4)
         if entry.parent_frame is not None:
             if entry.parent_frame not in mechanism.frames:
@@ -351,9 +349,6 @@ def extra_meshes_by_joint(extra: Sequence[ExtraMesh], mechanism: Mechanism) -> d
         pose = placement @ homogeneous_transform(rotation_from_rpy(*entry.rpy), entry.xyz)
         made.setdefault(joint, []).append(mesh.transformed(pose))
     return made
-
-
-_MAX_MESH_BYTES = 1 << 28
 
 
 @lru_cache(maxsize=64)
@@ -385,25 +380,22 @@ def tube_link_lengths_and_radii(
     system: System, values: Mapping[str, float] | None = None
 ) -> dict[str, tuple[Array, float]]:
     """Lengths of the links and radius of every tube, by segment [m]."""
-    symbols, theta = system.parameters.symbols, system.parameters.vector(values)
-    sizes = [ca.densify(ca.vertcat(*s.link_lengths, s.radius)) for s in system.segment_layouts]
-    numbers = [np.array(entry).ravel() for entry in ca.Function("sizes", [symbols], sizes).call([theta])]
-    names = [segment.name for segment in system.segment_layouts]
-    return {name: (entry[:-1], float(entry[-1])) for name, entry in zip(names, numbers, strict=True)}
+    segments, theta = system.segment_layouts, system.parameters.vector(values)
+    sizes = [ca.densify(ca.vertcat(*segment.link_lengths, segment.radius)) for segment in segments]
+    numbers = [
+        np.array(entry).ravel() for entry in ca.Function("sizes", [system.parameters.symbols], sizes).call([theta])
+    ]
+    return {s.name: (entry[:-1], float(entry[-1])) for s, entry in zip(segments, numbers, strict=True)}
 
 
 def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = None) -> dict[int, TriangleMesh]:
     """Cylinders along the links of the object's tubes, with balls at the joints between them, in the joints' frames.
 
-    Raises
-    ------
-    DataError
-        The system has no tubes.
+    `DataError` where the system has no tubes.
     """
     if not system.segment_layouts:
         raise DataError("the model has no object to see", hint="give it segments")
-    meshes: dict[int, TriangleMesh] = {}
-    sizes = tube_link_lengths_and_radii(system, values)
+    meshes, sizes = dict[int, TriangleMesh](), tube_link_lengths_and_radii(system, values)
     for segment in system.segment_layouts:
         lengths, radius = sizes[segment.name]
         for i, (names, length) in enumerate(zip(segment.link_joints, lengths, strict=True)):
@@ -412,3 +404,147 @@ def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = No
                 parts.append(TriangleMesh.sphere(radius))
             meshes[system.mechanism.joint_index(names[-1])] = TriangleMesh.concatenate(parts)
     return meshes
+
+
+# -- the virtual camera -----------------------------------------------------------------------------------------------
+
+# edges and middles of thin boxes [m]
+_FLOOR_AND_WALL = (([8.0, 8.0, 0.02], [1.0, 0.0, -0.94]), ([0.02, 8.0, 3.0], [-0.61, 0.0, 0.5]))
+_PERIOD_JITTER = 0.25  # share of its mean by which a period varies either way
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """Geometry and errors of a structured-light depth camera; the defaults are an Asus Xtion Pro Live."""
+
+    intrinsics: CameraIntrinsics = XTION_INTRINSICS
+    baseline: float = 0.075  # between projector and camera, along x [m]
+    # range of depths that it measures [m]
+    min_depth: float = 0.8
+    max_depth: float = 3.5
+    disparity_std: float = 1 / 16  # standard deviation of the disparity [pixels]; 1/16 gives 6 mm at 2 m
+    disparity_step: float = 1 / 8  # step of the disparity [pixels]; 1/8 gives 12 mm at 2 m
+    noise_correlation_length: float = 0.7  # over how many pixels neighbouring errors are alike [pixels]
+    # cosine of ray and normal below which nothing comes back; up to twice as much it comes back sometimes
+    min_incidence_cosine: float = 0.12
+    min_relative_edge_depth: float = 0.02  # difference of neighbouring pixels that makes an edge, relative to depth
+    # probability that a pixel at an edge is lost, or lies anywhere between front and back
+    edge_loss_probability: float = 0.6
+    edge_mixing_probability: float = 0.05
+    loss_probability: float = 0.01  # probability that any pixel is lost
+    # probability that a pixel's pattern is matched wrongly: its depth is then anywhere within `outlier_depth_range`
+    outlier_probability: float = 0.0
+    outlier_depth_range: float = 0.4  # [m], to either side of the true depth
+
+    def _simulate_depth_image(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
+        """Measured depth image [m], NaN where nothing was measured.
+
+        From the true one [m], infinite where there is nothing, and the cosine of ray and normal, all (height, width).
+        """
+        from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter  # slow to import
+
+        scale, shape = self.intrinsics.fx * self.baseline, depth.shape
+        white = rng.standard_normal(shape)
+        if self.noise_correlation_length > 0:
+            white = gaussian_filter(white, self.noise_correlation_length, mode="wrap")
+            white /= white.std()
+        chance = rng.random((4, *shape))
+        far = np.where(np.isfinite(depth), depth, 1e3)
+        front, back = minimum_filter(far, size=3), maximum_filter(far, size=3)
+        edge = back - front > self.min_relative_edge_depth * front
+        mixed = edge & (chance[0] < self.edge_mixing_probability) & (back < self.max_depth)
+        true = np.where(mixed, front + rng.random(shape) * (back - front), far)
+        wrong = chance[1] < self.outlier_probability
+        true = np.where(wrong, true + self.outlier_depth_range * rng.uniform(-1.0, 1.0, shape), true)
+        disparity = scale / np.maximum(true, 1e-3) + self.disparity_std * white
+        if self.disparity_step > 0:
+            disparity = np.rint(disparity / self.disparity_step) * self.disparity_step
+        measured = scale / np.maximum(disparity, 1e-6)
+        lost = (np.minimum(far, measured) < self.min_depth) | (np.maximum(far, measured) > self.max_depth)
+        lost |= cosine < self.min_incidence_cosine * (1.0 + chance[2])
+        lost |= edge & ~mixed & (chance[0] > 1.0 - self.edge_loss_probability)
+        lost |= chance[3] < self.loss_probability
+        lost |= self._shadow(far)
+        return np.where(lost, np.nan, measured)
+
+    def _shadow(self, depth: Array) -> BoolArray:
+        """Pixels that the projector, on the camera's left, does not reach: another one of its line is nearer."""
+        if self.baseline <= 0:
+            return np.zeros(depth.shape, bool)
+        disparity = self.intrinsics.fx * self.baseline / depth
+        height, width = depth.shape
+        margin = math.ceil(float(disparity.max())) + 1
+        # the projector stands at x = -baseline, so that its image of a pixel lies to the right by the disparity
+        column = np.rint(np.arange(width) + disparity).astype(np.int64)
+        flat = np.arange(height)[:, None] * (width + margin + 1) + np.minimum(column, width + margin)
+        nearest = np.zeros(height * (width + margin + 1))
+        np.maximum.at(nearest, flat.ravel(), disparity.ravel())
+        return np.asarray(disparity < nearest[flat] - 1.0)
+
+
+@dataclass(frozen=True)
+class FrameTiming:
+    """Timing model of a camera: frame rate, dropped frames and errors of time stamps."""
+
+    mean_rate: float = 3.0  # [Hz]
+    dropped_fraction: float = 0.0  # of the frames, which never arrive
+    latency: float = 0.0  # of every stamp after the picture, and the camera's clock ahead, taken together [s]
+    latency_std: float = 0.0  # standard deviation of the latency from frame to frame [s]
+
+    def _sample_times_and_stamps(self, start: float, stop: float, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Times of the pictures that arrive and their stamps, both shape (M,) [s]."""
+        if not self.mean_rate > 0:
+            raise ConfigError(f"mean_rate = {self.mean_rate}", allowed="mean_rate > 0")
+        count = math.ceil((stop - start) * self.mean_rate / (1 - _PERIOD_JITTER)) + 2
+        taken = start + np.cumsum(rng.uniform(1 - _PERIOD_JITTER, 1 + _PERIOD_JITTER, count) / self.mean_rate)
+        taken = taken[taken < stop]
+        taken = taken[rng.random(len(taken)) >= self.dropped_fraction]
+        return taken, taken + self.latency + self.latency_std * rng.standard_normal(len(taken))
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualFrames:
+    """Frame sequence of a virtual camera with the true times and configurations."""
+
+    sequence: FrameSequence
+    capture_times: Array  # (M,), time of every picture on the simulator's clock [s]
+    true_configuration_at: Callable[[float], Array]  # from a time to the configuration then, shape (n,)
+
+
+@dataclass(frozen=True, eq=False)
+class VirtualCamera:
+    """Virtual depth camera: sensor model, pose and frame timing."""
+
+    pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
+    depth_camera: DepthCamera = field(default_factory=DepthCamera)  # an Asus Xtion Pro Live where absent
+    timing: FrameTiming = field(default_factory=FrameTiming)
+    seed: int = 0  # of all that is drawn at random
+
+
+def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera: VirtualCamera) -> VirtualFrames:
+    """Render the frames that a virtual camera takes of a motion, when they are loaded and the same every time.
+
+    Configurations (N, n) at times (N,) [s] come from whatever simulator; between them a cubic spline interpolates.
+    Where there is a robot, the paper's Y stands on a floor, and a wall stands behind Baxter. `DataError` or
+    `ModelError` for no Open3D, no object, a mesh that cannot be read, or a pose that is none.
+    """
+    lens, pose = camera.depth_camera.intrinsics, validated_camera_pose(camera.pose, "sequence")
+    times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)
+    taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
+    course = CubicSpline(times, np.asarray(q, float), axis=0)
+    configuration = np.asarray(course(taken))
+    tree = scene.system.numeric_mechanism(scene.parameter_values)
+    meshes = tube_meshes_by_joint(scene.system, scene.parameter_values)
+    robot = load_robot_meshes(scene.robot_urdf, tree) if scene.robot_urdf is not None else {}
+    around = [TriangleMesh.box(size).transformed(homogeneous_transform(np.eye(3), at)) for size, at in _FLOOR_AND_WALL]
+    still = [*(around if robot else []), *([robot.pop(-1)] if -1 in robot else [])]
+    surfaces = ArticulatedSurfaces(tree, meshes | robot | ({-1: TriangleMesh.concatenate(still)} if still else {}))
+
+    def cloud(index: int) -> Array:
+        depth, cosine, _ = surfaces.render_depth_image(lens, pose, configuration[index])
+        rng = np.random.default_rng([camera.seed, index])
+        return lens.points_from_depth(camera.depth_camera._simulate_depth_image(depth, cosine, rng))
+
+    names = tuple(f"frame {i}" for i in range(len(taken)))
+    made = FrameSequence(stamps, names, pose, cloud, lens, "virtual camera")
+    return VirtualFrames(made, taken, lambda at: np.asarray(course(at)))

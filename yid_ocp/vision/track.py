@@ -29,6 +29,7 @@ from yid_ocp.vision.calibration import (
 from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import (
+    TrackOptions,
     frame_rejection_reason,
     is_shape_self_touching,
     mark_outlying_frames,
@@ -37,7 +38,6 @@ from yid_ocp.vision.frame_selection import (
 )
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
 from yid_ocp.vision.initial_shapes import InitialShapeFinder, system_with_free_root, trace_centerline
-from yid_ocp.vision.options import TrackOptions
 from yid_ocp.vision.point_cloud import (
     CloudSkeleton,
     ReachableObjectRegion,

@@ -42,10 +42,16 @@ from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
 from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionCheck
 from yid_ocp.vision.shape_evidence import FrameShapeFit
-from yid_ocp.vision.surface_meshes import CameraScene
+from yid_ocp.vision.surface_meshes import (
+    CameraScene,
+    DepthCamera,
+    FrameTiming,
+    VirtualCamera,
+    VirtualFrames,
+    render_virtual_frames,
+)
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
-from yid_ocp.vision.virtual_camera import DepthCamera, FrameTiming, VirtualCamera, VirtualFrames, render_virtual_frames
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import issues_to_plain_data, single_recording_issues
 from yid_ocp.workflow.command_runner import CommandResult, command_with_settings, workers_from_arguments
