@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -41,8 +41,7 @@ from yid_ocp.vision.point_cloud import weighted_median
 _OFF_ARM_DISTANCE = 0.04  # at which a point stops to be the arm's [m]
 _THIN = 5000  # points of a frame among which starts are tried
 _POINTS, _FEW_POINTS = 500, 150  # near the arm: for its offset, to see which start is best
-_COARSE = 0.04  # between starts [s]
-_FURTHEST = 0.4  # of them [s]
+_COARSE, _FURTHEST = 0.04, 0.4  # starts: apart, and the furthest [s]
 _NARROWING = (1.0, 0.7, 0.5, 0.5)  # of the reach, from iteration to iteration
 _SHARE = 0.3  # of the points must lie on the arm, or they are something else
 _UNUSUAL = 1.5  # times the usual misfit, from which on other starts are tried
@@ -82,8 +81,7 @@ class CameraClockOptions:
         check_option_bounds(self, "clock options")
 
 
-@dataclass(frozen=True)
-class _StampDelay:
+class _StampDelay(NamedTuple):
     """Delay of one frame's time stamp beyond the common clock offset."""
 
     delay: float
@@ -106,9 +104,8 @@ def estimate_excess_stamp_delay(
         return None
     trial = _nearby(arm, origin, t, chosen, 0.0)
     if trial.mean_square_distance > _UNUSUAL * usual:
-        steps = round(_FURTHEST / _COARSE)
+        steps, few = round(_FURTHEST / _COARSE), chosen[:_FEW_POINTS]
         grid = _COARSE * np.arange(-steps, steps + 1)
-        few = chosen[:_FEW_POINTS]
         met = [arm.match_points_to_surface(few, origin, t - delay, _OFF_ARM_DISTANCE, along=True) for delay in grid]
         start = float(grid[int(np.argmin([_mean_square(one.normal_distance, len(few)) for one in met]))])
         if abs(start) > _LEAST_LATE:
@@ -146,14 +143,13 @@ def _mean_square(error: Array, count: int) -> float:
 
 def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], float]:
     """Frames whose delays agree, so that frames stamped late do not bias the others, and the usual misfit [m^2]."""
-    known = [(i, entry) for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)]
+    known = {i: entry for i, entry in enumerate(own) if entry is not None and math.isfinite(entry.std)}
     if not known:
         return [], 0.0
-    delay, std = (np.array([getattr(entry, name) for _, entry in known]) for name in ("delay", "std"))
+    delay, std, square = np.array(list(known.values())).T
     apart = np.abs(delay - weighted_median(delay, std**-2))
     near = apart < np.maximum(_LEAST_LATE, _LATE * std)
-    usual = float(np.median([entry.mean_square_distance for _, entry in known]))
-    return [i for (i, _), good in zip(known, near, strict=True) if good], usual
+    return [i for i, good in zip(known, near, strict=True) if good], float(np.median(square))
 
 
 def is_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) -> bool:
@@ -161,8 +157,7 @@ def is_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) ->
     return abs(own.delay) > max(options.max_stamp_delay, _LATE * own.std)
 
 
-_LEAST_FRAMES = 3
-_START_FRAMES = 6  # in which starts are tried
+_LEAST_FRAMES, _START_FRAMES = 3, 6  # of a calibration, and in which starts are tried
 _STARTS = 4
 _ENOUGH = 0.9  # of the arm is where a start has led: others are not tried
 _WIDE = (0.08, 0.06, 0.045)  # reach of nearest surfaces, from stage to stage [m]
@@ -269,11 +264,8 @@ def calibrate_camera(
     """Calibrate the camera of a sequence, told to stand at a pose (4, 4), from some of its frames.
 
     The frames are thinned, the robot and what is about it among the points; `source` says where they come from.
-
-    Raises
-    ------
-    DataError
-        The arm is not seen, does not lie where the camera sees something, or moves too little to tell the time.
+    `DataError` where the arm is not seen, does not lie where the camera sees something, or moves too little to tell the
+    time.
     """
     about = float(np.mean([g.stamp for g in glimpses])) if glimpses else 0.0
     told = CameraState(pose, clock_offset=clock.initial_offset, clock_reference_stamp=about)
@@ -318,20 +310,14 @@ class _Calibrator:
     def run(self, frames: Sequence[CalibrationFrame]) -> CameraCalibration:
         glimpses = [g for g in map(self._about_the_arm, frames) if g is not None]
         if len(glimpses) < _LEAST_FRAMES:
-            raise _UntoldError(
-                f"it is in view in {len(glimpses)} frames, {_LEAST_FRAMES} are needed",
-                "turn the camera so that it sees the arm, or record for longer",
-            )
+            needed = f"it is in view in {len(glimpses)} frames, {_LEAST_FRAMES} are needed"
+            raise _UntoldError(needed, "turn the camera so that it sees the arm, or record for longer")
         state, chosen = self._start(glimpses), glimpses
         for _ in range(2):  # once more without the frames that were stamped late
             state = self._rounds(state, chosen, _WIDE[-1], True, _FEW, _ROUNDS)[0]
             state, found, used = self._rounds(state, chosen, _REACH, True, _MANY, _LAST_ROUNDS)
-            own = [
-                estimate_excess_stamp_delay(
-                    self.arm, state, g.stamp, state.measured_to_world_points(g.points), self.rng
-                )
-                for g in used
-            ]
+            placed = [(g.stamp, state.measured_to_world_points(g.points)) for g in used]
+            own = [estimate_excess_stamp_delay(self.arm, state, *seen, self.rng) for seen in placed]
             on_time, usual = _find_on_time_frames(own)
             chosen = [used[i] for i in on_time]
             if len(chosen) < _LEAST_FRAMES:
@@ -339,23 +325,19 @@ class _Calibrator:
         presence = surface_visibility(self.arm, chosen, state, _REACH)
         free = presence.there + presence.through
         if not presence.there >= self.options.min_visible_fraction * free:
-            raise _UntoldError(
-                f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface, wherever"
-                " camera and clock are put",
-                "check the told pose, the robot's description and which recording belongs to the frames",
-            )
+            seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
+            hint = "check the told pose, the robot's description and which recording belongs to the frames"
+            raise _UntoldError(f"{seen}, wherever camera and clock are put", hint)
         covariance = found.state_covariance(self.precision)
         std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
         if self.clock.search_half_width > 0 and not std < self.clock.max_offset_std:
-            raise _UntoldError(
-                f"it moves too little to tell the time: its clock is known to {1e3 * std:.0f} ms only",
-                "record a livelier motion, or give the clock's offset with track.options.clock.initial_offset and "
-                "search_half_width: 0",
-            )
-        used_state, beside = state, np.zeros(CAMERA_STATE_SIZE)
+            told = f"it moves too little to tell the time: its clock is known to {1e3 * std:.0f} ms only"
+            known = "give the clock's offset with track.options.clock.initial_offset and search_half_width: 0"
+            raise _UntoldError(told, f"record a livelier motion, or {known}")
+        used_state = state
         if self.options.fix_pose:
             used_state = replace(self.told, clock_offset=state.clock_offset, clock_drift=state.clock_drift)
-            beside = state.difference_from(used_state)
+        beside = state.difference_from(used_state)
         words = self._message(state, covariance, chosen[len(chosen) // 2].stamp)
         words += f"; from {len(chosen)} frames, with {100 * presence.there:.0f} % of the arm's surface in the clouds"
         return CameraCalibration(used_state, self.told, usual, covariance, beside, presence, len(chosen), words)
@@ -367,21 +349,15 @@ class _Calibrator:
         if len(own) < MIN_ARM_POINTS_PER_FRAME or not len(points):
             return None
         at, towards = points[:, :2] / points[:, 2:], own[:, :2] / own[:, 2:]
-        kept = ((at > towards.min(axis=0) - _AROUND) & (at < towards.max(axis=0) + _AROUND)).all(axis=1)
-        return (
-            CalibrationFrame(glimpse.stamp, points[kept])
-            if np.count_nonzero(kept) >= MIN_ARM_POINTS_PER_FRAME
-            else None
-        )
-
-    def _thinned(self, glimpse: CalibrationFrame) -> CalibrationFrame:
-        count = len(glimpse.points)
-        return replace(glimpse, points=glimpse.points[self.rng.choice(count, min(count, _THIN), replace=False)])
+        kept = points[((at > towards.min(axis=0) - _AROUND) & (at < towards.max(axis=0) + _AROUND)).all(axis=1)]
+        return CalibrationFrame(glimpse.stamp, kept) if len(kept) >= MIN_ARM_POINTS_PER_FRAME else None
 
     def _start(self, glimpses: Sequence[CalibrationFrame]) -> CameraState:
         """The state near which most of the arm is where the camera sees something."""
-        some = np.linspace(0, len(glimpses) - 1, min(len(glimpses), _START_FRAMES)).round()
-        few = [self._thinned(glimpses[int(k)]) for k in some]
+        few = []
+        for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _START_FRAMES)).round():
+            stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
+            few.append(CalibrationFrame(stamp, self.rng.choice(points, min(len(points), _THIN), replace=False)))
         tried = initial_camera_states(self.arm, few, self.told, self.clock.search_half_width, _STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")
@@ -397,17 +373,11 @@ class _Calibrator:
         return best
 
     def _rounds(
-        self,
-        state: CameraState,
-        glimpses: Sequence[CalibrationFrame],
-        reach: float,
-        along: bool,
-        most: int,
-        rounds: int,
+        self, state: CameraState, frames: Sequence[CalibrationFrame], reach: float, along: bool, most: int, rounds: int
     ) -> tuple[CameraState, RobustCostQuadraticModel, list[CalibrationFrame]]:
         """The state after some steps on at most so many points of each frame, the sum there, and those points."""
         chosen = []
-        for glimpse in glimpses:
+        for glimpse in frames:
             points = state.measured_to_world_points(glimpse.points)
             t = float(state.stamps_to_joint_clock(glimpse.stamp))
             near = np.flatnonzero(self.arm.is_near_moving_surface_off_grasps(points, t, 1.5 * reach))
@@ -416,12 +386,13 @@ class _Calibrator:
             if len(near) >= MIN_ARM_POINTS_PER_FRAME:
                 chosen.append(CalibrationFrame(glimpse.stamp, glimpse.points[near]))
         if len(chosen) < _LEAST_FRAMES:
-            what = "what the camera sees does not lie on it"
-            raise _UntoldError(what, "check the told pose and the unit of the clouds")
+            hint = "check the told pose and the unit of the clouds"
+            raise _UntoldError("what the camera sees does not lie on it", hint)
 
         def cost(state: CameraState) -> RobustCostQuadraticModel:
-            rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]
-            return quadratic_robust_cost(rows, reach)
+            return quadratic_robust_cost(
+                [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen], reach
+            )
 
         for _ in range(rounds):
             hessian, gradient, _ = cost(state).weighted_normal_equations(self.precision)
@@ -434,12 +405,11 @@ class _Calibrator:
 
     def _message(self, state: CameraState, covariance: Array, stamp: float) -> str:
         """What the arm says of camera and clock in the middle of the recording, in words."""
-        words = [f"clock offset {1e3 * state.clock_offset:.1f} ms as given"]
-        if self.clock.search_half_width > 0:
-            std = math.sqrt(covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
-            words = [f"clock offset {1e3 * state.clock_offset:.1f} ms ± {1e3 * std:.1f} ms (stamp minus joint time)"]
-        drift = math.sqrt(covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX])
-        if abs(state.clock_drift) > 2 * drift:
+        stds = np.sqrt(np.diag(covariance))
+        known = f"± {1e3 * stds[CLOCK_OFFSET_INDEX]:.1f} ms (stamp minus joint time)"
+        searched = self.clock.search_half_width > 0
+        words = [f"clock offset {1e3 * state.clock_offset:.1f} ms {known if searched else 'as given'}"]
+        if abs(state.clock_drift) > 2 * (drift := stds[CLOCK_DRIFT_INDEX]):
             words.append(f"its drift {1e3 * state.clock_drift:.2f} ms in a second ± {1e3 * drift:.2f}")
         points = self.arm.visible_surface_points(state, stamp)[0].mean(axis=0, keepdims=True)
         away = np.linalg.norm(state.measured_to_world_points(self.told.world_to_measured_points(points)) - points)
@@ -449,15 +419,11 @@ class _Calibrator:
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
             if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTED**2 * 3:
-                words.append(
-                    f"the arm contradicts the pose that is kept: it is seen {1e3 * away:.0f} mm from where the joints "
-                    "have it, which the standard deviations count"
-                )
+                off = f"it is seen {1e3 * away:.0f} mm from where the joints have it"
+                words.append(f"the arm contradicts the pose that is kept: {off}, which the standard deviations count")
         elif away > _NOTED:
-            turn = math.degrees(float(np.linalg.norm(change[ROTATION_SLICE])))
-            shift = float(np.linalg.norm(change[TRANSLATION_SLICE]))
-            words.append(
-                f"the told camera sees the arm {1e3 * away:.0f} mm from where the joints have it: turned by {turn:.1f}"
-                f" degrees, shifted by {1e3 * shift:.0f} mm, depth scaled by {math.exp(-change[DEPTH_SCALE_INDEX]):.3f}"
-            )
+            turn, shift = (float(np.linalg.norm(change[part])) for part in (ROTATION_SLICE, TRANSLATION_SLICE))
+            off = f"the told camera sees the arm {1e3 * away:.0f} mm from where the joints have it: turned by"
+            moved = f"{math.degrees(turn):.1f} degrees, shifted by {1e3 * shift:.0f} mm"
+            words.append(f"{off} {moved}, depth scaled by {math.exp(-change[DEPTH_SCALE_INDEX]):.3f}")
         return "; ".join(words)

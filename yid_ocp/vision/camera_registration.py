@@ -26,6 +26,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,9 +41,7 @@ from yid_ocp.vision.surface_meshes import ArticulatedSurfaces
 ROTATION_SLICE, TRANSLATION_SLICE = slice(0, 3), slice(3, 6)
 DEPTH_SCALE_INDEX, DEPTH_OFFSET_INDEX, CLOCK_OFFSET_INDEX, CLOCK_DRIFT_INDEX = 6, 7, 8, 9
 """Positions of the parts of a `CameraState` change in its vector."""
-CAMERA_STATE_SIZE = 10
-MIN_ARM_POINTS_PER_FRAME = 40
-"""Fewest points of the arm in a usable frame."""
+CAMERA_STATE_SIZE, MIN_ARM_POINTS_PER_FRAME = 10, 40
 
 # through which the robot's visible surface is sampled
 _LOOK = CameraIntrinsics.from_field_of_view(160, 120, math.radians(80.0))
@@ -109,13 +108,10 @@ class CameraState:
         pose = self.pose.copy()
         pose[:3, :3] = Rotation.from_rotvec(change[ROTATION_SLICE]).as_matrix() @ pose[:3, :3]
         pose[:3, 3] += change[TRANSLATION_SLICE]
+        scale, offset, clock, drift = map(float, change[DEPTH_SCALE_INDEX:])
+        depth = self.depth_scale * math.exp(scale), self.depth_offset + offset
         return CameraState(
-            pose,
-            self.depth_scale * math.exp(float(change[DEPTH_SCALE_INDEX])),
-            self.depth_offset + float(change[DEPTH_OFFSET_INDEX]),
-            self.clock_offset + float(change[CLOCK_OFFSET_INDEX]),
-            self.clock_drift + float(change[CLOCK_DRIFT_INDEX]),
-            self.clock_reference_stamp,
+            pose, *depth, self.clock_offset + clock, self.clock_drift + drift, self.clock_reference_stamp
         )
 
     def difference_from(self, other: CameraState) -> Array:
@@ -139,8 +135,7 @@ class CalibrationFrame:
         return cKDTree(self.points), cKDTree(self.points[:, :2] / self.points[:, 2:])
 
 
-@dataclass(frozen=True, eq=False)
-class _CalibrationEquations:
+class _CalibrationEquations(NamedTuple):
     """Linearised calibration equations of one frame's points near the arm."""
 
     jacobian: Array
@@ -190,31 +185,27 @@ class ArmSurface:
         if along:
             ahead = points - origin
             distance, normal, part = self.robot_surfaces.intersect_rays(origin, ahead, q)
-            chosen = np.flatnonzero((part >= 0) & self._moving[part])
-            square = -np.einsum("ij,ij->i", normal[chosen], ahead[chosen])
-            error = (distance[chosen] - 1.0) * square  # n . (P - (origin + d (P - origin)))
-            clear = square > _GRAZING * np.linalg.norm(ahead[chosen], axis=1)
-            kept = clear & (np.abs(error) < reach)
-            chosen, error = chosen[kept], error[kept]
+            square = -np.einsum("ij,ij->i", normal, ahead)
+            with np.errstate(invalid="ignore"):  # of rays that meet nothing
+                error = (distance - 1.0) * square  # n . (P - (origin + d (P - origin)))
+            kept = (square > _GRAZING * np.linalg.norm(ahead, axis=1)) & (np.abs(error) < reach)
         else:
-            distance, normal, part = self.robot_surfaces.nearest_moving_surface(points, q, reach)
-            chosen = np.flatnonzero((part >= 0) & self._moving[part])
-            error = distance[chosen]
+            error, normal, part = self.robot_surfaces.nearest_moving_surface(points, q, reach)
+            kept = np.ones(len(points), bool)
+        chosen = np.flatnonzero(kept & (part >= 0) & self._moving[part])
         behind, now, later = (self.part_poses_at(t + d)[part[chosen]] for d in (-_STEP, 0.0, _STEP))
         local = np.einsum("nji,nj->ni", now[:, :3, :3], points[chosen] - now[:, :3, 3])
         moved = np.einsum("nij,nj->ni", later[:, :3, :3] - behind[:, :3, :3], local)
         velocity = (moved + later[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)
         rate = np.einsum("ni,ni->n", normal[chosen], velocity)
-        return _SurfaceMatches(chosen, error, normal[chosen], rate, part[chosen], local)
+        return _SurfaceMatches(chosen, error[chosen], normal[chosen], rate, part[chosen], local)
 
     def linearized_surface_distances(
         self, state: CameraState, glimpse: CalibrationFrame, reach: float, along: bool
     ) -> _CalibrationEquations:
         """Distances of a frame's points from the arm's surface, linearised in the camera state."""
-        points = state.measured_to_world_points(glimpse.points)
-        met = self.match_points_to_surface(
-            points, state.pose[:3, 3], float(state.stamps_to_joint_clock(glimpse.stamp)), reach, along
-        )
+        points, t = state.measured_to_world_points(glimpse.points), float(state.stamps_to_joint_clock(glimpse.stamp))
+        met = self.match_points_to_surface(points, state.pose[:3, 3], t, reach, along)
         slope = np.empty((len(met.point_indices), CAMERA_STATE_SIZE))
         by_camera = state.world_point_jacobian(points[met.point_indices])
         slope[:, :CLOCK_OFFSET_INDEX] = np.einsum("ni,nij->nj", met.normal, by_camera)
@@ -225,8 +216,7 @@ class ArmSurface:
         return _CalibrationEquations(slope, met.normal_distance, patch)
 
 
-@dataclass(frozen=True, eq=False)
-class _SurfaceMatches:
+class _SurfaceMatches(NamedTuple):
     """Points matched to the arm: indices, normal distance e [m], normal, normal velocity [m/s], part, local place."""
 
     point_indices: IntArray
@@ -265,33 +255,25 @@ class RobustCostQuadraticModel:
 
 def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostQuadraticModel:
     """Robust cost over all points of all frames, scaled by their median error."""
-    size = np.abs(np.concatenate([r.residuals for r in rows]))
-    sigma = max(_TO_SIGMA * float(np.median(size)) if len(size) else reach, _LEAST_SIGMA)
-    scale = min(_CUT * sigma, reach)
-    gradient, (hessian, blocks) = np.zeros(CAMERA_STATE_SIZE), np.zeros((2, CAMERA_STATE_SIZE, CAMERA_STATE_SIZE))
-    scores, bent, straight = [], 0.0, 0.0
-    for r in rows:
-        square = (r.residuals / scale) ** 2
-        weight = 1 / (1 + square) ** 2 / sigma**2
-        score = r.jacobian * (weight * r.residuals)[:, None]
-        hessian += r.jacobian.T @ (weight[:, None] * r.jacobian)
-        gradient += score.sum(axis=0)
-        straight += float(weight.sum())
-        bent += float((weight * (1 - 3 * square) / (1 + square)).sum())
-        scores.append(score)
-    if len(size):
-        stacked = np.concatenate(scores)
+    jacobian, residuals, patches = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+    sigma = max(_TO_SIGMA * float(np.median(np.abs(residuals))) if len(residuals) else reach, _LEAST_SIGMA)
+    square = (residuals / min(_CUT * sigma, reach)) ** 2
+    weight = 1 / (1 + square) ** 2 / sigma**2
+    scores = jacobian * (weight * residuals)[:, None]
+    bent, blocks = float((weight * (1 - 3 * square) / (1 + square)).sum()), np.zeros((CAMERA_STATE_SIZE,) * 2)
+    if len(residuals):
         frame = np.repeat(np.arange(len(rows)), [len(r.residuals) for r in rows])
-        patch = np.unique(np.concatenate([r.patch_indices for r in rows]), axis=0, return_inverse=True)[1].ravel()
+        patch = np.unique(patches, axis=0, return_inverse=True)[1].ravel()
 
         def summed(group: IntArray) -> Array:
-            totals = np.stack([np.bincount(group, stacked[:, k]) for k in range(CAMERA_STATE_SIZE)], axis=1)
+            totals = np.stack([np.bincount(group, column) for column in scores.T], axis=1)
             return np.asarray(totals.T @ totals)
 
         both = summed(frame * (patch.max() + 1) + patch)
         blocks = _at_least(both, summed(frame) + summed(patch) - both)
-    curvature = max(bent / max(straight, 1e-12), _LEAST_CURVATURE)
-    return RobustCostQuadraticModel(gradient, hessian, curvature, blocks)
+    curvature = max(bent / max(float(weight.sum()), 1e-12), _LEAST_CURVATURE)
+    hessian = jacobian.T @ (weight[:, None] * jacobian)
+    return RobustCostQuadraticModel(scores.sum(axis=0), hessian, curvature, blocks)
 
 
 def _at_least(least: Array, matrix: Array) -> Array:
@@ -309,7 +291,7 @@ def initial_camera_states(
 
     So many at most, at least `_APART` from one another, with clock offsets up to `search` [s] from the told one.
     """
-    steps = math.ceil(search / _CLOCK_STEP) if search > 0 else 0
+    steps = math.ceil(search / _CLOCK_STEP)
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
     sides, ahead = (np.arange(-n, n + 1, _EVERY) for n in (_SIDEWAYS, _AHEAD))
     cells = np.stack(np.meshgrid(sides, sides, ahead, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -344,16 +326,16 @@ def _add_costs(
 
     points, part = arm.visible_surface_points(told, glimpse.stamp)
     own = told.world_to_measured_points(points)
-    at = glimpse.points[:, :2] / glimpse.points[:, 2:]
+    at, towards = (p[:, :2] / p[:, 2:] for p in (glimpse.points, own))
     view = np.array([at.min(axis=0), at.max(axis=0)])
-    towards = own[:, :2] / own[:, 2:]
     chosen = np.flatnonzero(((towards >= view[0]) & (towards <= view[1])).all(axis=1))
     if len(chosen) < MIN_ARM_POINTS_PER_FRAME:
         return
     chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLES)).astype(np.int64)]
     points, part, own = points[chosen], part[chosen], own[chosen]
     # a field of distances with room for the shifts, and for the arm's own way
-    margin = _CELL * (np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD]) + 2) + 0.2
+    edge = np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD])
+    margin = _CELL * (edge + 2) + 0.2
     low = own.min(axis=0) - margin
     shape = np.ceil((own.max(axis=0) + margin - low) / _CELL).astype(int) + 1
     cell = np.floor((glimpse.points - low) / _CELL).astype(int)
@@ -366,13 +348,12 @@ def _add_costs(
     depth = np.maximum(z, _CELL)
     u, v = x[:, None, None] / depth, y[:, None] / depth
     outside = (u < view[0, 0]) | (u > view[1, 0]) | (v < view[0, 1]) | (v > view[1, 1])
-    distance = distance_transform_edt(empty, sampling=_CELL)
-    cost = np.where(outside, _HIDDEN, (np.minimum(distance, _CAPTURE) / _CAPTURE) ** 2)
-    flat = cost.astype(np.float32).ravel()
+    distance = np.minimum(distance_transform_edt(empty, sampling=_CELL), _CAPTURE)
+    flat = np.where(outside, _HIDDEN, (distance / _CAPTURE) ** 2).astype(np.float32).ravel()
     t = float(told.stamps_to_joint_clock(glimpse.stamp))
     before = arm.part_poses_at(t)[part]
     local = np.einsum("nji,nj->ni", before[:, :3, :3], points - before[:, :3, 3])
-    edge, strides = np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD]), np.array([shape[1] * shape[2], shape[2], 1])
+    strides = np.array([shape[1] * shape[2], shape[2], 1])
     for row, delay in zip(total, delays, strict=True):
         then = arm.part_poses_at(t - delay)[part]
         own = told.world_to_measured_points(np.einsum("nij,nj->ni", then[:, :3, :3], local) + then[:, :3, 3])
@@ -382,13 +363,11 @@ def _add_costs(
 
 @dataclass(frozen=True)
 class SurfaceVisibility:
-    """Of the arm's surface that should be seen: shares where a cloud has it, where something is before it, and where
-    the camera saw through it; in how many samples.
-    """
+    """Shares of the arm's surface that should be seen, in so many samples."""
 
-    there: float
-    covered: float
-    through: float
+    there: float  # a cloud has it
+    covered: float  # something is before it
+    through: float  # the camera saw through it
     samples: int
 
 
