@@ -14,7 +14,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -35,8 +35,10 @@ from yid_ocp.vision.shape_evidence import (
     ShapePointClassification,
     TubeDimensionCost,
     TubeLinks,
+    across_links,
     assess_shape_against_cloud,
     line_of_sight_residuals,
+    link_axes,
     nearest_surface_residuals,
     tube_like_node_point_masks,
     tube_link_projections,
@@ -195,9 +197,7 @@ class ShapeFitter:
         q = self.rest_configuration.copy()
         known = [self.system.mechanism.joint_index(name) for name in self.recorded_joint_names]
         q[known] = q_known[known]
-        begun = [q.copy() for _ in starts or "r"]
-        for trial, start in zip(begun, starts or (self.rest_configuration,), strict=True):
-            trial[free] = start[free]
+        begun = [self._with_free(q, start[free]) for start in starts or (self.rest_configuration,)]
         everything = np.ones(len(sight.skeleton_nodes), bool), np.ones(len(sight.points), bool)
         thin = tube_like_node_point_masks(sight, float(self.link_radii.max()))
         best, evidence = self._attempt(sight, begun, thin if thin[0].any() and thin[1].any() else everything)
@@ -208,17 +208,21 @@ class ShapeFitter:
             # a part of the object is not where this has it: something like it stood nearer to where the search began
             if left[0].any() and left[1].any():
                 other = self._attempt(sight, [self._rested(best.q, failed), *begun], left)
-                best, evidence = max(
-                    (best, evidence), other, key=lambda found: found[1].length_weighted_coverage(self._lengths)
-                )
+                if other[1].length_weighted_coverage(self._lengths) > evidence.length_weighted_coverage(self._lengths):
+                    best, evidence = other
         return self._judged(best, evidence, self._rivals(best, evidence, sight), sight)
+
+    def _with_free(self, q: Array, angles: Array) -> Array:
+        """A configuration with other angles of the free joints."""
+        trial = q.copy()
+        trial[list(self.free_joints)] = angles
+        return trial
 
     def _rested(self, q: Array, tubes: Collection[str]) -> Array:
         """A configuration with some tubes as at rest."""
-        trial = q.copy()
-        again = [j for j, owner in zip(self.free_joints, self._free_joint_segments, strict=True) if owner in tubes]
-        trial[again] = self.rest_configuration[again]
-        return trial
+        free = list(self.free_joints)
+        again = np.array([owner in tubes for owner in self._free_joint_segments])
+        return self._with_free(q, np.where(again, self.rest_configuration[free], q[free]))
 
     def _links_of(self, tubes: Collection[str]) -> BoolArray:
         return np.array([owner in tubes for owner in self.link_segments])
@@ -242,13 +246,13 @@ class ShapeFitter:
 
     def _failed(self, evidence: ShapePointClassification) -> set[str]:
         """Tubes of which too much is seen to be empty."""
-        failed = set()
-        for name in dict.fromkeys(self.link_segments):
-            mine = self._lengths * self._links_of({name})
-            empty = float(mine @ evidence.visibly_empty_fraction) > 0
-            if empty and evidence.length_weighted_coverage(mine) < self.options.min_tube_coverage:
-                failed.add(name)
-        return failed
+        own = {name: self._lengths * self._links_of({name}) for name in self.link_segments}
+        return {
+            name
+            for name, mine in own.items()
+            if mine @ evidence.visibly_empty_fraction > 0
+            and evidence.length_weighted_coverage(mine) < self.options.min_tube_coverage
+        }
 
     def _without(
         self, best: _Minimum, evidence: ShapePointClassification, sight: ProcessedFrameCloud, links: BoolArray
@@ -267,15 +271,13 @@ class ShapeFitter:
         on_nodes, on_points = self._tasks(sight, *left)
         unit = np.eye(len(self.free_joints))
         tried = [self._minimise(_Minimum(start, unit, math.inf), on_nodes) for start in starts]
-        best = min(tried, key=lambda minimum: minimum.cost)
-        last = self._minimise(best, on_points)
-        evidence = assess_shape_against_cloud(self.tube_links_at(last.q), sight, self.max_informative_surface_distance)
+        last = self._minimise(min(tried, key=lambda minimum: minimum.cost), on_points)
+        near = self.max_informative_surface_distance
+        evidence = assess_shape_against_cloud(self.tube_links_at(last.q), sight, near)
         keep = ~(evidence.is_contested | evidence.is_foreign)
         if on_points and keep.any():
             last = self._minimise(last, self._tasks(sight, left[0], keep)[1])
-            evidence = assess_shape_against_cloud(
-                self.tube_links_at(last.q), sight, self.max_informative_surface_distance
-            )
+            evidence = assess_shape_against_cloud(self.tube_links_at(last.q), sight, near)
         return last, evidence
 
     @property
@@ -293,33 +295,27 @@ class ShapeFitter:
         nodes, points = sight.skeleton_nodes[at_nodes], sight.points[at_points]
         # nodes weigh together as much as the points, which share their errors
         node_weight = np.full(len(nodes), weight.sum() / max(len(nodes), 1)) * factor
-        anchors = sight.end_anchors
         on_nodes, on_surface = (nodes, node_weight, _NODE_RADIUS_FRACTION), (points, weight * factor, 1.0)
-        return (
-            [_Task(*on_nodes, scale, camera, anchors) for scale in options.node_loss_scales],
-            [_Task(*on_surface, scale, camera, anchors) for scale in options.surface_loss_scales],
-        )
+        both = (on_nodes, options.node_loss_scales), (on_surface, options.surface_loss_scales)
+        nodes_first, points_then = ([_Task(*of, s, camera, sight.end_anchors) for s in scales] for of, scales in both)
+        return nodes_first, points_then
 
     def _minimise(self, start: _Minimum, tasks: Sequence[_Task]) -> _Minimum:
         """One pass after the other, each from where the one before ended."""
-        free, end = list(self.free_joints), start
+        end, most = start, self.options.max_iterations
         for task in tasks:
-            q = end.q.copy()
 
-            def about(bends: Array, task: _Task = task, q: Array = q) -> LocalQuadraticModel:
-                trial = q.copy()
-                trial[free] = bends
-                return self._quadratic(trial, task)
+            def about(bends: Array, task: _Task = task, q: Array = end.q) -> LocalQuadraticModel:
+                return self._quadratic(self._with_free(q, bends), task)
 
             found = minimize_by_damped_newton(
                 about,
-                q[free],
-                max_iterations=self.options.max_iterations,
+                end.q[list(self.free_joints)],
+                max_iterations=most,
                 step_tolerance=_TOLERANCE,
                 cost_tolerance=_TOLERANCE,
             )
-            q[free] = found.x
-            end = _Minimum(q, found.final_model.hessian, found.final_model.cost)
+            end = _Minimum(self._with_free(end.q, found.x), found.final_model.hessian, found.final_model.cost)
         return end
 
     def _judged(
@@ -342,16 +338,13 @@ class ShapeFitter:
         corners = self._links_at(q)
         touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING
         # the spread across the links about each point
-        across = np.cross(corners[:, 1] - corners[:, 0], corners.mean(axis=1) - sight.camera_position)
-        across /= np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None]
-        wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across)
+        wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across_links(corners, sight.camera_position))
         swath = np.max(np.where(touching[..., None], wide[:, None], 0.0), axis=0)
-        off_end = np.zeros(places.shape)
+        off_end, noise = np.zeros(places.shape), max(self.options.surface_noise_std, evidence.noise_std)
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
-            if abs(offset) > _SIGMAS * max(self.options.surface_noise_std, evidence.noise_std):
+            if abs(offset) > _SIGMAS * noise:
                 at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING
-                axis = (corners[k, 1] - corners[k, 0]) / np.linalg.norm(corners[k, 1] - corners[k, 0])
-                off_end[at_end] = offset * axis
+                off_end[at_end] = offset * link_axes(corners)[k]
         # a point is seen where a link that begins or ends there is, of a tube that is where it should be
         sure = evidence.covered_fraction >= self.options.min_link_coverage
         sure &= ~self._links_of(self._failed(evidence))
@@ -374,22 +367,20 @@ class ShapeFitter:
         out, jacobian = self._corners(q)
         corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
         surface = nearest_surface_residuals(corners, self.link_radii, task.points, task.camera, task.share)
-        link, error, rows = surface.link_indices, surface.signed_distance, surface.jacobian_by_link_ends
+        link, error = surface.link_indices, surface.signed_distance
         square = (error / task.scale) ** 2
         cost = 0.5 * task.scale**2 * float(np.sum(task.weight * square / (1 + square)))
         weight = task.weight / (1 + square) ** 2
         # sums over the points of each link, by the start and the end of its centre line
         order = np.argsort(link, kind="stable")
-        block, apart = rows[order], error[order]
+        block, apart = surface.jacobian_by_link_ends[order], error[order]
         weighted = block * weight[order, None]
-        pull, stiff = np.zeros((len(self.link_radii), 6)), np.zeros((len(self.link_radii), 6, 6))
-        bounds = np.searchsorted(link[order], np.arange(len(self.link_radii) + 1))
-        for k, (begin, end) in enumerate(pairwise(bounds)):
-            pull[k] = apart[begin:end] @ weighted[begin:end]
-            stiff[k] = block[begin:end].T @ weighted[begin:end]
-        chain = by_q.reshape(len(self.link_radii), 6, -1)
+        bounds = pairwise(np.searchsorted(link[order], np.arange(len(self.link_radii) + 1)))
+        of_links = [slice(*edges) for edges in bounds]
+        pull = np.array([apart[mine] @ weighted[mine] for mine in of_links])
+        stiff = np.array([block[mine].T @ weighted[mine] for mine in of_links])
         gradient = by_q.T @ pull.ravel()
-        hessian = by_q.T @ np.matmul(stiff, chain).reshape(by_q.shape)
+        hessian = by_q.T @ np.matmul(stiff, by_q.reshape(len(stiff), 6, -1)).reshape(by_q.shape)
         for anchor in task.anchors:
             end, towards = anchor.link_end_index, anchor.direction / anchor.position_std
             off = float(towards @ (corners.reshape(-1, 3)[end] - anchor.position))
@@ -398,10 +389,9 @@ class ShapeFitter:
             gradient += by_off * off
             hessian += np.outer(by_off, by_off)
         held, by_held = (np.array(x) for x in self._held(q))
-        held = held.ravel()
         bend = (q - self.rest_configuration)[list(self.free_joints)] * self._prior
-        cost += 0.5 * float(held @ held + bend @ bend)
-        gradient += by_held.T @ held + bend * self._prior
+        cost += 0.5 * float(held.ravel() @ held.ravel() + bend @ bend)
+        gradient += by_held.T @ held.ravel() + bend * self._prior
         hessian += by_held.T @ by_held + np.diag(self._prior**2)
         return LocalQuadraticModel(cost, gradient, hessian)
 
@@ -414,7 +404,7 @@ class ShapeFitter:
         """What a frame's points say of lengths and radii at its shape."""
         names = [segment.name for segment in self.system.segment_layouts]
         free, many = len(self.free_joints), len(names)
-        out, jacobian = self._corners(q)
+        corners, jacobian = self._links_at(q), self._corners(q)[1]
         by_length, seen_by_length, held_by_length = (np.array(x) for x in self._grown(q))
         chain = np.hstack([np.array(jacobian), by_length])
         total = free + 2 * many
@@ -426,7 +416,7 @@ class ShapeFitter:
             hessian[:] += weighted.T @ rows
 
         if task is not None:
-            depths = line_of_sight_residuals(np.array(out).reshape(-1, 2, 3), self.link_radii, task.points, task.camera)
+            depths = line_of_sight_residuals(corners, self.link_radii, task.points, task.camera)
             weight = task.weight[depths.point_indices] / (1 + (depths.signed_distance / task.scale) ** 2) ** 2
             segment = np.array([names.index(owner) for owner in self.link_segments])
             for k in range(len(self.link_radii)):
@@ -437,10 +427,8 @@ class ShapeFitter:
                 add(rows, depths.signed_distance[mine], weight[mine])
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
             if np.isfinite(offset):
-                start, tip = np.array(out).reshape(-1, 2, 3)[k]
-                axis = (tip - start) / np.linalg.norm(tip - start)
                 rows = np.zeros((1, total))
-                rows[0, : free + many] = -axis @ chain[6 * k + 3 : 6 * k + 6]
+                rows[0, : free + many] = -link_axes(corners)[k] @ chain[6 * k + 3 : 6 * k + 6]
                 noise = max(self.options.surface_noise_std, evidence.noise_std)
                 add(rows, np.array([offset]), np.array([1.0 / noise**2]))
         held, by_held = (np.array(x) for x in self._held(q))
@@ -448,12 +436,12 @@ class ShapeFitter:
         gradient[:free] += (q - self.rest_configuration)[list(self.free_joints)] * self._prior**2
         hessian[:free, :free] += np.diag(self._prior**2)
         # the bends follow: dq = -H_qq^-1 (g_q + H_qx x)
-        follow = np.linalg.solve(hessian[:free, :free], np.column_stack([gradient[:free], hessian[:free, free:]]))
-        pull = gradient[free:] - hessian[free:, :free] @ follow[:, 0]
-        curvature = hessian[free:, free:] - hessian[free:, :free] @ follow[:, 1:]
+        both = np.column_stack([gradient, hessian[:, free:]])
+        follow = np.linalg.solve(hessian[:free, :free], both[:free])
+        left = both[free:] - hessian[free:, :free] @ follow
         moved = np.hstack([seen_by_length, np.zeros((len(seen_by_length), many))])
         moved = moved - np.array(self._seen(q)[1]) @ follow[:, 1:]
-        return TubeDimensionCost(pull, curvature, moved.reshape(-1, 3, 2 * many))
+        return TubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
 
     def tube_links_at(self, q: Array) -> TubeLinks:
         """Tube links in the world at a configuration."""
@@ -468,8 +456,7 @@ class ShapeFitter:
         return np.array(self._seen(np.asarray(q, float))[0]).reshape(-1, 3)
 
 
-@dataclass(frozen=True, eq=False)
-class _Minimum:
+class _Minimum(NamedTuple):
     """Where passes ended: configuration, Hessian by the free bends and cost there."""
 
     q: Array
@@ -477,8 +464,7 @@ class _Minimum:
     cost: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
+class _Task(NamedTuple):
     """One pass: points, their weights, where they lie on the tubes, the scale of the loss, the camera, seen ends."""
 
     points: Array

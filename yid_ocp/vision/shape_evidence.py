@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -21,8 +22,6 @@ from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.vision.frames import OcclusionMap
 from yid_ocp.vision.initial_shapes import ObservedObjectEnd
 from yid_ocp.vision.point_cloud import weighted_median
-
-_FilteredOutTest = Callable[[Array], BoolArray]
 
 _AWAY = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
 _STATIONS = 6  # per link at least, where it is asked whether points are near
@@ -35,6 +34,7 @@ _MOST_THINGS = 8  # of a frame, that are remembered
 _FILLED = 0.3  # of the usual number of points, with which a slice of a tube counts as filled
 _SURROUNDINGS = 3.0  # radii about a node, in which it is asked how wide the surface is there
 _AHEAD = 0.5  # of its length, by which a tube may be too short and its end still be found
+_RIM = 0.85  # of the radius to either side, within which a tube's depth is compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +69,18 @@ def tube_link_projections(
     return link, along, normal / np.maximum(distance, 1e-9)[:, None], distance
 
 
+def link_axes(link_ends: Array) -> Array:
+    """Unit vectors along links (K, 2, 3), shape (K, 3)."""
+    edge = link_ends[:, 1] - link_ends[:, 0]
+    return np.asarray(edge / np.linalg.norm(edge, axis=1)[:, None])
+
+
+def across_links(link_ends: Array, camera: Array) -> Array:
+    """Unit vectors across links (K, 2, 3) as a camera at (3,) sees them, shape (K, 3)."""
+    across = np.cross(link_ends[:, 1] - link_ends[:, 0], link_ends.mean(axis=1) - camera)
+    return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None])
+
+
 def _faces_away_from_camera(normal: Array, sight: Array) -> BoolArray:
     """Whether surface normals (N, 3) face away from the camera, by lines of sight (N, 3)."""
     return np.asarray(np.einsum("ij,ij->i", normal, sight) > -_AWAY * np.linalg.norm(sight, axis=1))
@@ -89,12 +101,10 @@ class ShapeFitQuality:
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
     mean_distance: float  # mean distance from the surface of points near it that are no thing's [m]
-    # (K,), share of each link's length on which there are own points, and on which the camera sees that there are
-    # none
+    # (K,), share of each link's length on which there are own points, and on which the camera sees that there are none
     covered_fraction: Array
     visibly_empty_fraction: Array
-    # (E,), by how much each free tube's end lies further along than the shape has it, NaN where that cannot be seen
-    # [m]
+    # (E,), how much further along each free tube's end lies than the shape has it, NaN where that cannot be seen [m]
     end_offsets: Array
     foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
 
@@ -124,12 +134,11 @@ class ProcessedFrameCloud:
     skeleton_nodes: Array  # (K, 3), of their skeleton [m]
     camera_position: Array  # (3,) [m]
     occlusion_map: OcclusionMap | None = None  # everything that the camera saw; without it no place counts as hidden
-    is_filtered_out: _FilteredOutTest | None = None  # which places, shape (S, 3), lie where filters leave no points
+    is_filtered_out: Callable[[Array], BoolArray] | None = None  # which places (S, 3) lie where filters leave no points
     end_anchors: Sequence[ObservedObjectEnd] = ()  # ends of the object that were seen
 
     @cached_property
     def _point_tree(self) -> cKDTree:
-        """Search tree of the points."""
         return cKDTree(self.points)
 
     @cached_property
@@ -144,9 +153,7 @@ class ProcessedFrameCloud:
         hidden = np.zeros(len(places), bool)
         if self.occlusion_map is not None:
             hidden |= self.occlusion_map.is_hidden(places, radius, margin)
-        if self.is_filtered_out is not None:
-            hidden |= self.is_filtered_out(places)
-        return hidden
+        return hidden if self.is_filtered_out is None else hidden | self.is_filtered_out(places)
 
 
 def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near: float) -> ShapePointClassification:
@@ -175,11 +182,9 @@ def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near
         contested = (on_shape | beyond) & (touching.query(seen.points)[0] < 2 * (tubes.radius[link] + gate))
         for i, k in enumerate(tubes.free_end_links):
             # whose the points at the end are is not known, so neither is where it is
-            if np.isfinite(ends[i]):
-                start, tip = tubes.link_ends[k]
-                end = tip + ends[i] * (tip - start) / np.linalg.norm(tip - start)
-                if touching.query(end)[0] < 2 * (tubes.radius[k] + gate):
-                    ends[i] = np.nan
+            end = tubes.link_ends[k, 1] + ends[i] * link_axes(tubes.link_ends)[k]
+            if np.isfinite(ends[i]) and touching.query(end)[0] < 2 * (tubes.radius[k] + gate):
+                ends[i] = np.nan
     own = on_shape & ~contested
     filled, empty = _coverage(tubes, seen, own, link, along, gate)
     counted = close & ~foreign
@@ -259,23 +264,20 @@ def _coverage(
     filled = np.bincount(station[own], minlength=int(count.sum())) > 0
     owner = np.repeat(np.arange(len(count)), count)
     bare = np.flatnonzero(~filled)
-    share = (bare - first[owner[bare]] + 0.5) / count[owner[bare]]
-    places = tubes.link_ends[owner[bare], 0] + share[:, None] * (
-        tubes.link_ends[owner[bare], 1] - tubes.link_ends[owner[bare], 0]
-    )
+    on = owner[bare]
+    share = (bare - first[on] + 0.5) / count[on]
+    places = tubes.link_ends[on, 0] + share[:, None] * (tubes.link_ends[on, 1] - tubes.link_ends[on, 0])
     empty = np.zeros(len(filled), bool)
-    empty[bare] = ~seen.is_hidden_or_filtered(places, tubes.radius[owner[bare]], gate)
+    empty[bare] = ~seen.is_hidden_or_filtered(places, tubes.radius[on], gate)
     return np.bincount(owner, filled) / count, np.bincount(owner, empty) / count
 
 
 def _swath(tubes: TubeLinks, seen: ProcessedFrameCloud, counted: BoolArray, link: IntArray, offset: Array) -> Array:
     """Variance of points across each link, seen from the camera, beyond that of a tube of its radius."""
-    edge = tubes.link_ends[:, 1] - tubes.link_ends[:, 0]
-    across = np.cross(edge, tubes.link_ends.mean(axis=1) - seen.camera_position)
-    across /= np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None]
+    across, count = across_links(tubes.link_ends, seen.camera_position), len(tubes.link_ends)
     square = np.einsum("ij,ij->i", offset, across[link]) ** 2
-    weight = np.bincount(link[counted], seen.point_weights[counted], minlength=len(edge))
-    total = np.bincount(link[counted], (seen.point_weights * square)[counted], minlength=len(edge))
+    weight = np.bincount(link[counted], seen.point_weights[counted], minlength=count)
+    total = np.bincount(link[counted], (seen.point_weights * square)[counted], minlength=count)
     # the picture of a tube is evenly filled from one side to the other
     return np.maximum(total / np.maximum(weight, 1e-12) - tubes.radius**2 / 3, 0.0)
 
@@ -285,9 +287,9 @@ def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: fl
 
     And which points lie about the axis between the tip and there.
     """
-    (start, tip), radius = tubes.link_ends[link], float(tubes.radius[link])
-    length, thick = float(np.linalg.norm(tip - start)), max(radius, 2 * seen._point_spacing)
-    axis, behind = (tip - start) / length, max(3, int(length / thick))
+    (start, tip), radius, axis = tubes.link_ends[link], float(tubes.radius[link]), link_axes(tubes.link_ends)[link]
+    thick = max(radius, 2 * seen._point_spacing)
+    behind = max(3, int(float(np.linalg.norm(tip - start)) / thick))
     edges = thick * np.arange(-behind, max(3, int(_AHEAD * tubes.tube_lengths[link] / thick)) + 1.0)
     away = seen.points - tip
     along = away @ axis
@@ -309,11 +311,7 @@ def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: fl
     return end, about & (along > 0.0) & (along <= end)
 
 
-_RIM = 0.85  # of the radius to either side, within which a tube's depth is compared
-
-
-@dataclass(frozen=True, eq=False)
-class _SurfaceResiduals:
+class _SurfaceResiduals(NamedTuple):
     """Signed distances of points from the tubes' surface, with derivatives."""
 
     point_indices: IntArray
@@ -348,8 +346,7 @@ def line_of_sight_residuals(corners: Array, radius: Array, points: Array, camera
     appear thinner by several times noise^2/r. Points near the rim, where depth says little, are not compared.
     """
     link, along, normal, distance = tube_link_projections(corners, radius, points)
-    edge = corners[:, 1] - corners[:, 0]
-    axis = (edge / np.linalg.norm(edge, axis=1)[:, None])[link]
+    axis = link_axes(corners)[link]
     sight = camera - points
     front = sight - np.einsum("ij,ij->i", sight, axis)[:, None] * axis
     front /= np.maximum(np.linalg.norm(front, axis=1), 1e-12)[:, None]
@@ -367,10 +364,9 @@ def line_of_sight_residuals(corners: Array, radius: Array, points: Array, camera
 
 @dataclass(frozen=True, eq=False)
 class TubeDimensionCost:
-    """Quadratic cost of the tubes' lengths and radii in one frame, minimised over the joint bends.
+    """Quadratic cost  g'x + x'Sx/2  of the tubes' sizes in one frame, minimised over the joint bends.
 
-    The sizes are the logarithms of all lengths and then of all radii, segment by segment, relative to the values of the
-    fit. About these the least cost is  g'x + x'Sx/2.
+    The sizes x are the logarithms of all lengths and then of all radii, segment by segment, relative to the fit's.
     """
 
     gradient: Array  # (2 s,)
@@ -385,11 +381,9 @@ class FrameShapeFit(ShapeFitQuality):
     q: Array  # (n,), configuration, twists at rest
     point_positions: Array  # (np, 3), the system's points there [m]
     point_std: Array  # (np, 3), standard deviation of each coordinate by the curvature of the cost [m]
-    # (np,), whether there are points enough about each of the system's points, or a gripper that holds it
-    is_point_seen: BoolArray
+    is_point_seen: BoolArray  # (np,), whether a gripper holds it, or there are points enough about it
     grasp_gaps: Array  # (grasps, 3), from what each gripper holds to the gripper [m]
-    # share of the points on the shape that may belong to a thing which touches it; they are left out
-    contested_fraction: float
+    contested_fraction: float  # of the points on the shape: may belong to a thing which touches it, and are left out
     dimension_equations: TubeDimensionCost  # what the frame says of lengths and radii
     link_ends: Array  # (K, 2, 3), start and end of every link [m]
 
