@@ -36,17 +36,19 @@ from yid_ocp.vision.frames import CameraIntrinsics, ColourArray, FrameSequence, 
 
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
 _DEPTH_IMAGE_SUFFIX = ".png"
-_POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"
-"""Arrays of an NPZ file."""
-
+_POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"  # of an NPZ file
 _PCD_HEADER_BYTES = 10_000  # [bytes]; where a PCD file says how many points it has
 _COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
 _MAX_FRAME_BYTES = 1 << 28  # of one cloud or image
 _AGAIN = "copy or record it again"
 
 
-def _read_cloud(path: Path, coloured: bool = False) -> tuple[Array, ColourArray | None]:
-    """Points of a cloud in the file's unit, and their red, green and blue where asked for and there, both (N, 3)."""
+_Cloud = tuple[Array, ColourArray | None]
+"""Points in the file's unit, and their red, green and blue where it has them, both (N, 3)."""
+
+
+def _read_cloud(path: Path, coloured: bool = False) -> _Cloud:
+    """A cloud; colours of PLY files only where asked for."""
     check_input_file(path, _MAX_FRAME_BYTES)
     if path.suffix.lower() == ".ply":
         return _read_ply(path, coloured)
@@ -57,9 +59,9 @@ def _read_cloud(path: Path, coloured: bool = False) -> tuple[Array, ColourArray 
     return points, colours
 
 
-def _read_npz(path: Path) -> tuple[Array, ColourArray | None]:
-    allowed = f"the array `{_POINTS_ARRAY}` of numbers, shape (N, 3), and `{_COLOURS_ARRAY}` of whole numbers"
-    allowed += " from 0 to 255 if wanted"
+def _read_npz(path: Path) -> _Cloud:
+    allowed = f"the array `{_POINTS_ARRAY}` of numbers, shape (N, 3), and `{_COLOURS_ARRAY}` of whole numbers from 0"
+    allowed += " to 255 if wanted"
     try:
         with zipfile.ZipFile(path) as packed:
             check_number_count(sum(entry.file_size for entry in packed.infolist()), str(path))
@@ -75,7 +77,7 @@ def _read_npz(path: Path) -> tuple[Array, ColourArray | None]:
     return points.astype(np.float64), colours
 
 
-def _read_xyz(path: Path) -> tuple[Array, ColourArray | None]:
+def _read_xyz(path: Path) -> _Cloud:
     try:
         with warnings.catch_warnings():  # of an empty file, which is said below
             warnings.simplefilter("ignore", UserWarning)
@@ -89,7 +91,7 @@ def _read_xyz(path: Path) -> tuple[Array, ColourArray | None]:
     return rows[:, :3].copy(), seen.astype(np.uint8) if coloured else None
 
 
-def _read_pcd(path: Path) -> tuple[Array, ColourArray | None]:
+def _read_pcd(path: Path) -> _Cloud:
     o3d = import_open3d()
     with path.open("rb") as file:
         declared = _COUNT.search(file.read(_PCD_HEADER_BYTES))
@@ -121,8 +123,7 @@ def _read_depth_image(path: Path) -> Array:
     return image.astype(np.float64)
 
 
-_MAX_HEADER_BYTES = 100_000
-"""A longer head is none [bytes]."""
+_MAX_HEADER_BYTES = 100_000  # a longer head is none
 _TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
@@ -130,13 +131,11 @@ _TYPES = {
 }
 _AXIS_PROPERTIES, _COLOUR_PROPERTIES = ("x", "y", "z"), ("red", "green", "blue")
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-
-
 _Element = tuple[str, int, list[tuple[str, str]]]
 """A table of a PLY file: its name, its number of rows, its columns with NumPy's names of their types, "" for lists."""
 
 
-def _read_ply(path: Path, coloured: bool) -> tuple[Array, ColourArray | None]:
+def _read_ply(path: Path, coloured: bool) -> _Cloud:
     """Positions and colours of the vertices; other properties and later elements are left out."""
     head, end, body = path.read_bytes().partition(b"end_header")
     line, _, body = body.partition(b"\n")
@@ -184,8 +183,8 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
 
 def _vertices(
     path: Path, count: int, columns: Sequence[tuple[str, str]], order: str, body: bytes, coloured: bool
-) -> tuple[Array, ColourArray | None]:
-    names, kinds = [name for name, _ in columns], [kind for _, kind in columns]
+) -> _Cloud:
+    names, kinds = zip(*columns, strict=True) if columns else ((), ())
     if len(set(names)) < len(names) or not set(_AXIS_PROPERTIES) <= set(names) or "" in kinds:
         raise _damaged(path, "its vertices have no x, y and z, or lists")
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
@@ -211,9 +210,7 @@ def _vertices(
 
 _FRAMES_FORMAT = "yid-frames/1"
 _CAMERA_FILE, STAMP_FILE = "camera.json", "timestamps.csv"
-METRES_PER_LENGTH_UNIT: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
-"""Allowed units of clouds and their size in metres."""
-
+_METRES_PER_UNIT: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
 _KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_unit", "description")
 
 
@@ -225,12 +222,8 @@ def read_frame_folder(
     The folder holds `camera.json` (`yid-frames/1`: `pose` 4x4, `frame` "camera" or "world" of the clouds, `unit` "m" or
     "mm" of the clouds, `intrinsics` and `depth_unit` [m] of depth images), `timestamps.csv` (columns `file`, `t` [s])
     and the files that it names: PLY, PCD, NPZ or XYZ clouds, or 16-bit PNG depth images, in any order. They are read
-    when they are needed. A `pose`, shape (4, 4), or a `unit` that is given replaces the folder's.
-
-    Raises
-    ------
-    DataError
-        No such folder, no time stamps, no pose, an unknown key or unit, depth images without intrinsics.
+    when they are needed. A `pose`, shape (4, 4), or a `unit` that is given replaces the folder's. `DataError` for no
+    such folder, no time stamps, no pose, an unknown key or unit, depth images without intrinsics.
     """
     path = Path(folder)
     if not path.is_dir():
@@ -238,9 +231,7 @@ def read_frame_folder(
     head = _read_camera(path / _CAMERA_FILE)
     where = str(path / _CAMERA_FILE)
     camera = validated_camera_pose(head.get("pose") if pose is None else pose, where)
-    given = str(unit or head.get("unit", "m"))
-    if given not in METRES_PER_LENGTH_UNIT:
-        raise DataError(f"the unit is '{given}'", where=where, **unknown_name_details(given, METRES_PER_LENGTH_UNIT))
+    scale = metres_per_unit(str(unit or head.get("unit", "m")), where)
     frame = head.get("frame", "camera")
     if frame not in ("camera", "world"):
         raise DataError(f"the frame of the clouds is '{frame}'", where=where, allowed="camera, world")
@@ -254,7 +245,7 @@ def read_frame_folder(
         if file.suffix.lower() == _DEPTH_IMAGE_SUFFIX:
             assert intrinsics is not None
             return intrinsics.points_from_depth(_read_depth_image(file) * depth_unit)
-        points = _read_cloud(file)[0] * METRES_PER_LENGTH_UNIT[given]
+        points = _read_cloud(file)[0] * scale
         return (points - camera[:3, 3]) @ camera[:3, :3] if frame == "world" else points
 
     def colours(index: int) -> ColourArray | None:
@@ -266,10 +257,7 @@ def read_frame_folder(
 def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) -> None:
     """Write a frame sequence as a folder of binary PLY clouds for `read_frame_folder`.
 
-    Raises
-    ------
-    OutputError
-        The folder or a file cannot be written.
+    `OutputError` where the folder or a file cannot be written.
     """
     path, o3d = make_folder(folder), import_open3d()
     names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
@@ -291,29 +279,36 @@ def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) 
         writer.writerows([name, repr(float(t))] for name, t in zip(names, sequence.stamps, strict=True))
 
 
+def metres_per_unit(unit: str, where: str) -> float:
+    """Size of a cloud's length unit [m]; `DataError` for an unknown one."""
+    if unit not in _METRES_PER_UNIT:
+        raise DataError(f"the unit is '{unit}'", where=where, **unknown_name_details(unit, _METRES_PER_UNIT))
+    return _METRES_PER_UNIT[unit]
+
+
 def _read_camera(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
     head = read_input_json(path)
     if not isinstance(head, dict):
         raise DataError("the camera's file is not an object", where=str(path), allowed='{"pose": ..., ...}')
-    for key in head:
-        if key not in _KEYS:
-            raise DataError(f"unknown key '{key}'", where=str(path), **unknown_name_details(key, _KEYS))
+    for key in (key for key in head if key not in _KEYS):
+        raise DataError(f"unknown key '{key}'", where=str(path), **unknown_name_details(key, _KEYS))
     if head.get("format", _FRAMES_FORMAT) != _FRAMES_FORMAT:
         raise DataError(f"the format of the frames is '{head['format']}'", where=str(path), allowed=_FRAMES_FORMAT)
     return head
 
 
 def _check_kinds(names: Sequence[str], folder: Path, intrinsics: CameraIntrinsics | None) -> None:
+    known = (*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX)
     for name in names:
         kind = Path(name).suffix.lower()
-        if kind not in (*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX):
-            what, allowed = f"'{name}' is neither a cloud nor a depth image", (*_CLOUD_SUFFIXES, _DEPTH_IMAGE_SUFFIX)
-            raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(allowed))
+        if kind not in known:
+            what = f"'{name}' is neither a cloud nor a depth image"
+            raise DataError(what, where=str(folder / STAMP_FILE), allowed=", ".join(known))
         if kind == _DEPTH_IMAGE_SUFFIX and intrinsics is None:
-            what, hint = "there are depth images but the camera's intrinsics are missing", "add `intrinsics` with"
-            hint += " width, height, fx, fy, cx, cy [pixels]"
+            hint = "add `intrinsics` with width, height, fx, fy, cx, cy [pixels]"
+            what = "there are depth images but the camera's intrinsics are missing"
             raise DataError(what, where=str(folder / _CAMERA_FILE), hint=hint)
 
 
@@ -351,12 +346,11 @@ def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
         raise DataError("there is no frame", where=str(path), allowed=allowed)
     if not {"file", "t"} <= set(rows[0]):
         raise DataError(f"the columns are {', '.join(map(str, rows[0]))}", where=str(path), allowed=allowed)
-    names, times = [], []
+    times = []
     for number, row in enumerate(rows, start=2):
         try:
             times.append(float(row["t"]))
         except (TypeError, ValueError) as error:
             where = f"{path}, line {number}"
             raise DataError(f"the time is {row['t']!r}", where=where, allowed="seconds, as a number") from error
-        names.append(str(row["file"]))
-    return tuple(names), np.array(times)
+    return tuple(str(row["file"]) for row in rows), np.array(times)

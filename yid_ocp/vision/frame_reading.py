@@ -10,6 +10,7 @@ import os
 import posixpath
 import struct
 from collections.abc import Iterable
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers.bags import JOINT_STATE_MESSAGE_TYPE, BagMessage, OpenBag, relative_message_time_function
-from yid_ocp.errors import DataError, unknown_name_details
+from yid_ocp.errors import DataError
 from yid_ocp.files import check_input_file
-from yid_ocp.vision.frame_folder import METRES_PER_LENGTH_UNIT, STAMP_FILE, read_frame_folder
+from yid_ocp.vision.frame_folder import STAMP_FILE, metres_per_unit, read_frame_folder
 from yid_ocp.vision.frames import CameraIntrinsics, ColourArray, FrameSequence, import_open3d, validated_camera_pose
 
 _CLOUD_MESSAGE, _IMAGE_MESSAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
@@ -35,9 +36,7 @@ _PER_METRE = "/option/Depth_Units/value"  # topic of RealSense's files with the 
 def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str | None) -> FrameSequence:
     """Open the frames in a bag."""
     camera = validated_camera_pose(pose, f"{path}: give track.camera_pose")
-    bag = OpenBag(path)
-    if unit not in METRES_PER_LENGTH_UNIT:
-        raise DataError(f"the unit is '{unit}'", where=str(path), **unknown_name_details(unit, METRES_PER_LENGTH_UNIT))
+    bag, scale = OpenBag(path), metres_per_unit(unit, str(path))
     name = _topic(bag, topic)
     messages, stamps = _frames(bag, name)
     if not messages:
@@ -49,7 +48,7 @@ def _read_bag_frames(path: Path, pose: ArrayLike | None, unit: str, topic: str |
     def load(index: int) -> Array:
         content = _decoded(bag, messages[index])
         if lens is None:
-            return _points(content, where) * METRES_PER_LENGTH_UNIT[unit]
+            return _points(content, where) * scale
         return lens.points_from_depth(_depth(content, per_metre, where))
 
     def colours(index: int) -> ColourArray | None:
@@ -64,14 +63,11 @@ def _frames(bag: OpenBag, topic: str) -> tuple[list[BagMessage], Array]:
     frames: list[BagMessage] = []
     with bag.read_errors_as_data_errors():
         for connection, logged, data in bag.reader.messages([c for c in bag.reader.connections if c.topic == topic]):
-            before = sum(1 for frame in reversed(frames[-8:]) if frame.logged == logged)
+            before = sum(1 for frame in frames[-8:] if frame.logged == logged)
             frames.append(BagMessage(topic, logged, _stamp(bag, data), (connection, before)))
-        joints = [
-            BagMessage(connection.topic, logged, _stamp(bag, data), None)
-            for connection in bag.reader.connections
-            if connection.msgtype == JOINT_STATE_MESSAGE_TYPE
-            for _, (_, logged, data) in zip(range(1), bag.reader.messages([connection]), strict=False)
-        ]
+        of_joints = [c for c in bag.reader.connections if c.msgtype == JOINT_STATE_MESSAGE_TYPE]
+        firsts = chain.from_iterable(islice(bag.reader.messages([connection]), 1) for connection in of_joints)
+        joints = [BagMessage(connection.topic, logged, _stamp(bag, data), None) for connection, logged, data in firsts]
     return frames, np.array(list(map(relative_message_time_function(frames, joints), frames)))
 
 
@@ -119,12 +115,10 @@ def _topic(bag: OpenBag, wanted: str | None) -> str:
     if len(deep) == 1:
         return deep[0]
     if deep:
-        hint = "say which one with track.frame_topic"
-        what = f"the bag has {len(deep)} topics of clouds or depth images"
+        what, hint = f"the bag has {len(deep)} topics of clouds or depth images", "say which one with track.frame_topic"
         raise DataError(what, where=str(bag.path), allowed=", ".join(deep), hint=hint)
-    encoded = f"with the encoding {' or '.join(_DEPTH_ENCODINGS)}, not compressed"
-    allowed = f"{_CLOUD_MESSAGE}, or {_IMAGE_MESSAGE} {encoded}"
-    raise bag.no_usable_topics_error("the bag has no clouds and no depth images", allowed)
+    encoded = f"{_IMAGE_MESSAGE} with the encoding {' or '.join(_DEPTH_ENCODINGS)}, not compressed"
+    raise bag.no_usable_topics_error("the bag has no clouds and no depth images", f"{_CLOUD_MESSAGE}, or {encoded}")
 
 
 def _is_depth(bag: OpenBag, topic: str) -> bool:
@@ -140,24 +134,23 @@ def _lens(bag: OpenBag, topic: str) -> CameraIntrinsics:
     beside = {name: len(posixpath.commonpath(["/" + name, "/" + topic])) for name in infos}
     nearest = [name for name in infos if beside[name] == max(beside.values())]
     if len(nearest) != 1:
-        allowed = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}"
         what = f"the camera's intrinsics are not known: the bag has {len(nearest)} topics that may hold them"
-        hint = f"record {topic.rpartition('/')[0]}/camera_info as well"
-        raise DataError(what, where=str(bag.path), allowed=allowed, hint=hint)
+        allowed, beside_it = f"one topic of {_CAMERA_INFO_MESSAGE} beside {topic}", topic.rpartition("/")[0]
+        raise DataError(what, where=str(bag.path), allowed=allowed, hint=f"record {beside_it}/camera_info as well")
     info = _first(bag, nearest[0])
     # ROS 1 spells them with a capital
     fields = (getattr(info, name, getattr(info, name.upper(), ())) for name in ("k", "p", "d"))
     matrix, projection, bent = ([float(value) for value in entry] for entry in fields)
+    size = int(info.width), int(info.height)
     if "rect" in topic and projection[0] > 0:
         fx, _, cx, _, _, fy, cy = projection[:7]
-        return CameraIntrinsics(int(info.width), int(info.height), fx, fy, cx, cy)
-    if not (matrix[0] > 0 and matrix[4] > 0):
+        return CameraIntrinsics(*size, fx, fy, cx, cy)
+    fx, _, cx, _, fy, cy = matrix[:6]
+    if not (fx > 0 and fy > 0):
         hint = "calibrate the camera, or write a folder of frames with camera.json"
         raise DataError("the camera is not calibrated: its focal length is 0", where=nearest[0], hint=hint)
-    model = str(info.distortion_model) or "plumb_bob"
-    model = "equidistant" if model == "fisheye" else model
-    fx, _, cx, _, fy, cy = matrix[:6]
-    return CameraIntrinsics(int(info.width), int(info.height), fx, fy, cx, cy, model, tuple(bent))
+    model = {"": "plumb_bob", "fisheye": "equidistant"}.get(str(info.distortion_model), str(info.distortion_model))
+    return CameraIntrinsics(*size, fx, fy, cx, cy, model, tuple(bent))
 
 
 def _depth(content: Any, per_metre: float, where: str) -> Array:
@@ -186,10 +179,8 @@ def _cloud_columns(content: Any, names: Iterable[str], where: str) -> list[NDArr
         kind = np.dtype(order + _POINT_FIELD_TYPES.get(int(fields[name].datatype), "u1"))
         offset = int(fields[name].offset)
         if offset + kind.itemsize > step or row < width * step or len(data) < height * row:
-            what = f"the cloud has {len(data)} bytes for {width} x {height} points of {step}"
-            raise DataError(what, where=where)
-        column = np.ndarray((height, width), kind, data, offset, (row, step))
-        found.append(column.ravel())
+            raise DataError(f"the cloud has {len(data)} bytes for {width} x {height} points of {step}", where=where)
+        found.append(np.ndarray((height, width), kind, data, offset, (row, step)).ravel())
     return found
 
 
@@ -211,7 +202,6 @@ def _colours(content: Any, where: str) -> ColourArray | None:
 
 
 _BAG_SUFFIXES, _AZURE_KINECT_SUFFIX = (".bag", ".mcap", ".db3"), ".mkv"
-_MILLIMETRE, _MICROSECOND = 1e-3, 1e-6
 
 
 def read_frames(
@@ -221,12 +211,8 @@ def read_frames(
 
     They are a folder (`read_frame_folder`), a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file, of which `topic`
     names the clouds or depth images, or an Azure Kinect's `.mkv`, where the build of Open3D reads it. The camera's
-    `pose` (4, 4) in the world and the `unit` of clouds replace the folder's; others do not say them.
-
-    Raises
-    ------
-    DataError
-        What is there cannot be read, or lacks time stamps, pose or intrinsics.
+    `pose` (4, 4) in the world and the `unit` of clouds replace the folder's; others do not say them. `DataError` where
+    what is there cannot be read, or lacks time stamps, pose or intrinsics.
     """
     place = Path(path)
     ending = place.suffix.lower()
@@ -251,8 +237,8 @@ _FILM_HINT = "write its depth images as 16-bit PNG into a folder with camera.jso
 class _Film:
     """An Azure Kinect's film, whose frames are found by going through it: the last one that was read is kept."""
 
-    _kind: Any
     reader: Any = None
+    _kind: Any
 
     def __init__(self, path: Path) -> None:
         self.path, self._kind = path, getattr(import_open3d().io, "AzureKinectMKVReader", None)
@@ -264,8 +250,8 @@ class _Film:
         except RuntimeError as error:  # it loads the camera's own library when asked to
             raise DataError(f"{what} here ({error})", where=str(path), hint=_FILM_HINT) from error
         if not self.reader.is_opened():
-            what, allowed = "the film cannot be read", "an Azure Kinect's .mkv"
-            raise DataError(what, where=str(path), allowed=allowed, hint=_FILM_HINT)
+            allowed = "an Azure Kinect's .mkv"
+            raise DataError("the film cannot be read", where=str(path), allowed=allowed, hint=_FILM_HINT)
 
     def _rewind(self) -> None:
         if self.reader is not None:
@@ -275,7 +261,6 @@ class _Film:
         self._index, self._last = -1, None
 
     def count(self) -> int:
-        """How many frames there are, by going through all of them."""
         self._rewind()
         self.reader.next_frame()
         count = 0
@@ -286,7 +271,6 @@ class _Film:
         return count
 
     def frame(self, index: int) -> Any:
-        """Colour and depth of a frame."""
         if index < self._index:
             self._rewind()
         while self._index < index:
@@ -309,10 +293,10 @@ def _read_film(path: Path, pose: ArrayLike | None) -> FrameSequence:
     count = film.count()
     if not count:
         raise DataError("the film holds no frame", where=str(path))
-    times = _MICROSECOND * float(metadata.stream_length_usec) * np.arange(count) / count
+    times = 1e-6 * float(metadata.stream_length_usec) * np.arange(count) / count
 
     def depth(index: int) -> Array:
-        return _MILLIMETRE * np.asarray(film.frame(index).depth, float)
+        return 1e-3 * np.asarray(film.frame(index).depth, float)
 
     def colours(index: int) -> ColourArray | None:
         image = np.asarray(film.frame(index).color)

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -85,15 +85,9 @@ def track_object(
 ) -> TrackResult:
     """Track the object's points in a frame sequence.
 
-    Parameters
-    ----------
-    scene : CameraScene
-        Robot and object; joints that are not elastic must be in the recording. Without a URDF file there is no
-        self-filter and no clock offset.
-    recording : Recording or None
-        Joint angles, for the self-filter, the grasps and the clock; None where the model has no robot.
-    empty : FrameSequence, optional
-        Frames of the scene without robot and object, by the same camera: a background.
+    Joints that are not elastic must be in the recording, for the self-filter, the grasps and the clock; None where the
+    model has no robot. Without a URDF file there is no self-filter and no clock offset. `empty` are frames of the scene
+    without robot and object, by the same camera: a background.
 
     Raises
     ------
@@ -117,12 +111,10 @@ class _Work:
     skeleton: CloudSkeleton | None = None
 
     def say(self, **changes: Any) -> None:
-        """Fill in fields of the report."""
         self.report = replace(self.report, **changes)
 
 
-@dataclass(frozen=True, eq=False)
-class _Look:
+class _Look(NamedTuple):
     """What a frame shows, once for every way in which it may, the robot's configuration, and where searches begin."""
 
     sights: Sequence[ProcessedFrameCloud]
@@ -147,11 +139,10 @@ class FrameTracker:
         system, values = scene.system, scene.parameter_values
         self._loose: tuple[str, ...] = ()
         anywhere = options.root_placement != "model"
+        if anywhere and scene.robot_urdf is not None:
+            hint = "set track.options.root_placement to model, or model.robot to null"
+            raise ConfigError("a robot holds the object: its root is where the model has it", where="root", hint=hint)
         if anywhere:
-            if scene.robot_urdf is not None:
-                hint = "set track.options.root_placement to model, or model.robot to null"
-                what = "a robot holds the object: its root is where the model has it"
-                raise ConfigError(what, where="root", hint=hint)
             system, self._loose = system_with_free_root(system, values)
         self.system, self.parameter_values = system, values
         self.sequence, self.options, self.empty_scene = sequence, options, empty
@@ -163,21 +154,19 @@ class FrameTracker:
         known = () if anywhere else self.shape_fitter.recorded_joint_names
         self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
         tree = system.numeric_mechanism(values)
-        meshes: dict[int, TriangleMesh] = {}
+        meshes = extra_meshes_by_joint(scene.extra_meshes, tree)
         if scene.robot_urdf is not None:
-            meshes = load_robot_meshes(scene.robot_urdf, tree, options.robot_mesh_kind)
-            if all(joint < 0 for joint in meshes):
+            robot = load_robot_meshes(scene.robot_urdf, tree, options.robot_mesh_kind)
+            if all(joint < 0 for joint in robot):
                 raise ModelError("no link of the robot moves with the model's joints", where=str(scene.robot_urdf))
-        for joint, extra in extra_meshes_by_joint(scene.extra_meshes, tree).items():
-            meshes[joint] = TriangleMesh.concatenate([*([meshes[joint]] if joint in meshes else []), *extra])
-        self.robot_surfaces = ArticulatedSurfaces(tree, meshes) if meshes else None
+            meshes |= {joint: [mesh, *meshes.get(joint, ())] for joint, mesh in robot.items()}
+        whole = {joint: TriangleMesh.concatenate(parts) for joint, parts in meshes.items()}
+        self.robot_surfaces = ArticulatedSurfaces(tree, whole) if whole else None
         self.arm_surface: ArmSurface | None = None
         self._widest = float(self.shape_fitter.link_radii.max())
         if self.robot_surfaces is not None and self.joint_time_span is not None and scene.robot_urdf is not None:
-            held_at = self.shape_fitter.gripper_positions_at
-            self.arm_surface = ArmSurface(
-                self.robot_surfaces, self._configuration_at_rest, held_at, self._widest + _GRIP
-            )
+            held = self.shape_fitter.gripper_positions_at, self._widest + _GRIP
+            self.arm_surface = ArmSurface(self.robot_surfaces, self._configuration_at_rest, *held)
         self.frame_order, self._reasons = _by_stamp(sequence.stamps)
         usable = [i for i in self.frame_order if i not in self._reasons]
         self._check_clock(usable)
@@ -199,23 +188,23 @@ class FrameTracker:
     def calibrate_sequence(self) -> SequenceCalibration:
         """Calibration shared by the sequence, estimated from some of its frames."""
         calibration = self._calibration()
-        background = BackgroundPoints()
         filters, noise = self.options.filters, self.options.shape_fit.surface_noise_std
-        if self.empty_scene is not None:
-            seen = (self._finite(self.empty_scene, i)[0] for i in range(len(self.empty_scene)))
-            clouds = [calibration.camera_state.measured_to_world_points(points) for points in seen]
-            background = BackgroundPoints.from_static_points(clouds, filters.voxel_size, noise)
+        seen = (
+            ()
+            if self.empty_scene is None
+            else (self._finite(self.empty_scene, i)[0] for i in range(len(self.empty_scene)))
+        )
+        clouds = [calibration.camera_state.measured_to_world_points(points) for points in seen]
+        background = BackgroundPoints.from_static_points(clouds, filters.voxel_size, noise)
         looks = [look for i in self._asked if (look := self._look(i, calibration, background)[1]) is not None]
         last: list[tuple[ShapeFitter, FrameShapeFit]] = []
 
         def fitted(values: Mapping[str, float], starts: Sequence[Array]) -> list[FrameShapeFit]:
             shape = self._shape_of(values)
-            before: list[Array | None] = list(starts) if len(starts) == len(looks) else [None] * len(looks)
-            last[:] = [
-                (shape, shape.fit_frame(look.sights[0], look.q, look.starts[0] if start is None else (start,)))
-                for look, start in zip(looks, before, strict=True)
-            ]
-            return [fit for _, fit in last]
+            begun = [(q,) for q in starts] if len(starts) == len(looks) else [look.starts[0] for look in looks]
+            fits = [shape.fit_frame(look.sights[0], look.q, q) for look, q in zip(looks, begun, strict=True)]
+            last[:] = [(shape, fit) for fit in fits]
+            return fits
 
         shared = 0.0
         if looks:
@@ -224,11 +213,8 @@ class FrameTracker:
         asked = self.options.estimated_dimensions
         sizes = estimate_and_check_dimensions(self.system, self.parameter_values, asked, (noise, shared), fitted)
         if self.options.background_estimation == "frames":
-            shapes = [
-                shape.tube_links_at(fit.q)
-                for shape, fit in last
-                if not frame_rejection_reason(fit, shape, self.options)
-            ]
+            good = (pair for pair in last if not frame_rejection_reason(pair[1], pair[0], self.options))
+            shapes = [shape.tube_links_at(fit.q) for shape, fit in good]
             clouds = [look.sights[0].points for look in looks]
             near = self.shape_fitter.max_informative_surface_distance
             found = BackgroundPoints.from_static_points(clouds, 2 * filters.voxel_size, noise, shapes, near)
@@ -304,11 +290,9 @@ class FrameTracker:
     def _read(self, index: int, calibration: CameraCalibration) -> tuple[WeightedCloud, Array]:
         """A frame's cloud in the world where the object can be, the robot's points among them, and all its points."""
         found, finite = self._finite(self.sequence, index)
-        points = calibration.camera_state.measured_to_world_points(found)
-        filters = self.options.filters
-        q = self._configuration_at_rest(
-            float(calibration.camera_state.stamps_to_joint_clock(self.sequence.stamps[index]))
-        )
+        state, filters = calibration.camera_state, self.options.filters
+        points = state.measured_to_world_points(found)
+        q = self._configuration_at_rest(float(state.stamps_to_joint_clock(self.sequence.stamps[index])))
         inside = self.object_region.membership_test_at(q, calibration.camera_position)(points)
         if not inside.any():
             raise DataError("no point lies where the object can be: check the camera's pose")
@@ -316,9 +300,8 @@ class FrameTracker:
             colours = self.sequence.load_colours(index)
             if colours is None:
                 raise DataError("the cloud has no colours")
-            inside[inside] = has_wanted_colour(
-                colours[finite][inside], filters.object_colours, filters.max_colour_angle
-            )
+            wanted = filters.object_colours, filters.max_colour_angle
+            inside[inside] = has_wanted_colour(colours[finite][inside], *wanted)
             if not inside.any():
                 raise DataError("no point has one of the object's colours: check filters.object_colours")
         return voxel_averages(points[inside], filters.voxel_size), points
@@ -343,15 +326,14 @@ class FrameTracker:
 
     def frame_processing_stages(self, frame: FrameReport, common: SequenceCalibration) -> FrameProcessingStages | None:
         """Processing stages of a frame, for figures; None if its cloud cannot be read."""
+        calibration = common.camera_calibration
         try:
-            cloud = common.camera_calibration.camera_state.measured_to_world_points(
-                self.sequence.load_cloud(frame.index)
-            )
+            cloud = calibration.camera_state.measured_to_world_points(self.sequence.load_cloud(frame.index))
         except DataError:
             return None
-        work, _ = self._look(frame.index, common.camera_calibration, common.background)
+        work, _ = self._look(frame.index, calibration, common.background)
         filtered = None if work.filtered is None else work.filtered.points
-        return FrameProcessingStages(frame, common.camera_calibration.camera_position, cloud, filtered, work.skeleton)
+        return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
     def unprocessed_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Report of a frame before processing, with the reason if it is dropped."""
@@ -417,7 +399,8 @@ class FrameTracker:
 
     def _prepared(self, work: _Work, calibration: CameraCalibration, background: BackgroundPoints) -> _Look:
         """What a frame shows of the object; `DataError` with the reason why it is dropped."""
-        options, index, stamp, t = self.options, work.report.index, work.report.stamp, work.report.joint_time
+        index, stamp, t = work.report.index, work.report.stamp, work.report.joint_time
+        options, state = self.options, calibration.camera_state
         cloud, raw = self._read(index, calibration)
         work.say(n_raw_points=len(raw))
         if self.joint_time_span is not None and not self.joint_time_span[0] <= t <= self.joint_time_span[1]:
@@ -425,7 +408,6 @@ class FrameTracker:
         rng = np.random.default_rng([options.seed, index])
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
-            state = calibration.camera_state
             own = estimate_excess_stamp_delay(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
@@ -446,7 +428,7 @@ class FrameTracker:
             cloud = cloud.select(np.sort(rng.choice(len(cloud), filters.max_points, replace=False)))
             work.say(n_filtered_points=len(cloud))
         begun = time.process_time()
-        view = OcclusionMap(raw, calibration.camera_state.pose, self.sequence.intrinsics, cloud.points)
+        view = OcclusionMap(raw, state.pose, self.sequence.intrinsics, cloud.points)
         given = calibration.camera_position, view, self._removed(q, calibration, background)
         if self.initial_shape_finder is None:
             look = self._held(work, cloud, q, rng, given)
@@ -488,14 +470,13 @@ class FrameTracker:
 
 
 def _chosen_points(system: System, wanted: tuple[str, ...] | None) -> tuple[str, ...]:
-    if wanted is None:
-        held = {grasp.held_frame for grasp in system.grasps}
-        return tuple(name for name in system.point_frames if name not in held) or system.point_frames
-    for name in wanted:
+    held = {grasp.held_frame for grasp in system.grasps}
+    for name in wanted or ():
         if name not in system.point_frames:
             hint = nearest_name_hint(name, system.point_frames)
             raise ConfigError(f"there is no point '{name}'", where="track options: points", hint=hint)
-    return wanted
+    free = tuple(name for name in system.point_frames if name not in held) or system.point_frames
+    return free if wanted is None else wanted
 
 
 def _joint_angles(
@@ -524,17 +505,15 @@ def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
     reasons = {int(i): "its time stamp is not a number" for i in np.flatnonzero(~np.isfinite(stamps))}
     order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
     before = -math.inf
-    for i in order:
-        if i not in reasons:
-            if stamps[i] - before < _SAME_TIME:
-                reasons[i] = "its time stamp is that of the frame before: a duplicate"
-            else:
-                before = float(stamps[i])
+    for i in (i for i in order if i not in reasons):
+        if stamps[i] - before < _SAME_TIME:
+            reasons[i] = "its time stamp is that of the frame before: a duplicate"
+        else:
+            before = float(stamps[i])
     return tuple(order), reasons
 
 
 def _spread(indices: Sequence[int], most: int) -> tuple[int, ...]:
     """So many of the indices at most, evenly spread."""
-    if len(indices) <= most:
-        return tuple(indices)
-    return tuple(indices[int(k)] for k in np.linspace(0, len(indices) - 1, most).round())
+    count = min(len(indices), most)
+    return tuple(indices[int(k)] for k in np.linspace(0, len(indices) - 1, count).round())
