@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -50,8 +51,7 @@ class _Centerline:
     @property
     def end_nodes(self) -> IntArray:
         """Nodes at which only one edge ends."""
-        count = np.bincount(self.edges.ravel(), minlength=len(self.nodes))
-        return np.flatnonzero(count <= 1)
+        return np.flatnonzero(np.bincount(self.edges.ravel(), minlength=len(self.nodes)) <= 1)
 
     @property
     def to_skeleton(self) -> CloudSkeleton:
@@ -88,18 +88,14 @@ def trace_centerline(cloud: WeightedCloud, diameter: float, gap: float, rng: np.
     points = cloud.points
     if len(points) > _MOST:
         points = points[np.sort(rng.choice(len(points), _MOST, replace=False))]
-    nothing = _Centerline(np.empty((0, 3)), np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), diameter)
+    if len(points) > _NEIGHBOURS:
+        points, graph = _connected(points, gap)
     if len(points) <= _NEIGHBOURS:
-        return nothing
-    points, graph = _connected(points, gap)
-    if len(points) <= _NEIGHBOURS:
-        return nothing
+        return _Centerline(np.empty((0, 3)), np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), diameter)
     far = int(np.argmax(dijkstra(graph, directed=False, indices=0)))
     away = np.asarray(dijkstra(graph, directed=False, indices=far))
-    spacing = float(np.median(graph.data))
-    width = max(diameter, 2.0 * spacing)
-    slices = np.floor(away / width).astype(np.int64)
-    nodes, edges = _slices(points, graph, slices)
+    width = max(diameter, 2.0 * float(np.median(graph.data)))
+    nodes, edges = _slices(points, graph, np.floor(away / width).astype(np.int64))
     tree, loops = _tree(nodes, edges, _LOOP * np.pi * diameter)
     return _pruned(_Centerline(nodes, tree, loops, width), _TWIG * diameter)
 
@@ -130,11 +126,16 @@ def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
         bridges.append((int(own[nearest[k]]), int(other[k])))
         joined.append(int(part[other[k]]))
     kept = np.flatnonzero(np.isin(part, joined))
-    renamed = np.full(len(points), -1)
-    renamed[kept] = np.arange(len(kept))
-    every = renamed[np.concatenate([edges, np.array(bridges, dtype=np.int64).reshape(-1, 2)])]
+    every = _renumbered(kept, len(points))[np.concatenate([edges, np.array(bridges, np.int64).reshape(-1, 2)])]
     both = np.unique(np.sort(every[(every >= 0).all(axis=1)], axis=1), axis=0)
     return points[kept], _graph(points[kept], both)
+
+
+def _renumbered(kept: IntArray, count: int) -> IntArray:
+    """Number of each of so many entries among those that are kept, -1 for the others."""
+    numbers = np.full(count, -1)
+    numbers[kept] = np.arange(len(kept))
+    return numbers
 
 
 def _slices(points: Array, graph: csr_matrix, slices: IntArray) -> tuple[Array, IntArray]:
@@ -174,9 +175,7 @@ def _pruned(trace: _Centerline, twig: float) -> _Centerline:
         gone = np.array(min(short, key=lambda found: found[0])[1][:-1])
         edges = edges[~np.isin(edges, gone).any(axis=1)]
     used = np.unique(edges)
-    renamed = np.full(len(nodes), -1)
-    renamed[used] = np.arange(len(used))
-    return _Centerline(nodes[used], renamed[edges], trace.loop_positions, trace.slice_width)
+    return replace(trace, nodes=nodes[used], edges=_renumbered(used, len(nodes))[edges])
 
 
 def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[float, list[int]]:
@@ -191,8 +190,7 @@ def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[f
     return length, way
 
 
-_FREE_ROOT_PREFIX = "found_root"
-"""Prefix of the joints that `system_with_free_root` adds."""
+_FREE_ROOT_PREFIX = "found_root"  # of the joints that `system_with_free_root` adds
 _MOST_ENDS = 7  # of a course; more are clutter, and there are too many ways
 _ALIKE = 1.3  # a way whose distances are off by so many times the best one's is tried as well
 _WHOLE = 0.08  # of the object, by which a course may be off that shows all of it
@@ -208,8 +206,7 @@ class ObservedObjectEnd:
     position_std: float
 
 
-@dataclass(frozen=True, eq=False)
-class _InitialShape:
+class _InitialShape(NamedTuple):
     """Initial shape: configuration (n,), root position (3,) [m] and observed ends."""
 
     q: Array
@@ -233,14 +230,13 @@ def system_with_free_root(system: System, values: Mapping[str, float] | None = N
     return replace(system, mechanism=carried, grasps=()), carrier.joint_names
 
 
-@dataclass(frozen=True, eq=False)
-class _Link:
+class _Link(NamedTuple):
     """A link: joints by which it turns, how far from the root it begins and ends [m], and a tip that lies behind it."""
 
     joints: tuple[int, ...]
     begin: float
     end: float
-    tip: int
+    tip: int = -1
 
 
 class InitialShapeFinder:
@@ -258,24 +254,21 @@ class InitialShapeFinder:
         self._axis = [np.array(joint.axis, float) for joint in tree.joints]
         self._turns = [joint.kind == "revolute" for joint in tree.joints]
         self._placed = [np.array(ca.DM(joint.placement.rotation)) for joint in tree.joints]
-        names = {name: i for i, name in enumerate(tree.joint_names)}
         ends: dict[int, float] = {}
-        found: list[tuple[str, int, tuple[int, ...], float, float]] = []
+        found: list[_Link] = []
         for segment in system.segment_layouts:
-            for i, (joints, length) in enumerate(zip(segment.link_joints, lengths[segment.name], strict=True)):
-                indices = tuple(names[joint] for joint in joints)
+            for joints, length in zip(segment.link_joints, lengths[segment.name], strict=True):
+                indices = tuple(tree.joint_index(joint) for joint in joints)
                 begin = ends.get(self._parent[indices[0]], 0.0)
                 ends[indices[-1]] = begin + float(length)
-                found.append((segment.name, i, indices, begin, begin + float(length)))
-        carrying = {self._parent[indices[0]] for _, _, indices, _, _ in found}
-        lasts = [indices[-1] for _, _, indices, _, _ in found]
+                found.append(_Link(indices, begin, ends[indices[-1]]))
+        carrying = {self._parent[link.joints[0]] for link in found}
+        lasts = [link.joints[-1] for link in found]
         tips = [last for last in lasts if last not in carrying]
         self._corners = [0, *(2 * lasts.index(tip) + 1 for tip in tips)]
         ways = {tip: set(tree.ancestor_joint_indices(tip)) for tip in tips}
-        self._links = [
-            _Link(indices, begin, end, next(k for k, tip in enumerate(tips) if indices[-1] in ways[tip]))
-            for _, _, indices, begin, end in found
-        ]
+        behind = (next(k for k, tip in enumerate(tips) if last in ways[tip]) for last in lasts)
+        self._links = [link._replace(tip=tip) for link, tip in zip(found, behind, strict=True)]
         self._root_to_tip_lengths = np.array([ends[tip] for tip in tips])
         shared = [[max((ends[j] for j in ways[a] & ways[b] if j in ends), default=0.0) for b in tips] for a in tips]
         to_tips = np.array([0.0, *self._root_to_tip_lengths])
@@ -295,10 +288,10 @@ class InitialShapeFinder:
         # the middles of the last slices are half a slice from the ends
         along = np.array([trace.path_lengths_from(int(leaf))[0][leaves] for leaf in leaves]) + trace.slice_width
         np.fill_diagonal(along, 0.0)
-        ways = []
-        for chosen in permutations(range(len(leaves)), n_ends):
-            off = np.abs(along[np.ix_(chosen, chosen)] - self._end_distances)
-            ways.append((float(off.max()), chosen))
+        ways = [
+            (float(np.abs(along[np.ix_(chosen, chosen)] - self._end_distances).max()), chosen)
+            for chosen in permutations(range(len(leaves)), n_ends)
+        ]
         best, nearest = min(ways)
         if best > max(_WHOLE * float(self._root_to_tip_lengths.max()), trace.slice_width):
             own = self._end_distances[0, 1]
@@ -312,8 +305,7 @@ class InitialShapeFinder:
         """The start whose root and tips lie at some nodes of the course."""
         reaches = zip(ends[1:], self._root_to_tip_lengths, strict=True)
         courses = [_Course(trace.path_between(ends[0], end), reach) for end, reach in reaches]
-        q = self._rest.copy()
-        first = self._links[0]
+        q, first = self._rest.copy(), self._links[0]
         turned = self._rotations(q)
         aim = courses[first.tip].direction(first.begin, first.end)
         carry = Rotation.align_vectors(aim, turned[first.joints[-1]][:, 2])[0].as_matrix()
@@ -323,11 +315,12 @@ class InitialShapeFinder:
         place = courses[first.tip].at(0.0)
         q[self._root[:3]] = place
         q[self._root[3:]] = Rotation.from_matrix(carry).as_euler("XYZ")
-        anchors = []
+        anchors, width = [], trace.slice_width
         for corner, end in zip(self._corners, ends, strict=True):
             ahead = trace.outward_direction(end)
-            middle = trace.nodes[end] + 0.5 * trace.slice_width * ahead
-            anchors.append(ObservedObjectEnd(corner, ahead, middle, trace.slice_width / np.sqrt(12.0)))
+            anchors.append(
+                ObservedObjectEnd(corner, ahead, trace.nodes[end] + 0.5 * width * ahead, width / np.sqrt(12.0))
+            )
         return _InitialShape(q, place, tuple(anchors))
 
     def _rotations(self, q: Array) -> list[Array]:
@@ -348,8 +341,7 @@ class InitialShapeFinder:
         base, ahead = turned[carrier] if carrier >= 0 else np.eye(3), np.array([0.0, 0.0, 1.0])
         for j in joints:
             if bends and j == bends[0]:
-                local = (base @ self._placed[j]).T @ aim
-                axis = self._axis[j]
+                local, axis = (base @ self._placed[j]).T @ aim, self._axis[j]
                 if len(bends) > 1:  # turns about the first axis leave what lies along it
                     other = self._axis[bends[1]]
                     rate = float(np.cross(other, ahead) @ axis)
@@ -370,10 +362,8 @@ class _Course:
         self.nodes, self.along = nodes, along * (length / max(float(along[-1]), 1e-9))
 
     def at(self, length: float) -> Array:
-        """The place so far along it [m]."""
-        return np.array([np.interp(length, self.along, self.nodes[:, axis]) for axis in range(3)])
+        return np.array([np.interp(length, self.along, column) for column in self.nodes.T])
 
     def direction(self, begin: float, end: float) -> Array:
-        """Unit vector from one place to another."""
         way = self.at(end) - self.at(begin)
         return np.asarray(way / max(float(np.linalg.norm(way)), 1e-9))

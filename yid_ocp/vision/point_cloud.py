@@ -130,10 +130,9 @@ class ReachableObjectRegion:
         anywhere: bool = False,
     ) -> None:
         tree, sizes = system.numeric_mechanism(values), tube_link_lengths_and_radii(system, values)
-        reach: dict[str, float] = {}
+        reach = {"": 0.0}
         for segment in system.segment_layouts:
-            before = reach[segment.parent_segment] if segment.parent_segment else 0.0
-            reach[segment.name] = float(sizes[segment.name][0].sum()) + before
+            reach[segment.name] = float(sizes[segment.name][0].sum()) + reach[segment.parent_segment or ""]
         radius = max(own for _, own in sizes.values())
         first = next(s for s in system.segment_layouts if s.parent_segment is None)
         self._radius = np.inf if anywhere else max(reach.values()) + radius + options.reach_margin
@@ -145,9 +144,8 @@ class ReachableObjectRegion:
         low = -np.inf if options.floor_height is None else options.floor_height
         if options.floor_height is None and tree.joints[base].parent_index < 0 and tips and not anywhere:
             rest = np.zeros(system.n_coordinates)
-            root = float(np.array(self._root(rest))[2, 0])
-            heights = np.array(ca.Function("tips", [q], [ca.horzcat(*tips)])(rest))[2]
-            if heights.min() > root:
+            root = float(self._root(rest)[2])
+            if np.array(ca.Function("tips", [q], [ca.horzcat(*tips)])(rest))[2].min() > root:
                 low = root + options.floor_margin
         self._lower = np.full(3, -np.inf) if options.box_lower is None else np.array(options.box_lower, float)
         self._upper = np.full(3, np.inf) if options.box_upper is None else np.array(options.box_upper, float)
@@ -164,8 +162,7 @@ class ReachableObjectRegion:
         ahead, limit = np.zeros(3), 0.0
         if self._behind is not None and self._base is not None:
             ahead = (self._base - np.asarray(camera, float)) * [1.0, 1.0, 0.0]
-            length = float(np.linalg.norm(ahead))
-            ahead = ahead / length if length > 0 else np.zeros(3)
+            ahead /= float(np.linalg.norm(ahead)) or 1.0
             limit = float(ahead @ self._base) + self._behind
 
         def contains(points: Array) -> BoolArray:
@@ -173,13 +170,16 @@ class ReachableObjectRegion:
             for axis in range(3):  # column by column, which is quicker than whole rows on large clouds
                 inside &= (points[:, axis] >= self._lower[axis]) & (points[:, axis] <= self._upper[axis])
             rest = np.flatnonzero(inside)
-            inside[rest] = points[rest] @ ahead <= limit
-            rest = np.flatnonzero(inside)
-            away = points[rest] - centre
-            inside[rest] = np.einsum("ij,ij->i", away, away) <= self._radius**2
+            near = _square_distances(points[rest], centre) <= self._radius**2
+            inside[rest] = near & (points[rest] @ ahead <= limit)
             return inside
 
         return contains
+
+
+def _square_distances(points: Array, place: Array) -> Array:
+    away = points - place
+    return np.asarray(np.einsum("ij,ij->i", away, away))
 
 
 def voxel_averages(points: Array, size: float) -> WeightedCloud:
@@ -226,14 +226,13 @@ def has_wanted_colour(colours: ArrayLike, wanted: ArrayLike, angle: float) -> Bo
     Colours are red, green and blue, 0 to 255 (sRGB), shapes (N, 3) and (C, 3). `angle` is the largest between two of
     them as directions of linear light, which brightness does not change [rad].
     """
-    seen, asked = (_light(np.asarray(entry, float)) for entry in (colours, wanted))
+    seen, asked = (_light_directions(np.asarray(entry, float) / 255.0) for entry in (colours, wanted))
     return np.asarray((seen @ asked.T).max(axis=1) >= math.cos(angle))
 
 
-def _light(colours: Array) -> Array:
+def _light_directions(colours: Array) -> Array:
     """Unit directions of linear light; black, which has none, is grey."""
-    share = colours / 255.0
-    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
     linear = np.maximum(linear, 1e-6)
     return np.asarray(linear / np.linalg.norm(linear, axis=1)[:, None])
 
@@ -303,22 +302,16 @@ def _thin_to_nodes(
         stays = np.ones(len(alive), bool)
         stays[centred] = False
         alive, points, weight = alive[stays], points[stays], weight[stays]
-        if not len(alive):
-            break
-        away = points - centre
-        square = np.einsum("ij,ij->i", away, away)
-        following = int(np.argmin(square))
-        if square[following] > options.neighbour_radius**2:
-            following = int(rng.integers(len(alive)))
-        seed = points[following]
+        if len(alive):
+            square = _square_distances(points, centre)
+            nearest = int(np.argmin(square))
+            seed = points[nearest if square[nearest] <= options.neighbour_radius**2 else rng.integers(len(alive))]
     return np.array(nodes).reshape(-1, 3), np.array(size), label
 
 
 def _near(points: Array, centre: Array, options: SkeletonOptions) -> IntArray:
     """The nearest points of a centre within the radius, no more than a segment has."""
-    away = points - centre
-    square = np.einsum("ij,ij->i", away, away)
-    within = options.neighbour_radius**2
+    square, within = _square_distances(points, centre), options.neighbour_radius**2
     if len(square) > options.segment_neighbours:
         found = np.argpartition(square, options.segment_neighbours - 1)[: options.segment_neighbours]
         return np.asarray(found[square[found] <= within])
@@ -350,9 +343,9 @@ def extract_skeleton(
 ) -> CloudSkeleton:
     """Skeleton of a cloud without connected parts that hold too few points, begun at the lowest point."""
     nodes, size, label = _thin_to_nodes(cloud, rng, options)
-    _, part = _spanning_forest(nodes, options)
+    edges, part = _spanning_forest(nodes, options)
     if not len(nodes):
-        return CloudSkeleton(nodes, label, np.empty((0, 2), dtype=np.int64), part)
+        return CloudSkeleton(nodes, label, edges, part)
     held = np.bincount(part, size)
     rank = np.argsort(np.argsort(-held, kind="stable"))
     keep = held[part] >= options.min_component_fraction * size.sum()
