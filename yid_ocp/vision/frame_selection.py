@@ -150,24 +150,27 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
 
 def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
     """Frames, with those that deviate from the other good frames marked as dropped."""
-    fits = [frame.shape_fit for frame in frames if frame.is_good and frame.shape_fit is not None]
+    fits = _good_fits(frames)
     if not fits:
         return list(frames)
-    usual = float(np.median([fit.mean_distance for fit in fits]))
-    gap = np.median([fit.grasp_gaps for fit in fits], axis=0)
+    usual = float(np.median([fit.mean_distance for fit in fits.values()]))
+    gap = np.median([fit.grasp_gaps for fit in fits.values()], axis=0)
     made = list(frames)
-    for k, frame in enumerate(frames):
-        fit, reason = frame.shape_fit, ""
-        if not frame.is_good or fit is None:
-            continue
+    for k, fit in fits.items():
+        reason = ""
         apart = float(np.linalg.norm(fit.grasp_gaps - gap, axis=1).max(initial=0.0))
         if fit.mean_distance > options.max_distance_ratio * usual:
             off = f"{1e3 * fit.mean_distance:.1f} mm off on average, {1e3 * usual:.1f} mm are usual"
             reason = f"the shape fits worse than in other frames: {off}"
         elif apart > options.max_grasp_gap_change:
             reason = f"{_END_ELSEWHERE}: {1e3 * apart:.0f} mm more than usual (a late stamp?)"
-        made[k] = replace(frame, drop_reason=reason)
+        made[k] = replace(frames[k], drop_reason=reason)
     return made
+
+
+def _good_fits(frames: Sequence[FrameReport]) -> dict[int, FrameShapeFit]:
+    """Shapes of the good frames by the frames' places."""
+    return {k: frame.shape_fit for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None}
 
 
 def tracked_states_and_points(
@@ -183,29 +186,23 @@ def tracked_states_and_points(
     Of the points in `columns` of the system's in the good frames. `DataError` without a good frame, or where no point
     is known well enough in any.
     """
-    good = [frame for frame in frames if frame.is_good]
+    good, sizes, calibration = _good_fits(frames), common.dimensions, common.camera_calibration
     if not good:
-        raise _none_good(frames, common.dimensions, things, source)
-    fits = [frame.shape_fit for frame in good if frame.shape_fit is not None]
-    t = np.array([frame.joint_time for frame in good])
-    position = np.array([fit.point_positions[list(columns)] for fit in fits])
-    std = np.hypot(np.array([fit.point_std[list(columns)] for fit in fits]), options.min_point_std)
-    sizes = common.dimensions
-    by_sizes = np.array([sizes.point_std(fit.dimension_equations.point_jacobian[list(columns)]) for fit in fits])
-    std = np.hypot(std, by_sizes)
-    velocity = np.zeros_like(position)
-    if len(t) > 1:
-        velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1))
+        raise _none_good(frames, sizes, things, source)
+    fits, of = list(good.values()), list(columns)
+    t = np.array([frames[k].joint_time for k in good])
+    position = np.array([fit.point_positions[of] for fit in fits])
+    by_sizes = np.array([sizes.point_std(fit.dimension_equations.point_jacobian[of]) for fit in fits])
+    std = np.hypot(np.hypot(np.array([fit.point_std[of] for fit in fits]), options.min_point_std), by_sizes)
+    velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1)) if len(t) > 1 else np.zeros_like(position)
     # a point is where it was at some time of the exposure, which is uniform over that
     std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure_time / math.sqrt(12.0)))
-    stamps = np.repeat([frame.stamp for frame in good], len(columns))
-    calibration = common.camera_calibration
-    shared = calibration.point_std_from_calibration(position.reshape(-1, 3), velocity.reshape(-1, 3), stamps).reshape(
-        std.shape
-    )
+    stamps = np.repeat([frames[k].stamp for k in good], len(of))
+    flat = position.reshape(-1, 3), velocity.reshape(-1, 3), stamps
+    shared = calibration.point_std_from_calibration(*flat).reshape(std.shape)
     std = np.hypot(std, shared)
     unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.max_point_std
-    unseen |= ~np.array([fit.is_point_seen[list(columns)] for fit in fits])
+    unseen |= ~np.array([fit.is_point_seen[of] for fit in fits])
     if unseen.all():
         best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
         wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_point_std).all())
@@ -213,10 +210,8 @@ def tracked_states_and_points(
         what = f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: {limit}"
         check = f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame"
         raise DataError(what, where=source, hint=_hint(sizes, things, check))
-    hidden = unseen[..., None]
-    q = np.array([fit.q for fit in fits])
-    position, std, shared = (np.where(hidden, np.nan, entry) for entry in (position, std, shared))
-    return t, q, position, std, shared
+    position, std, shared = (np.where(unseen[..., None], np.nan, entry) for entry in (position, std, shared))
+    return t, np.array([fit.q for fit in fits]), position, std, shared
 
 
 def _none_good(
@@ -263,11 +258,11 @@ def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOption
     """
     if options.root_placement == "model":
         return list(frames), ""
-    fitted = [k for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None]
+    fitted = _good_fits(frames)
     two = [k for k in fitted if frames[k].alternative_fit is not None]
     if not two:
-        near, said = options.approximate_root_position, "lengths and branches tell it"
-        said = said if near is None else "it is the one nearest to approximate_root_position"
+        near = "it is the one nearest to approximate_root_position"
+        said = "lengths and branches tell it" if options.approximate_root_position is None else near
         return _fixed(frames, options), f"root: {said}"
     made, last = list(frames), None
     for k in fitted:
@@ -313,10 +308,9 @@ def _ends(fits: Iterable[FrameShapeFit | None]) -> tuple[Array, Array]:
 
 def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
     """Drop frames whose root is not where it is in the others, where it is fixed."""
-    good = [k for k, frame in enumerate(frames) if frame.is_good and frame.shape_fit is not None]
-    made = list(frames)
+    good, made = _good_fits(frames), list(frames)
     if options.root_placement == "fixed" and good:
-        roots = _ends(frames[k].shape_fit for k in good)[0]
+        roots = _ends(good.values())[0]
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
             if away > options.max_grasp_gap_change + 2 * options.max_point_std:
                 reason = f"its root is not where it is in other frames: {1e3 * away:.0f} mm away"
@@ -328,11 +322,11 @@ def is_shape_self_touching(centre_line: Array, radius: Array) -> bool:
     """Whether a shape of links (K, 2, 3) and radii (K,) [m] touches itself at parts that are far apart along it."""
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)
-    edges = np.where(near < _TOUCHING, 1e-6, np.inf)  # zero would be no way
+    edges = np.where(near < _TOUCHING, 1e-6, 0.0)  # zero is no way
     lengths = np.linalg.norm(centre_line[:, 1] - centre_line[:, 0], axis=1)
     starts = 2 * np.arange(len(centre_line))
     edges[starts, starts + 1] = edges[starts + 1, starts] = lengths
-    along = shortest_path(np.where(np.isfinite(edges), edges, 0.0), directed=False)
+    along = shortest_path(edges, directed=False)
     spacing = max(float(radius.min()), float(lengths.sum()) / _MOST)
     link = np.repeat(np.arange(len(lengths)), np.ceil(lengths / spacing).astype(np.int64) + 1)
     share = np.concatenate([np.linspace(0.0, 1.0, np.count_nonzero(link == k)) for k in range(len(lengths))])

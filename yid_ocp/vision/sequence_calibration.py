@@ -75,9 +75,8 @@ class BackgroundPoints:
         often = 1.0 if shapes is None else max(2.0, _MOST * len(clouds))
         points: Array = np.asarray((place[count >= often] + 0.5) * voxel)
         for tubes in shapes or ():
-            if len(points):
-                link, _, _, distance = tube_link_projections(tubes.link_ends, tubes.radius, points)
-                points = points[distance > tubes.radius[link] + near]
+            link, _, _, distance = tube_link_projections(tubes.link_ends, tubes.radius, points)
+            points = points[distance > tubes.radius[link] + near]
         return BackgroundPoints(points, _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
 
 
@@ -107,13 +106,12 @@ def group_foreign_clusters(
     poses (4, 4) of the robot's links at a time; `background` says that what stands still is left out already.
     """
     groups: list[list[tuple[float, ForeignCluster]]] = []
-    for t, seen in things:
-        for thing in seen:
-            home = min(groups, key=lambda group: _apart(group[-1][1], thing), default=None)
-            if home is not None and home[-1][0] < t and _apart(home[-1][1], thing) < 1.0:
-                home.append((t, thing))
-            else:
-                groups.append([(t, thing)])
+    for t, thing in ((t, thing) for t, seen in things for thing in seen):
+        home = min(groups, key=lambda group: _apart(group[-1][1], thing), default=None)
+        if home is not None and home[-1][0] < t and _apart(home[-1][1], thing) < 1.0:
+            home.append((t, thing))
+        else:
+            groups.append([(t, thing)])
     groups = [group for group in groups if len(group) >= min(_FEWEST, len(things))]
     groups.sort(key=lambda group: -sum(thing.n_points for _, thing in group))
     found = []
@@ -129,9 +127,8 @@ def group_foreign_clusters(
         beside = bool(((low > box[1]) | (high < box[0])).any())
         how = f"moving with {link}" if link else "moving" if moving else "still"
         big, where = (mark.join(f"{x:.2f}" for x in of) for mark, of in ((" x ", size), (", ", centre)))
-        text = (
-            f"something of {big} m at ({where}) m is not the object, {how}, in {len(group)} of {len(things)} frames: "
-        )
+        text = f"something of {big} m at ({where}) m is not the object, {how}, "
+        text += f"in {len(group)} of {len(things)} frames: "
         boxed = "leave it out with track.options.filters.box_lower and box_upper"
         if link:
             text += f"give its shape under model.extra_meshes with parent_frame: {link}"
@@ -159,19 +156,16 @@ def _carrying_link(places: Array, poses: Sequence[Mapping[str, Array]]) -> str:
     def wandering(own: Array) -> float:
         return _TO_SIGMA * float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1)))
 
-    inside = {
-        name: wandering(
-            np.array([(p - at[name][:3, 3]) @ at[name][:3, :3] for p, at in zip(places, poses, strict=True)])
-        )
-        for name in poses[0]
-    }
-    best = min(inside, key=lambda name: inside[name], default="")
-    return best if best and inside[best] < _FOLLOWS * wandering(places) else ""
+    inside = {"": math.inf}
+    for name in poses[0]:
+        pose = np.array([at[name] for at in poses])
+        inside[name] = wandering(np.einsum("fij,fi->fj", pose[:, :3, :3], places - pose[:, :3, 3]))
+    best = min(inside, key=lambda name: inside[name])
+    return best if inside[best] < _FOLLOWS * wandering(places) else ""
 
 
 TubeDimensionKind = Literal["length", "radius"]
 _DIMENSION_KINDS: tuple[TubeDimensionKind, ...] = ("length", "radius")
-
 _PRIOR = (0.2, 0.4)  # standard deviations of the logarithms of lengths and radii
 _SIGMAS = 3.0  # from the model's value, beyond which that is doubted
 _CLEAR = 2.0  # from there, within which a first look finds nothing to doubt
@@ -205,9 +199,8 @@ class TubeDimensionCheck:
     @property
     def is_model_value_contradicted(self) -> BoolArray:
         """Which of the model's values contradict the frames, shape (2 s,)."""
-        return np.asarray(
-            self.is_dimension_determined & (np.abs(self.log_ratio) > _SIGMAS * self.dimension_log_ratio_std)
-        )
+        off = np.abs(self.log_ratio) > _SIGMAS * self.dimension_log_ratio_std
+        return np.asarray(self.is_dimension_determined & off)
 
     @property
     def contradiction_message(self) -> str:
@@ -224,9 +217,9 @@ class TubeDimensionCheck:
         """One message for every dimension that is doubted or estimated: the value that fits, with its interval."""
         lines = []
         for i, name in enumerate(self.names):
-            value = self.model_values[i] * math.exp(self.log_ratio[i])
+            value = 1e3 * self.model_values[i] * math.exp(self.log_ratio[i])
             two = 2 * value * self.dimension_log_ratio_std[i]
-            found = f"{1e3 * value:.4g} mm ± {1e3 * two:.2g} mm (two standard deviations) fits {self.n_frames} frames"
+            found = f"{value:.4g} mm ± {two:.2g} mm (two standard deviations) fits {self.n_frames} frames"
             said = f"the model says {1e3 * self.model_values[i]:.4g} mm"
             if self.is_estimated[i]:
                 lines.append(f"{name} is estimated: {found}; {said}")
@@ -299,24 +292,19 @@ def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
     """Fits whose free ends stand where those of the others do, as seen from the shape's."""
     if not fits:
         return []
-    ends = np.array([fit.end_offsets for fit in fits])
+    ends, noise = np.array([fit.end_offsets for fit in fits]), float(np.median([fit.noise_std for fit in fits]))
     keep = np.ones(len(fits), bool)
-    for column in ends.T:
-        seen = np.isfinite(column)
-        if seen.any():
-            middle = float(np.median(column[seen]))
-            spread = _TO_SIGMA * float(np.median(np.abs(column[seen] - middle)))
-            usual = max(spread, float(np.median([fit.noise_std for fit in fits])))
-            keep &= ~seen | (np.abs(column - middle) < _APART * usual)
+    for column in ends[:, np.isfinite(ends).any(axis=0)].T:
+        off = np.abs(column - np.nanmedian(column))
+        keep &= np.isnan(column) | (off < _APART * max(_TO_SIGMA * float(np.nanmedian(off)), noise))
     return [fit for fit, good in zip(fits, keep, strict=True) if good]
 
 
 def _changed(system: System, given: Mapping[str, float] | None, change: Array) -> dict[str, float]:
     """Parameter values with the sizes changed by logarithms (2 s,)."""
     values = dict(zip(system.parameters.names, system.parameters.vector(given).tolist(), strict=True))
-    made_of = [ca.vertcat(*s.link_lengths) for s in system.segment_layouts]
-    made_of += [s.radius for s in system.segment_layouts]
-    for entry, by in zip(made_of, change, strict=True):
+    lengths, radii = zip(*((ca.vertcat(*s.link_lengths), s.radius) for s in system.segment_layouts), strict=True)
+    for entry, by in zip((*lengths, *radii), change, strict=True):
         for symbol in ca.symvar(entry):
             values[symbol.name()] *= math.exp(float(by))
     return values

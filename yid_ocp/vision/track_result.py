@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -32,15 +32,13 @@ class FrameReport:
     stamp: float  # as the camera gave it [s]
     joint_time: float  # on the joints' clock [s]
     drop_reason: str  # why it was dropped; empty for a good one
-    # points of the cloud, points left by the filters, nodes of the skeleton
-    n_raw_points: int
-    n_filtered_points: int
+    n_raw_points: int  # of the cloud
+    n_filtered_points: int  # left by the filters
     n_skeleton_nodes: int
     stamp_delay: float  # of its stamp beyond the common offset, NaN where it cannot be told [s]
     cpu_seconds: float  # processor time from the filtered cloud to the fitted points [s]
     shape_fit: FrameShapeFit | None
-    # the shape with another end as its root that fits as well, where the root is sought
-    alternative_fit: FrameShapeFit | None = None
+    alternative_fit: FrameShapeFit | None = None  # with another end as its root, where that fits as well
 
     @property
     def is_good(self) -> bool:
@@ -71,11 +69,9 @@ class TrackResult:
     point_names: tuple[str, ...]  # points written down
     t: Array  # (M,), times of the good frames on the joints' clock [s]
     configurations: Array  # (M, n), configurations, twists at rest
-    # (M, np, 3), [m]; NaN where a point was not seen well enough. `shared_std`: the part of `std` that all frames
-    # have in common, from the camera's pose, depth and clock
-    position: Array
+    position: Array  # (M, np, 3), NaN where a point was not seen well enough, as are the standard deviations [m]
     std: Array
-    shared_std: Array
+    shared_std: Array  # the part that all frames have in common, from the camera's pose, depth and clock
     frame_reports: tuple[FrameReport, ...]  # all of them, by time stamp
     camera_calibration: CameraCalibration
     dimensions: TubeDimensionCheck  # what the frames say of the object's lengths and radii
@@ -84,14 +80,10 @@ class TrackResult:
     _place: Callable[[Array], Array]  # from a configuration to the points
 
     def configuration_at(self, t: float) -> Array:
-        """Configuration at any time between the good frames, by a cubic spline through theirs, shape (n,).
-
-        Beyond the first and the last frame it stays as it was there.
-        """
-        at = float(np.clip(t, self.t[0], self.t[-1]))
+        """Configuration at any time by a cubic spline through the good frames', constant beyond them, shape (n,)."""
         if len(self.t) < 2:
             return self.configurations[0].copy()
-        return np.asarray(CubicSpline(self.t, self.configurations, axis=0)(at))
+        return np.asarray(CubicSpline(self.t, self.configurations, axis=0)(np.clip(t, self.t[0], self.t[-1])))
 
     def points_at(self, t: float) -> Array:
         """Positions of the tracked points at any time, by the kinematics of `configuration_at`, shape (np, 3) [m]."""
@@ -115,10 +107,7 @@ class TrackResult:
         return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, pose=pose)
 
     def recording_with_points(self, recording: Recording | None) -> Recording:
-        """A recording with these points as its `points_camera`; `DataError` as `validate_recording`.
-
-        Without a recording, as of an object that no robot holds, one of these points alone.
-        """
+        """A recording, or one of nothing else, with these points as `points_camera`; errors as `validate_recording`."""
         recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != _CAMERA_POINT_GROUP)
         count = f"Points of {len(self.t)} of {len(self.frame_reports)} frames"
@@ -132,55 +121,54 @@ class TrackResult:
 
 _MOST = 12000  # points in one picture: more hide each other
 _GREY, _BLUE, _ORANGE, _GREEN = "#9a9a9a", "#1f5fa8", "#e07a1f", "#2a8f4f"
-_Picture = tuple[str, str, Sequence[tuple[Array, str, float]], Sequence[Array], str]
-"""Name and title of a picture, points with colour and size, lines (2, 3) and their colour."""
+
+
+class _Picture(NamedTuple):
+    """A picture: points with colour and size, lines (2, 3) and their colour."""
+
+    name: str
+    title: str
+    points: Sequence[tuple[Array, str, float]]
+    lines: Sequence[Array] = ()
+    line_colour: str = ""
 
 
 def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os.PathLike[str]) -> list[Path]:
     """Write one picture for every stage that a frame came to: cloud, filtered, skeleton, graph, fit.
 
     They are `NAME_1_cloud.png` to `NAME_5_fit.png` in the folder, which is made; the title of the last one says why the
-    frame was dropped.
-
-    Raises
-    ------
-    OutputError
-        The folder or a file cannot be written.
+    frame was dropped. `OutputError` where the folder or a file cannot be written.
     """
-    path = make_folder(folder)
-    report, parts = stages.report, [] if stages.filtered_points is None else [stages.filtered_points]
+    path, report, parts = make_folder(folder), stages.report, [np.empty((0, 3))]
+    parts += [] if stages.filtered_points is None else [stages.filtered_points]
     parts += [] if report.shape_fit is None else [report.shape_fit.link_ends.reshape(-1, 3)]
-    near = np.concatenate([np.empty((0, 3)), *parts])
+    near = np.concatenate(parts)
     stem = "".join(letter if letter.isalnum() else "_" for letter in Path(report.name).stem)
     written, pictures = [], _pictures(stages)
     for number, picture in enumerate(pictures, start=1):
-        name, title = picture[:2]
-        target = path / f"{stem}_{number}_{name}.png"
-        frame = stages.raw_points if name == "cloud" or not len(near) else near
+        written.append(path / f"{stem}_{number}_{picture.name}.png")
+        frame = stages.raw_points if picture.name == "cloud" or not len(near) else near
         ended = f"\n{report.drop_reason}" if number == len(pictures) and report.drop_reason else ""
-        _write(target, f"{report.name}: {title}{ended}", frame, stages.camera_position, picture)
-        written.append(target)
+        _write(written[-1], f"{report.name}: {picture.title}{ended}", frame, stages.camera_position, picture)
     return written
 
 
 def _pictures(stages: FrameProcessingStages) -> list[_Picture]:
     """The pictures of every stage that the frame came to, in order."""
     raw, near, skeleton, fit = stages.raw_points, stages.filtered_points, stages.skeleton, stages.report.shape_fit
-    made: list[_Picture] = [("cloud", f"{len(raw)} points of the camera", [(raw, _GREY, 0.4)], [], "")]
-    if near is None:
-        return made
-    made.append(("filtered", f"{len(near)} points of the object", [(near, _BLUE, 1.5)], [], ""))
-    if skeleton is None:
-        return made
-    faint, nodes, edges = (near, _GREY, 0.4), (skeleton.nodes, _ORANGE, 14.0), skeleton.nodes[skeleton.edges]
-    made.append(("skeleton", f"{len(skeleton.nodes)} nodes of the walk", [faint, nodes], [], ""))
-    title = f"{len(edges)} edges, {len(set(skeleton.component_of_node.tolist()))} connected parts"
-    made.append(("graph", title, [nodes], list(edges), _BLUE))
-    if fit is None:
-        return made
-    title = f"fitted shape, {1e3 * fit.mean_distance:.1f} mm off on average"
-    places = [faint, (fit.link_ends.reshape(-1, 3), _GREEN, 18.0), (fit.point_positions, _ORANGE, 40.0)]
-    return [*made, ("fit", title, places, list(fit.link_ends), _GREEN)]
+    made = [_Picture("cloud", f"{len(raw)} points of the camera", [(raw, _GREY, 0.4)])]
+    if near is not None:
+        made.append(_Picture("filtered", f"{len(near)} points of the object", [(near, _BLUE, 1.5)]))
+    if near is not None and skeleton is not None:
+        faint, nodes, edges = (near, _GREY, 0.4), (skeleton.nodes, _ORANGE, 14.0), skeleton.nodes[skeleton.edges]
+        made.append(_Picture("skeleton", f"{len(skeleton.nodes)} nodes of the walk", [faint, nodes]))
+        title = f"{len(edges)} edges, {len(set(skeleton.component_of_node.tolist()))} connected parts"
+        made.append(_Picture("graph", title, [nodes], list(edges), _BLUE))
+        if fit is not None:
+            title = f"fitted shape, {1e3 * fit.mean_distance:.1f} mm off on average"
+            places = [faint, (fit.link_ends.reshape(-1, 3), _GREEN, 18.0), (fit.point_positions, _ORANGE, 40.0)]
+            made.append(_Picture("fit", title, places, list(fit.link_ends), _GREEN))
+    return made
 
 
 def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Picture) -> None:
@@ -188,13 +176,12 @@ def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Pictur
 
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d")
-    _, _, places, lines, line_colour = picture
     rng = np.random.default_rng(0)
-    for points, colour, size in places:
-        shown = points if len(points) <= _MOST else points[rng.choice(len(points), _MOST, replace=False)]
+    for points, colour, size in picture.points:
+        shown = points if len(points) <= _MOST else rng.choice(points, _MOST, replace=False)
         axes.scatter(*shown.T, s=size, c=colour, linewidths=0, depthshade=False)
-    for line in lines:
-        axes.plot(*line.T, color=line_colour, linewidth=1.2 if line_colour == _BLUE else 2.5)
+    for line in picture.lines:
+        axes.plot(*line.T, color=picture.line_colour, linewidth=1.2 if picture.line_colour == _BLUE else 2.5)
     low, high = np.percentile(frame, 0.5, axis=0) - 0.02, np.percentile(frame, 99.5, axis=0) + 0.02
     middle, half = 0.5 * (low + high), 0.5 * float((high - low).max())
     limits = np.column_stack([middle - half, middle + half])
