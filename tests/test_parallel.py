@@ -1,7 +1,8 @@
-"""Tasks: finished ones are kept and not done again, failing and dying ones take no other with them."""
+"""Tasks that keep what they finished, failing and dying ones that take no other with them; threads and processes."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -10,7 +11,7 @@ import subprocess
 import sys
 import textwrap
 import time
-from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,14 @@ import pytest
 
 from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError
 from yid_ocp.parallel import (
+    InlineExecutor,
     Task,
     TaskResult,
     WorkerConfig,
     available_processor_count,
+    batched_call,
     map_in_threads,
+    map_with_batched_calls,
     process_pool,
     require_task_values,
     run_tasks,
@@ -131,16 +135,13 @@ def test_what_is_done_is_not_done_again(tmp_path, threads):
     ],
 )
 def test_a_result_that_is_not_whole_is_not_taken(tmp_path, threads, spoiled):
-    calls, folder = tmp_path / "calls", tmp_path / "results"
-    tasks = tasks_of(2, calls=str(calls))
+    tasks, folder = tasks_of(2, calls=str(tmp_path / "calls")), tmp_path / "results"
     run_tasks(counted, tasks, folder, threads)
     (file,) = (path for path in folder.iterdir() if '"number": 0' in path.read_text())
     file.write_text(spoiled(file.read_text()))
     (folder / f".{file.name}.1234.tmp").write_text("{")
     again = run_tasks(counted, tasks, folder, threads)
-    assert [entry.was_resumed for entry in again] == [False, True]
-    assert [entry.value["twice"] for entry in again] == [0, 2]
-    assert sorted(calls.read_text().split()) == ["0", "0", "1"]
+    assert [(entry.was_resumed, entry.value["twice"]) for entry in again] == [(False, 0), (True, 2)]
 
 
 def test_a_changed_input_is_done_again(tmp_path, threads):
@@ -177,28 +178,19 @@ def test_results_depend_on_the_function_and_on_the_sources_that_are_named(tmp_pa
 
 
 def test_a_worker_of_other_sources_does_nothing(tmp_path, threads, monkeypatch):
-    calls = tmp_path / "calls"
-    here = software_fingerprint()
-    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: {**here, "code": "a" * 64})
-    monkeypatch.setattr(
-        "yid_ocp.parallel.resumable_tasks._perform", perform_with(here, parallel_tasks._perform, monkeypatch)
-    )
-    (found,) = run_tasks(counted, tasks_of(1, calls=str(calls)), tmp_path / "results", threads)
-    assert "is of another version: code" in found.error
-    assert f"{here['code'][:12]} instead of aaaaaaaaaaaa" in found.error
-    assert not calls.exists()
-    assert not list((tmp_path / "results").iterdir())
-
-
-def perform_with(fingerprint, perform, monkeypatch):
-    """What a worker of this fingerprint does."""
+    here, perform, patched = software_fingerprint(), parallel_tasks._perform, "yid_ocp.parallel.resumable_tasks."
 
     def performed(job):
         with monkeypatch.context() as patch:
-            patch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: fingerprint)
+            patch.setattr(f"{patched}software_fingerprint", lambda: here)
             return perform(job)
 
-    return performed
+    monkeypatch.setattr(f"{patched}software_fingerprint", lambda: {**here, "code": "a" * 64})
+    monkeypatch.setattr(f"{patched}_perform", performed)
+    (found,) = run_tasks(counted, tasks_of(1, calls=str(tmp_path / "calls")), tmp_path / "results", threads)
+    assert f"is of another version: code {here['code'][:12]} instead of aaaaaaaaaaaa" in found.error
+    assert not (tmp_path / "calls").exists()
+    assert not list((tmp_path / "results").iterdir())
 
 
 def test_paths_are_absolute_for_workers_elsewhere(tmp_path, threads, monkeypatch):
@@ -238,13 +230,12 @@ def test_a_result_that_json_cannot_hold_is_a_failure(tmp_path, threads):
 
 
 def test_what_all_tasks_found_or_why_one_did_not():
-    good, bad = TaskResult("a", 1), TaskResult("b", error="ZeroDivisionError: no b")
+    good = TaskResult("a", 1)
     assert require_task_values([good, good]) == [1, 1]
     with pytest.raises(RuntimeError, match="1 of 2 tasks failed, b with ZeroDivisionError: no b; the same command"):
-        require_task_values([good, bad])
-    ours = TaskResult("c", error="DataError: no such file\n  where: here\n  try: there")
+        require_task_values([good, TaskResult("b", error="ZeroDivisionError: no b")])
     with pytest.raises(WorkerError, match="c with DataError: no such file; where: here; try: there"):
-        require_task_values([good, ours])
+        require_task_values([good, TaskResult("c", error="DataError: no such file\n  where: here\n  try: there")])
 
 
 def test_what_cannot_be_a_task_is_refused_before_any_runs(tmp_path, threads):
@@ -262,25 +253,21 @@ def test_what_cannot_be_a_task_is_refused_before_any_runs(tmp_path, threads):
     assert not calls.exists()
 
 
-class Breaking(Executor):
+class Breaking(InlineExecutor):
     """Does one task, then breaks."""
 
-    def __init__(self) -> None:
-        self.left = 1
+    left = 1
 
     def submit(self, function: Any, /, *arguments: Any, **named: Any) -> Future[Any]:
         if self.left == 0:
             raise BrokenExecutor
         self.left -= 1
-        future: Future[Any] = Future()
-        future.set_result(function(*arguments, **named))
-        return future
+        return super().submit(function, *arguments, **named)
 
 
 def test_an_executor_that_breaks_leaves_what_was_done(tmp_path):
     found = run_tasks(slow, tasks_of(3), tmp_path, Breaking())
-    assert [entry.value for entry in found] == [0, None, None]
-    assert [entry.error for entry in found] == ["", "the executor broke", "the executor broke"]
+    assert [(entry.value, entry.error) for entry in found] == [(0, ""), *[(None, "the executor broke")] * 2]
 
 
 # -- processes --------------------------------------------------------------------------------------------------------
@@ -291,7 +278,6 @@ def test_one_process_and_two_find_the_same(tmp_path):
     for workers in (1, 2):
         with process_pool(workers) as pool:
             found = run_tasks(process_name, tasks_of(4), tmp_path / str(workers), pool)
-        assert [entry.error for entry in found] == [""] * 4
         assert 1 <= len({entry.value for entry in found} - {here}) <= workers
     one, two = (sorted(path.name for path in (tmp_path / folder).iterdir()) for folder in ("1", "2"))
     assert one == two
@@ -322,7 +308,6 @@ def test_no_workers_and_workers_in_two_places_are_refused():
 def test_a_task_that_ends_its_process_takes_no_other_with_it(tmp_path, caplog):
     found = run_tasks(lethal, tasks_of(5, deadly=1), tmp_path)
     assert [entry.value for entry in found] == [0, None, 20, 30, 40]
-    assert found[1].error == "its process ended abruptly"
     assert [record.getMessage() for record in caplog.records] == ["task 1 failed: its process ended abruptly"]
 
 
@@ -347,33 +332,21 @@ if __name__ == "__main__":
 """
 
 
-def wait_for(folder: Path, pattern: str, count: int) -> None:
-    """Wait until there are so many files."""
-    until = time.monotonic() + 60
-    while len(list(folder.glob(pattern))) < count:
-        assert time.monotonic() < until, f"there is no {pattern}"
+def wait_until(reached: Any, seconds: float = 60) -> bool:
+    until = time.monotonic() + seconds
+    while not reached() and time.monotonic() < until:
         time.sleep(0.05)
+    return reached()
 
 
 def workers_of(parent: int) -> set[int]:
     found = set()
     for status in Path("/proc").glob("[0-9]*/stat"):
-        try:
+        with contextlib.suppress(OSError):
             fields = status.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[1]) == parent and fields[0] != "Z":
-            found.add(int(status.parent.name))
+            if int(fields[1]) == parent and fields[0] != "Z":
+                found.add(int(status.parent.name))
     return found
-
-
-def gone(processes: set[int]) -> bool:
-    until = time.monotonic() + 20
-    while any(Path(f"/proc/{process}").exists() for process in processes):
-        if time.monotonic() > until:
-            return False
-        time.sleep(0.05)
-    return True
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks processes up in /proc")
@@ -381,16 +354,85 @@ def gone(processes: set[int]) -> bool:
 def test_an_interrupted_or_killed_run_leaves_its_results_and_no_process(tmp_path, how):
     (tmp_path / "sleepers.py").write_text(textwrap.dedent(SLEEPERS))
     process = subprocess.Popen([sys.executable, str(tmp_path / "sleepers.py"), str(tmp_path)])
-    wait_for(tmp_path, "results/*.json", 1)
-    wait_for(tmp_path, "*.begun", 2)
+    assert wait_until(lambda: list(tmp_path.glob("results/*.json")) and len(list(tmp_path.glob("*.begun"))) > 1)
     workers = workers_of(process.pid)
     assert workers
     process.send_signal(how)
     assert process.wait(timeout=20) == (130 if how == signal.SIGINT else -signal.SIGKILL)
-    assert gone(workers)
+    assert wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 20)
     names = [json.loads(path.read_text())["name"] for path in (tmp_path / "results").glob("*.json")]
     assert names == ["0.0"]
 
 
 def test_threads_keep_the_order():
     assert map_in_threads(lambda x: x * x, range(7)) == [x * x for x in range(7)]
+
+
+# -- items at work side by side, whose questions are answered together -------------------------------------------------
+
+
+class Answers:
+    """Squares, and who asked for them together."""
+
+    def __init__(self) -> None:
+        self.asked: list[list[int]] = []
+
+    def __call__(self, questions: list[int]) -> list[int]:
+        self.asked.append(list(questions))
+        return [x * x for x in questions]
+
+
+def test_questions_of_all_items_meet():
+    squares = Answers()
+
+    def item(i: int) -> int:
+        """Asks i + 1 times, one question more every time."""
+        return sum(sum(batched_call(squares, [10 * i + k for k in range(turn + 1)])) for turn in range(i + 1))
+
+    found = map_with_batched_calls(item, range(3))
+    assert squares.asked == [[0, 10, 20], [10, 11, 20, 21], [20, 21, 22]]
+    assert found == [0, 100 + 100 + 121, 400 + 400 + 441 + 400 + 441 + 484]
+
+
+def test_more_items_than_are_at_work_at_once_and_two_functions():
+    squares, others = Answers(), Answers()
+    found = map_with_batched_calls(lambda i: batched_call(others if i % 2 else squares, [i])[0], range(20))
+    assert found == [i * i for i in range(20)]
+    assert (squares.asked[0], others.asked[0]) == ([0, 2, 4, 6], [1, 3, 5, 7])
+    assert sorted(x for group in squares.asked + others.asked for x in group) == list(range(20))
+
+
+def test_outside_and_within_an_item_one_asks_as_usual():
+    squares = Answers()
+    assert batched_call(squares, [3]) == [9]
+
+    def inner(_: int) -> list[int]:
+        return map_with_batched_calls(lambda j: batched_call(squares, [j])[0], range(2))
+
+    assert map_with_batched_calls(inner, range(2)) == [[0, 1], [0, 1]]
+    assert squares.asked == [[3], [0, 0], [1, 1]]
+    assert map_with_batched_calls(str, []) == []
+
+
+@pytest.mark.parametrize("kind", [KeyError, KeyboardInterrupt])
+def test_what_goes_wrong_is_said_where_the_map_was_called_and_leaves_nobody_waiting(kind):
+    ended = []
+
+    def refuses(questions: list[int]) -> list[int]:
+        raise kind
+
+    def item(i: int) -> None:
+        try:
+            batched_call(refuses, [i])
+        finally:
+            ended.append(i)
+
+    with pytest.raises(kind):
+        map_with_batched_calls(item, range(3))
+    assert sorted(ended) == [0, 1, 2]
+
+    def fails(i: int) -> int:
+        return batched_call(Answers(), [i])[0] if i != 1 else int("item 1")
+
+    with pytest.raises(ValueError, match="item 1"):
+        map_with_batched_calls(fails, range(3))
