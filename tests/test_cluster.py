@@ -38,19 +38,8 @@ def scheduler():
     where = {"dashboard_address": None, "host": "127.0.0.1", "scheduler_kwargs": {"allowed_failures": 1}}
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True, **where) as cluster:
         cluster.wait_for_workers(2, timeout=60)
-        yield SimpleNamespace(
-            address=cluster.scheduler_address, cluster=cluster, config=WorkerConfig(None, cluster.scheduler_address)
-        )
-
-
-def recover(cluster: Any) -> None:
-    """Wait for two workers; one that could not be started again in time, on a busy machine, is replaced."""
-    try:
-        cluster.wait_for_workers(2, timeout=30)
-    except TimeoutError:
-        cluster.scale(0)
-        cluster.scale(2)
-        cluster.wait_for_workers(2, timeout=60)
+        address = cluster.scheduler_address
+        yield SimpleNamespace(address=address, cluster=cluster, config=WorkerConfig(None, address))
 
 
 def processes(scheduler: Any) -> list[int]:
@@ -92,30 +81,41 @@ def test_a_killed_worker_loses_nothing_and_nothing_counts_twice(scheduler, tmp_p
     assert all(entry.was_resumed for entry in again)
 
 
-def test_a_task_that_ends_every_worker_fails_alone(scheduler, tmp_path, caplog):
+def test_a_task_that_ends_every_worker_fails_alone(scheduler, tmp_path):
     found = run_tasks(deadly, [Task(str(i), {"number": i}) for i in range(3)], tmp_path, scheduler.config)
     assert [entry.value for entry in found] == [0, None, 2]
     assert found[1].error == "every worker that tried it ended abruptly"
-    recover(scheduler.cluster)
+    try:
+        scheduler.cluster.wait_for_workers(2, timeout=30)
+    except TimeoutError:  # one that could not be started again in time, on a busy machine, is replaced
+        scheduler.cluster.scale(0)
+        scheduler.cluster.scale(2)
+        scheduler.cluster.wait_for_workers(2, timeout=60)
 
 
-def test_a_worker_of_another_version_is_refused(scheduler, tmp_path, monkeypatch):
-    other = {**software_fingerprint(), "yid-ocp": "99.0", "code": "b" * 64}
-    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: other)
-    with pytest.raises(WorkerError, match=r"of another version: yid-ocp \S+ instead of 99.0, code \w+ instead of bbb"):
-        scheduler.config.check_available()
-    older = {**software_fingerprint(), "python": "2.7"}
-    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: older)
-    with pytest.raises(WorkerError, match=r"python 3\.\S+ instead of 2.7"):
+@pytest.mark.parametrize(
+    ("other", "words"),
+    [
+        (
+            {"yid-ocp": "99.0", "code": "b" * 64},
+            r"of another version: yid-ocp \S+ instead of 99.0, code \w+ instead of bbb",
+        ),
+        ({"python": "2.7"}, r"python 3\.\S+ instead of 2.7"),
+    ],
+)
+def test_a_worker_of_another_version_is_refused(scheduler, monkeypatch, other, words):
+    here = software_fingerprint() | other
+    monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.software_fingerprint", lambda: here)
+    with pytest.raises(WorkerError, match=words):
         scheduler.config.check_available()
 
 
 def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeypatch):
-    squared_elsewhere = SimpleNamespace(__module__="nowhere.to_be_found")
-    with (
-        pytest.raises(WorkerError, match="ModuleNotFoundError: No module named 'nowhere'"),
-        connected(scheduler.address, squared_elsewhere, tmp_path),
-    ):
+    elsewhere, missing = (
+        SimpleNamespace(__module__="nowhere.to_be_found"),
+        "ModuleNotFoundError: No module named 'nowhere'",
+    )
+    with pytest.raises(WorkerError, match=missing), connected(scheduler.address, elsewhere, tmp_path):
         pass
     unseen = nullcontext(SimpleNamespace(name=str(tmp_path / "unseen")))
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks.tempfile.NamedTemporaryFile", lambda **_: unseen)
@@ -165,12 +165,9 @@ def test_an_event_loop_that_has_no_time_to_start_is_tried_again(scheduler, monke
         return real(**where)
 
     monkeypatch.setattr(distributed, "Client", busy)
-    if refused:
-        with pytest.raises(WorkerError, match="event loop did not start"), connected(scheduler.address):
-            pass
-    else:
-        with connected(scheduler.address) as (executor, _):
-            assert executor.submit(abs, -3).result(timeout=60) == 3
+    answer = pytest.raises(WorkerError, match="event loop did not start") if refused else nullcontext()
+    with answer, connected(scheduler.address) as (executor, _):
+        assert executor.submit(abs, -3).result(timeout=60) == 3
     assert len(asked) == 3
 
 
@@ -195,13 +192,9 @@ class Killing(Progress):
 @pytest.mark.slow
 def test_a_blind_proof_survives_a_killed_worker(scheduler, pendulum, tmp_path):
     pytest.importorskip("mujoco", reason="blind proofs need MuJoCo: pip install 'yid-ocp[blind]'")
-    settings = (
-        "model.arms.mode=driven",
-        "recordings.held_out=[]",
-        "output.write_report=false",
-        "problem.use_compiler=true",
-    )
-    run = load_config(pendulum, (*settings, "diagnosis.candidates=[joint_viscous, joint_coulomb]"))
+    settings = ("recordings.held_out=[]", "output.write_report=false", "problem.use_compiler=true")
+    candidates = "diagnosis.candidates=[joint_viscous, joint_coulomb]"
+    run = load_config(pendulum, ("model.arms.mode=driven", *settings, candidates))
     killing = Killing(scheduler)
     there = run_blind([run], tmp_path / "there", CASES, 3, killing, scheduler.config)
     assert killing.killed

@@ -7,6 +7,7 @@ import json
 import math
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -28,41 +29,26 @@ from yid_ocp.version import package_source_hash, software_fingerprint, software_
 
 
 def test_an_interruption_leaves_nothing(tmp_path):
-    def interrupted():
-        with atomic_write(tmp_path / "run.h5") as temporary:
-            temporary.write_text("half")
-            raise KeyboardInterrupt
+    def interrupted(temporary):
+        temporary.write_text("half")
+        raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
+    with pytest.raises(KeyboardInterrupt), atomic_write(tmp_path / "run.h5") as file:
+        interrupted(file)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_is_replaced_as_a_whole(tmp_path):
+def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
     file = tmp_path / "a.json"
     write_json(file, {"a": 1})
     write_json(file, {"a": [2, None]})
-    assert json.loads(file.read_text()) == {"a": [2, None]}
-    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
-
-
-def test_what_json_cannot_hold_leaves_the_old_file(tmp_path):
-    file = tmp_path / "a.json"
-    write_json(file, {"a": 1})
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_json(file, {"a": float("nan")})
-    assert json.loads(file.read_text()) == {"a": 1}
-    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
-
-
-def test_a_disk_that_refuses_is_the_users_business(tmp_path, monkeypatch):
-    def full(source, target):
-        raise OSError(28, "any words")
-
-    monkeypatch.setattr(os, "replace", full)
+    monkeypatch.setattr(os, "replace", Mock(side_effect=OSError(28, "any words")))
     with pytest.raises(OutputError, match=os.strerror(28)):
-        write_json(tmp_path / "a.json", 1)
-    assert not list(tmp_path.iterdir())
+        write_json(file, 1)
+    assert json.loads(file.read_text()) == {"a": [2, None]}
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
 def test_a_place_that_cannot_hold_a_file(tmp_path):
@@ -73,13 +59,13 @@ def test_a_place_that_cannot_hold_a_file(tmp_path):
 
 
 def test_the_hash_of_a_folder_is_that_of_its_files(tmp_path):
-    (tmp_path / "in").mkdir()
-    (tmp_path / "in" / "a").write_text("1")
-    (tmp_path / "in" / "b").write_text("2")
-    before = file_sha256(tmp_path / "in")
-    assert before == file_sha256(tmp_path / "in")
-    (tmp_path / "in" / "b").write_text("3")
-    assert file_sha256(tmp_path / "in") != before
+    folder, hashes = tmp_path / "in", []
+    folder.mkdir()
+    (folder / "a").write_text("1")
+    for text in ("2", "2", "3"):
+        (folder / "b").write_text(text)
+        hashes.append(file_sha256(folder))
+    assert hashes[0] == hashes[1] != hashes[2]
     with pytest.raises(DataError, match="no such file"):
         file_sha256(tmp_path / "absent")
 
@@ -106,15 +92,15 @@ def test_any_name_may_be_asked_for(tmp_path, name):
 
 def test_the_hash_of_sources_follows_their_names_and_content(tmp_path):
     (tmp_path / "inner").mkdir()
+    kernel = tmp_path / "inner" / "kernel.c"
     (tmp_path / "a.py").write_text("a = 1\n")
-    (tmp_path / "inner" / "kernel.c").write_text("int a;\n")
+    kernel.write_text("int a;\n")
     first = source_hash(tmp_path)
     (tmp_path / "a.pyc").write_text("compiled")
     assert source_hash(tmp_path) == first
-    (tmp_path / "inner" / "kernel.c").write_text("int b;\n")
+    kernel.write_text("int b;\n")
     assert source_hash(tmp_path) != first
-    (tmp_path / "inner" / "kernel.c").write_text("int a;\n")
-    assert source_hash(tmp_path) == first
+    kernel.write_text("int a;\n")
     (tmp_path / "a.py").rename(tmp_path / "b.py")
     assert source_hash(tmp_path) != first
 
@@ -123,12 +109,9 @@ def test_where_two_processes_differ_is_said():
     here = software_fingerprint()
     assert here["code"] == package_source_hash()
     assert software_fingerprint_differences(here, software_fingerprint()) == []
-    assert software_fingerprint_differences(here, {**here, "casadi": "1.0"}) == [
-        f"casadi 1.0 instead of {here['casadi']}"
-    ]
-    assert software_fingerprint_differences(here, {**here, "code": "f" * 64}) == [
-        f"code {'f' * 12} instead of {here['code'][:12]}"
-    ]
+    casadi, code = (f"casadi 1.0 instead of {here['casadi']}", f"code {'f' * 12} instead of {here['code'][:12]}")
+    found = software_fingerprint_differences(here, {**here, "casadi": "1.0", "code": "f" * 64})
+    assert found == [casadi, code]
     del here["numpy"]
     assert software_fingerprint_differences({**here, "numpy": "2"}, here) == ["numpy unknown instead of 2"]
 
@@ -203,28 +186,20 @@ def test_every_file_from_outside_comes_through_the_door(repository):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
-@pytest.mark.parametrize("name", ["a.csv", "a.h5", "a.c3d", "a.mcap", "a.bag", "a.db3"])
+@pytest.mark.parametrize("name", ["a.csv", "a.h5", "a.c3d", "a.mcap", "a.bag", "a.db3", "a.yaml", "a.urdf"])
 @pytest.mark.parametrize("kind", ["pipe", "endless"])
-def test_a_recording_that_is_no_regular_file_is_refused_at_once(tmp_path, name, kind):
+def test_an_input_that_is_no_regular_file_is_refused_at_once(tmp_path, name, kind):
     path = tmp_path / name
     if kind == "pipe":
         os.mkfifo(path)
     else:
         path.symlink_to("/dev/zero")
-    with pytest.raises(DataError, match="a pipe or a device"):
-        read_any(path)
-    with pytest.raises(DataError, match="a pipe or a device"):
-        preview_file(path)
-
-
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names")
-def test_a_configuration_or_robot_that_is_no_regular_file_is_refused_at_once(tmp_path):
-    os.mkfifo(tmp_path / "a.yaml")
-    with pytest.raises(ConfigError, match="a pipe or a device"):
-        load_config(tmp_path / "a.yaml")
-    (tmp_path / "a.urdf").symlink_to("/dev/zero")
-    with pytest.raises(ModelError):
-        read_urdf(tmp_path / "a.urdf")
+    readers = {".yaml": [load_config], ".urdf": [read_urdf]}.get(path.suffix, [read_any, preview_file])
+    for read in readers:
+        with pytest.raises(
+            (DataError, ConfigError, ModelError), match="" if name == "a.urdf" else "a pipe or a device"
+        ):
+            read(path)
 
 
 @pytest.mark.parametrize("text", [b"\xff", b"{", b"[" * 100_000])
