@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
+from yid_ocp.progress import Progress
 
-class Heard:
-    """See `yid_ocp.progress.Progress`."""
 
+class Heard(Progress):
     def __init__(self) -> None:
-        self.stages: list[str] = []
-        self.iterates: list[object] = []
-        self.parts: list[tuple[int, int, str]] = []
+        self.stages, self.parts = [], []
 
     def begin_stage(self, text):
         self.stages.append(text)
-
-    def report_iterate(self, entry):
-        self.iterates.append(entry)
 
     def report_parts_done(self, done, total, text):
         self.parts.append((done, total, text))

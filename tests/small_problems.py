@@ -107,14 +107,16 @@ def taken(step, seed, *, efforts=True, camera=True, name=None, steps=STEPS):
     return Recording(group, tuple(groups), name=name or f"run_{seed}")
 
 
-def swinging_pendulum(folder):
+def swinging_pendulum(folder, *effects):
     """The step of a damped double pendulum, and a function that records a free swing of it, its lower points seen.
 
     The function (seed, steps, bend, noise) starts with angles of `bend` times a standard normal number and adds `noise`
-    metres to what is seen; the standard deviation said is 1 mm.
+    metres to what is seen; the standard deviation said is 1 mm. The swing has the effects (kind, location, values).
     """
     system = System.build(read_urdf(str(folder / "double_pendulum.urdf")), damping={"shoulder": 0.1, "elbow": 0.1})
     step = compile_step(system, H, use_compiler=False)
+    real = system.with_effects([make_effect(kind, place, system, values) for kind, place, values in effects])
+    moving = compile_step(real, H, use_compiler=False) if effects else step
     frames = list(system.mechanism.frames)[-2:]
     q = ca.SX.sym("q", system.n_coordinates)
     kinematics = forward_kinematics(system.mechanism, q)
@@ -124,7 +126,7 @@ def swinging_pendulum(folder):
         rng = np.random.default_rng(seed)
         start = np.zeros(step.sizes["nx"])
         start[:2], start[2:4] = bend * rng.standard_normal(2), 0.02 * rng.standard_normal(2)
-        states = simulate(step, system.parameters.vector(), start, steps).state
+        states = simulate(moving, real.parameters.vector(), start, steps).state
         clean = np.stack([np.array(place(x[:2])).T for x in states])
         position = clean + noise * rng.standard_normal(clean.shape)
         group = seen(frames, H * np.arange(steps + 1), position, std=np.full(clean.shape, 1e-3))

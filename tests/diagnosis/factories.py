@@ -44,19 +44,7 @@ def cases(names: str, rows: Mapping[str, object]):
 # -- effects ----------------------------------------------------------------------------------------------------------
 
 
-class MadeUp(EffectBase):
-    """An effect that is nothing but its quantities."""
-
-    @classmethod
-    def possible_locations(cls, system):
-        return ()
-
-    @classmethod
-    def parameter_definitions(cls, location, system):
-        return ()
-
-
-class MadeUpThing(MadeUp):
+class Local(EffectBase):
     """One that says nothing of other places."""
 
     is_local = True
@@ -77,7 +65,7 @@ def effect(label="friction@elbow", *quantities: ParameterDefinition, alone=False
     kind, _, location = label.partition("@")
     chosen = quantities or (amplitude(),)
     entries = (Parameter(f"{label}.{q.name}", q.neutral_value, q.unit, q.lower, q.upper, q.description) for q in chosen)
-    return (MadeUpThing if alone else MadeUp)(kind, location, tuple(chosen), Parameters(entries))
+    return (Local if alone else EffectBase)(kind, location, Parameters(entries), definitions=tuple(chosen))
 
 
 # -- null test --------------------------------------------------------------------------------------------------------
@@ -189,10 +177,10 @@ READ_FORCE, BIAS, OFFSET = (
 )
 
 
-def trace(sources: Sequence[SmoothedUnknownGroup], mean, std, recording="run", interval=0.5) -> SmoothedUnknowns:
-    """Unknowns of a recording, one column each, over even intervals."""
+def trace(sources: Sequence[SmoothedUnknownGroup], mean, std, recording="run") -> SmoothedUnknowns:
+    """Unknowns of a recording, one column each, over intervals of half a second."""
     mean, std = np.asarray(mean, float), np.asarray(std, float)
-    edges = interval * np.arange(len(mean) + 1)
+    edges = 0.5 * np.arange(len(mean) + 1)
     names = tuple(f"{source.location}.{i}" for i, source in enumerate(sources))
     return SmoothedUnknowns(recording, edges, names, tuple(sources), np.ones(len(sources)), mean, std)
 

@@ -5,49 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
-import casadi as ca
-import numpy as np
 import pytest
+from small_problems import swinging_pendulum
 
-from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.diagnosis import diagnose, hypotheses
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, TruncatedHeldOutRecording
-from yid_ocp.effects import make_effect
-from yid_ocp.integrator.step import compile_step, simulate
-from yid_ocp.model import System
-from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-
-TIME_STEP, NOISE = 0.01, 1e-3
 
 
 @pytest.fixture(scope="module")
 def swinging(urdf_folder):
     """A pendulum let go, with dry friction in the elbow that the model does not know."""
-    tree = read_urdf(str(urdf_folder / "double_pendulum.urdf"))
-    nominal = System.build(tree, damping={"shoulder": 0.1, "elbow": 0.1})
-    real = nominal.with_effects([make_effect("joint_coulomb", "elbow", nominal, {"tau_c": 0.02})])
-    step = compile_step(real, TIME_STEP)
-    rng = np.random.default_rng(1)
-    start = np.zeros(step.sizes["nx"])
-    start[:2], start[2:4] = 0.4 * rng.standard_normal(2), 0.02 * rng.standard_normal(2)
-    swept = simulate(step, real.parameters.vector(), start, 400)
-    frames = list(nominal.mechanism.frames)[-2:]
-    q = ca.SX.sym("q", nominal.n_coordinates)
-    kinematics = forward_kinematics(nominal.mechanism, q)
-    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.frame_position(frame) for frame in frames))])
-    clean = np.stack([np.array(place(x[:2])).T for x in swept.state])
-    t = TIME_STEP * np.arange(401)
-    seen = clean + NOISE * rng.standard_normal(clean.shape)
-    points = PointGroup("points", tuple(frames), t, seen, std=np.full(clean.shape, NOISE))
+    step, record = swinging_pendulum(urdf_folder, ("joint_coulomb", "elbow", {"tau_c": 0.02}))
     options = ProblemOptions(initial_state="estimated", start_configuration_std=0.5, start_velocity_std=2.0)
-    return EstimationProblem(
-        compile_step(nominal, TIME_STEP),
-        [Recording(None, (points,), name="one")],
-        ("elbow.damping", "shoulder.damping"),
-        options,
-    )
+    return EstimationProblem(step, [record(1, 400, 0.4, 1e-3)], ("elbow.damping", "shoulder.damping"), options)
 
 
 def test_the_held_out_blocks_begin_where_the_others_do(swinging):
@@ -104,8 +75,7 @@ def followed(monkeypatch):
 
 def test_what_is_followed_to_its_end_stays(followed):
     composed, cuts = followed(Held("a", 500))
-    assert cuts == ()
-    assert composed.problem.held_out == (Held("a", 500),)
+    assert (cuts, composed.problem.held_out) == ((), (Held("a", 500),))
 
 
 def test_what_is_lost_on_the_way_is_compared_until_shortly_before(followed):
@@ -129,8 +99,7 @@ def test_too_short_a_beginning_is_left_out(followed):
 
 def test_where_nothing_is_left_the_other_recordings_are_split(followed):
     composed, cuts = followed(Held("b", 500, until=50))
-    assert composed.is_split_in_blocks
-    assert composed.problem.held_out == ("blocks",)
+    assert (composed.is_split_in_blocks, composed.problem.held_out) == (True, ("blocks",))
     assert cuts == (TruncatedHeldOutRecording("b", 0.0, 5.0),)
 
 

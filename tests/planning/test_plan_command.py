@@ -1,4 +1,4 @@
-"""The command `plan`: files that others read, parameters from a run of `solve`, exit codes."""
+"""The command `plan`: files that others read, parameters and effects of earlier runs, exit codes; and `information`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,21 @@ import json
 import h5py
 import numpy as np
 import pytest
+from small_problems import pendulum_step, taken
 
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
-from yid_ocp.workflow.plan import compile_step_for_planning, identified_parameters_with_covariance, run_plan
+from yid_ocp.data.recording_hdf5 import write_recording
+from yid_ocp.report.diagnosis_summaries import _planning_command
+from yid_ocp.report.summaries import plan_summary
+from yid_ocp.report.terminal import summary_terminal_lines
+from yid_ocp.workflow.plan import (
+    compile_step_for_planning,
+    discrimination_plan_settings,
+    identified_parameters_with_covariance,
+    run_plan,
+)
 from yid_ocp.workflow.simulate import run_simulate
 
 PLAN = """\
@@ -20,11 +30,27 @@ problem: {path_cutoff: .inf}
 plan: {point: tip, target_offset: [0.0, 0.15, 0.04], start_joint_positions: {shoulder: 0.2}, duration: 0.7,
   hold_duration: 0.3, position_tolerance: 0.02}
 """
+INFORMATION = """\
+  elbow.damping: {free: true}
+recordings: {estimate: [RECORDING]}
+problem: {path_cutoff: 15.0, feedback: none}
+plan:
+  {goal: information, duration: 0.8, hold_duration: 0.4, n_spline_coefficients: 3, n_random_starts: 2,
+    limits: {max_acceleration: 15.0}}
+"""
+PAIR = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
 
 
 @pytest.fixture
 def config(pendulum):
     return pendulum(PLAN)
+
+
+@pytest.fixture
+def informing(limited_urdf, pendulum, tmp_path):
+    recording = tmp_path / "recording.h5"
+    write_recording(taken(pendulum_step(limited_urdf.parent, prescribed=("shoulder",)), 3, steps=140), recording)
+    return pendulum(INFORMATION.replace("RECORDING", str(recording)), "tip, lower")
 
 
 def solved(folder, stiffness, std, status="converged", **more):
@@ -38,6 +64,25 @@ def solved(folder, stiffness, std, status="converged", **more):
         unknowns.attrs["names"] = np.array(["elbow.stiffness"], dtype=h5py.string_dtype())
         unknowns.create_dataset("covariance", data=[[std**2]])
     return folder
+
+
+def diagnosed(folder, stiffness):
+    """What `diagnose` leaves, as far as a plan reads it."""
+    folder.mkdir()
+    which = [
+        pair(label) | {"parameters": {name: {"value": value, "std": None, "unit": ""}}}
+        for label, (name, value) in zip(PAIR, (("tau_c", 0.4), ("b", None)), strict=True)
+    ]
+    absorption = {"elbow.stiffness": {"before": stiffness, "after": 9.0, "std": 0.1, "unit": "N m/rad"}}
+    result = {"format": "yid-diagnosis/2", "verdict": "confusable", "which": which, "absorption": absorption}
+    (folder / "result.json").write_text(json.dumps(result))
+    h5py.File(folder / "trajectories.h5", "w").close()
+    return folder
+
+
+def pair(label):
+    kind, _, location = label.partition("@")
+    return {"kind": kind, "location": location}
 
 
 def test_the_run_folder_is_what_simulate_and_robots_read(config, tmp_path):
@@ -104,10 +149,9 @@ def test_wrong_input_leaves_nothing(config, refused, settings, words):
     refused(config, settings, words)
 
 
-def test_a_folder_of_another_kind_is_refused(config, tmp_path, capsys):
+def test_a_run_that_failed_is_refused(config, tmp_path, refused):
     failed = solved(tmp_path / "failed", 4.0, 0.1, status="failed")
-    assert main(["plan", str(config), "--out", str(tmp_path / "out"), "--set", f"plan.parameter_run={failed}"]) == 2
-    assert "failed: made up" in capsys.readouterr().err
+    refused(config, [f"plan.parameter_run={failed}"], ("failed: made up",))
 
 
 def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, capsys):
@@ -118,8 +162,62 @@ def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, ca
     told = capsys.readouterr().err
     assert "was solved with point_mass@tip, which this model does not have" in told
     assert "model.effects" in told
-    with_it = "model.effects=[{kind: point_mass, location: tip}]"
-    assert main([*chosen, "--set", with_it]) == 0
-    assert (
-        json.loads((tmp_path / "out" / "result.json").read_text())["from"]["parameters"]["point_mass@tip.mass"] == 0.1
-    )
+    assert main([*chosen, "--set", "model.effects=[{kind: point_mass, location: tip}]"]) == 0
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert result["from"]["parameters"]["point_mass@tip.mass"] == 0.1
+
+
+# -- the goal `information` -------------------------------------------------------------------------------------------
+
+
+def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path):
+    outcome = run_plan(load_config(informing), tmp_path / "out")
+    assert outcome.is_successful, outcome.result["message"]
+    result = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert (result["format"], result["goal"]) == ("yid-plan/1", "information")
+    assert {"recording.h5", "csv", "trajectory.json", "report.html"} <= {p.name for p in (tmp_path / "out").iterdir()}
+    planned = read_recording(tmp_path / "out" / "recording.h5")
+    np.testing.assert_allclose(planned.joints.position, outcome.output.joint_positions)
+    assert '<section id="information">' in (tmp_path / "out" / "report.html").read_text()
+    words = "\n".join(summary_terminal_lines(plan_summary(result)))
+    for name, known in outcome.output.parameter_precisions.items():
+        assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
+        assert f"± {100 * known.std_planned:.2g} %" in words
+    assert "tells most" in words
+    assert all(name in words for names in result["limits_reached"].values() for name in names)
+    assert "the parameters are those of the configuration" in words
+
+
+def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
+    folder = diagnosed(tmp_path / "diagnosed", 4.0)
+    section = discrimination_plan_settings([[pair(label) for label in PAIR]], folder)
+    assert section == {"goal": "information", "discriminate": list(PAIR), "parameter_run": str(folder)}
+    assert discrimination_plan_settings([], folder) is None
+    command = _planning_command(section)
+    assert command.startswith(f"yid-ocp plan {folder / 'config.yaml'} --set plan.goal=information")
+    overrides = [f"plan.discriminate=[{', '.join(PAIR)}]", f"plan.parameter_run={folder}"]
+    assert all(f"'{text}'" in command or text in command for text in overrides)
+    outcome = run_plan(load_config(informing, [*overrides, "plan.max_iterations=3"]), tmp_path / "out")
+    assert outcome.result["from"]["parameters"] == {"elbow.stiffness": 4.0, "elbow.damping": 0.2}
+    assert {(entry["effect"], entry["explained_by"]) for entry in outcome.result["distances"]} == {PAIR, PAIR[::-1]}
+    assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
+    assert PAIR[0] in "\n".join(summary_terminal_lines(plan_summary(outcome.result)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (["plan.identify=[elbow.stifness]"], ("no parameter 'elbow.stifness'", "did you mean", "pendulum.yaml")),
+        (["parameters.elbow.stiffness.free=false", "parameters.elbow.damping.free=false"], ("no parameter is free",)),
+        (["recordings.estimate=[]"], ("no recording to estimate on",)),
+        (["plan.parameter_run=nowhere"], ("no finished run of `solve` or `diagnose`", "plan.parameter_run")),
+        (["plan.duration=0.1", "plan.hold_duration=0.1"], ("too short", "plan.duration")),
+    ],
+)
+def test_wrong_input_of_information_leaves_nothing(informing, refused, settings, words):
+    refused(informing, settings, words)
+
+
+def test_other_goals_do_not_take_a_diagnosis(config, tmp_path, refused):
+    folder = diagnosed(tmp_path / "diagnosed", 4.0)
+    refused(config, [f"plan.parameter_run={folder}"], ("run folder of another command (yid-diagnosis/2)",))
