@@ -1,4 +1,4 @@
-"""Forward sensitivities by every effect's parameters, all effects at once, beside central differences."""
+"""All effects at once: nothing at neutral parameters, and sensitivities that are central differences'."""
 
 from __future__ import annotations
 
@@ -108,3 +108,22 @@ def test_compiled_and_interpreted_agree_with_every_effect(cases) -> None:
     for s, rollout in ((step, fast), (case.step, slow)):
         gradient = s.kernel.adjoint_gradient(case.run.theta, rollout, None, case.names, weight, None, None)
         assert gradient.by_theta == pytest.approx(exact, rel=1e-6, abs=1e-8 * np.max(np.abs(exact)))
+
+
+def largest(difference, reference) -> float:
+    return float(np.max(np.abs(difference)) / np.max(np.abs(reference)))
+
+
+@pytest.mark.parametrize("mode", ["driven", "prescribed"])
+def test_at_neutral_parameters_they_change_nothing(mode, benches, all_effects, sensors) -> None:
+    bench = benches[mode]
+    effects = all_effects(bench.system)
+    plain, full = bench.run(bench.plain), bench.run(bench.step(*effects))
+    assert full.rollout.status.is_converged
+    assert full.rollout.status.newton_iterations <= 1.5 * plain.rollout.status.newton_iterations
+    assert largest(bench.nominal_part(full) - bench.nominal_part(plain), bench.nominal_part(plain)) < 1e-10
+    assert largest(full.rollout.multipliers - plain.rollout.multipliers, plain.rollout.multipliers) < 1e-10
+    watched = [sensors.camera, sensors.arm] + ([sensors.effort] if mode == "prescribed" else [])
+    for sensor in watched:
+        nominal = bench.reading(plain, sensor)
+        assert largest(bench.reading(full, sensor) - nominal, nominal) < 1e-10

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from yid_ocp.effects import make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -15,8 +16,9 @@ from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.system import NodeState
-from yid_ocp.sensors import EffortSensor, PointSensor, sensor_reading_function
+from yid_ocp.problem import ProblemOptions
+from yid_ocp.problem.unknown_vector import estimated_initial_state_names, initial_state_offset_limits
+from yid_ocp.sensors import EffortSensor, PointSensor, PositionSensor, sensor_reading_function
 
 LENGTH, MASS, RADIUS, KAPPA = 0.5, 0.2, 0.02, 3.0
 INERTIA = MASS * (LENGTH**2 / 3 + RADIUS**2 / 4)
@@ -33,12 +35,13 @@ def link(gravity=(0.0, 0.0, 0.0), prescribed=JOINTS, links=1) -> System:
     return System.build(objects=[(flexible_object([segment]), None, None)], prescribed=prescribed, gravity=gravity)
 
 
-def hinge(mode: str = "prescribed", gravity=(0.0, 0.0, 0.0)) -> System:
+def hinge(mode: str | None = "prescribed", gravity=(0.0, 0.0, 0.0)) -> System:
     """One arm joint about y that carries a link along z."""
     body = Inertia.from_values(MASS, [0.0, 0.0, LENGTH / 2], np.diag([1e-3, 1e-3, 1e-4]))
     joint = Joint("left_a", "revolute", -1, Placement.identity(), (0.0, 1.0, 0.0), (body,))
     tip = Frame(0, Placement.from_matrix(homogeneous_transform(np.eye(3), [0, 0, LENGTH])))
-    return System.build(Mechanism("arm", (joint,), {"left_gripper": tip}), gravity=gravity, **{mode: ["left_a"]})
+    tree = Mechanism("arm", (joint,), {"left_gripper": tip})
+    return System.build(tree, gravity=gravity, **({mode: ["left_a"]} if mode else {}))
 
 
 def follow(system, effects, path, values=None, z0=None):
@@ -293,6 +296,97 @@ def test_friction_works_against_the_motion(kind, values, extra, rate) -> None:
     assert effort == pytest.approx(extra(rate), rel=1e-6, abs=1e-9)
 
 
+# -- friction that holds at rest, by Dahl's equation -------------------------------------------------------------------
+
+
+TAU = 0.8
+
+
+@pytest.mark.parametrize("width", [0.2, 0.02, 1e-4])
+def test_s_is_the_solution_of_dahls_equation(width) -> None:
+    t, system = 0.01 * np.arange(201), hinge()
+    path = 0.3 * (1 - np.cos(2 * np.pi * t)) + 0.05 * np.sin(9 * t) - 0.45 * t
+    effect = make_effect("joint_presliding", "left_a", system, {"tau_c": TAU, "yield_angle": width})
+    step = compile_step(system.with_effects([effect]), 0.01, use_compiler=False)
+    rollout = simulate(step, step.system.parameters.vector(), np.array([0.0, 0.0, -0.4]), 200, path=path[:, None])
+    assert rollout.status.is_converged
+    s = rollout.state[:, 2]
+    expected = [-0.4]
+    for a, b in itertools.pairwise(path):
+        way = np.sign(b - a)
+        run = solve_ivp(lambda x, y, way=way: (1 - way * y) / width * way, (0, abs(b - a)), [expected[-1]], rtol=1e-9)
+        expected.append(float(run.y[0, -1]))
+    np.testing.assert_allclose(s, expected, atol=5e-3)
+    assert np.max(np.abs(s)) <= 1.0 + 1e-3
+
+
+def test_every_step_takes_out_more_than_it_stores() -> None:
+    """Stored is tau_c yield_angle s^2/2; the law of one step alone, for any angle and any s."""
+    system = hinge()
+    effect = make_effect("joint_presliding", "left_a", system, {"tau_c": TAU, "yield_angle": 0.01})
+    step = compile_step(system.with_effects([effect]), H, use_compiler=False)
+    e, theta, rng = step.equations, step.system.parameters.vector(), np.random.default_rng(1)
+    bare = compile_step(system, H, use_compiler=False).equations
+    law = ca.Function(
+        "law", [e.q0, e.q1, e.z0, e.z1, e.p0, e.theta, e.time_step], [e.internal_residual, e.momentum_balance]
+    )
+    without = ca.Function("without", [bare.q0, bare.q1, bare.p0, bare.theta, bare.time_step], [bare.momentum_balance])
+    for _ in range(200):
+        turned, before = 10.0 ** rng.uniform(-7, 0) * rng.choice([-1, 1]), rng.uniform(-1, 1)
+        residual = float(law(0, turned, before, before, 0, theta, H)[0])
+        after = before - residual  # the equation is z1 - z0 - change, whatever z1 is
+        assert abs(float(law(0, turned, before, after, 0, theta, H)[0])) < 1e-12
+        friction = float(law(0, turned, before, after, 0, theta, H)[1])
+        friction -= float(without(0, turned, 0, system.parameters.vector(), H))
+        work = -friction / (H / 2) * turned
+        stored = TAU * 0.01 * (after**2 - before**2) / 2
+        assert work >= stored - 1e-6 * TAU * 0.01
+
+
+def test_it_holds_a_load_at_rest_and_lets_go_above() -> None:
+    """Gravity on a hanging arm turned aside: below tau_c it creeps into the presliding angle and stays."""
+    weight = MASS * G * LENGTH / 2
+    for tau_c, stays in ((1.3 * weight, True), (0.5 * weight, False)):
+        system = hinge(gravity=(G, 0.0, 0.0), mode=None)
+        effects = [
+            make_effect("joint_presliding", "left_a", system, {"tau_c": tau_c, "yield_angle": 1e-3}),
+            make_effect("joint_viscous", "left_a", system, {"b": 0.5}),
+        ]
+        step = compile_step(system.with_effects(effects), H / 10, use_compiler=False)
+        rollout = simulate(step, step.system.parameters.vector(), np.zeros(step.sizes["nx"]), 1200)
+        assert rollout.status.is_converged
+        q = rollout.state[:, 0]
+        assert (abs(q[-1]) < 0.02) == stays
+        if stays:
+            assert abs(q[-1] - q[-200]) < 1e-6
+            assert rollout.state[-1, 2] == pytest.approx(weight * np.cos(q[-1]) / tau_c, rel=1e-3)
+
+
+def test_a_resting_joint_is_as_stiff_as_the_friction_before_it_yields() -> None:
+    system = hinge("driven")
+    effect = make_effect("joint_presliding", "left_a", system, {"tau_c": TAU, "yield_angle": 0.02})
+    step = compile_step(system.with_effects([effect]), H, use_compiler=False)
+    theta = step.system.parameters.vector()
+    a, b, _ = step.jacobians(np.zeros(1), np.zeros(1), np.zeros(1), theta, internal=np.zeros(1))
+    inertia = 1e-3 + MASS * LENGTH**2 / 4
+    # dq/du of a midpoint step: h^2/2 over M + h^2 k/4
+    assert b[0, 0] == pytest.approx(H**2 / 2 / (inertia + H**2 / 4 * TAU / 0.02), rel=1e-4)
+    assert a[2, 0] == pytest.approx((a[0, 0] - 1) / 0.02, rel=1e-6)
+
+
+def test_where_it_begins_is_estimated_with_every_recording() -> None:
+    system = hinge()
+    effect = make_effect("joint_presliding", "left_a", system)
+    whole = system.with_effects([effect])
+    theta, options = whole.parameters.vector(), ProblemOptions()
+    assert estimated_initial_state_names(whole, options, (), theta) == ()
+    [name] = estimated_initial_state_names(whole, options, ("joint_presliding@left_a.tau_c",), theta)
+    assert name == "z.joint_presliding@left_a.s"
+    assert initial_state_offset_limits(whole, [name]).tolist() == [1.0]
+    known = whole.parameters.vector({"joint_presliding@left_a.tau_c": 0.1})
+    assert estimated_initial_state_names(whole, options, (), known) == (name,)
+
+
 # -- what sensors read ------------------------------------------------------------------------------------------------
 
 
@@ -302,21 +396,6 @@ def read(system: System, effects, sensor, q=None, effort=None) -> np.ndarray:
     n = whole.n_coordinates
     at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
     return np.array(function(**at, theta=whole.parameters.vector())["y"]).ravel()
-
-
-@dataclass(frozen=True)
-class Encoder:
-    """Measured angle of the hinge, which the library's effects change as well."""
-
-    group_name: str = "joints.position"
-    channel_names: tuple[str, ...] = ("joints.position.left_a",)
-    unit: str = "rad"
-    outputs_per_channel: int = 1
-    frame_names: tuple[str, ...] = ()
-    camera_pose: Placement | None = None
-
-    def ideal_reading(self, state: NodeState) -> ca.SX:
-        return state.q
 
 
 @pytest.mark.parametrize(
@@ -330,9 +409,9 @@ class Encoder:
     ],
 )
 def test_joint_readings_and_the_way_back(kind, values, angle, torque) -> None:
-    system = hinge()
+    system, names = hinge(), ("left_a",)
     effect = make_effect(kind, "left_a", system, values)
-    seen = [read(system, [effect], sensor, [0.5], [3.0])[0] for sensor in (Encoder(), EffortSensor(("left_a",)))]
+    seen = [read(system, [effect], sensor, [0.5], [3.0])[0] for sensor in (PositionSensor(names), EffortSensor(names))]
     assert seen == pytest.approx([angle, torque])
     back = [
         effect.corrected_reading(f"joints.{quantity}.left_a", ca.SX(reading), ca.SX(3.0))

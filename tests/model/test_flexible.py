@@ -1,8 +1,10 @@
-"""Chains of links: lengths, stiffnesses, inertias, rest shapes, and what is refused."""
+"""Flexible objects: lengths, stiffnesses, inertias, rest shapes, what is refused; the paper's Y and a tapered rod."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -11,20 +13,31 @@ from hypothesis import given
 from hypothesis import strategies as st
 from placed_frames import numbers, positions
 
+from yid_ocp.config.reader import load_config
+from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
-from yid_ocp.model import Segment, flexible_object
+from yid_ocp.integrator.statics import EquilibriumSolver
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.flexible import parallel_transport_rotations
+from yid_ocp.model.objects.base import init_command_object_templates
+from yid_ocp.model.objects.foam_y import foam_y_object, foam_y_segments
+from yid_ocp.model.objects.tapered_rod import TaperedRod
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
+from yid_ocp.model.urdf import mechanism_to_urdf
+from yid_ocp.workflow.build import build_system, divided_link_parameter_scale
 
 
-def stiffness(item, values=None):
+def stiffness(item):
     """Stiffness and damping of every coordinate by joint name."""
-    p = item.mechanism.parameters
-    function = ca.Function(
-        "springs", [p.symbols], [ca.vertcat(*(ca.horzcat(s.stiffness, s.damping) for s in item.elastic_joints))]
+    rows = numbers(
+        ca.vertcat(*(ca.horzcat(s.stiffness, s.damping) for s in item.elastic_joints)), item.mechanism.parameters
     )
-    rows = np.array(function(p.vector(values)))
     return {spring.joint_name: tuple(row) for spring, row in zip(item.elastic_joints, rows, strict=True)}
+
+
+def bodies(item) -> list:
+    return [body for joint in item.mechanism.with_numeric_values().joints for body in joint.bodies]
 
 
 def test_unequal_links():
@@ -33,7 +46,7 @@ def test_unequal_links():
     tips = positions(item, ["C_0_tip", "C_1_tip", "C_2_tip", "w_C"])
     np.testing.assert_allclose(tips[:, 2], [0.1, 0.4, 0.6, 0.6])
     assert item.mechanism.parameters["C.length"].value == pytest.approx(0.6)
-    carried = [joint.bodies[0] for joint in item.mechanism.with_numeric_values().joints if joint.bodies]
+    carried = bodies(item)
     np.testing.assert_allclose([float(b.mass) for b in carried], [0.1, 0.3, 0.2])
     for body, length in zip(carried, lengths, strict=True):
         mass = float(body.mass)
@@ -77,24 +90,15 @@ def test_branches_at_inner_links():
 
 
 def test_a_flat_beam_that_bends_one_way():
-    beam = Segment(
-        "B",
-        0.6,
-        0.3,
-        links=3,
-        cross_section=(0.001, 0.08),
-        joint_axes="y",
-        bend=1.2,
-        stiffness_per_curvature=True,
-        clamped_at_base=True,
-    )
+    clamped = {"stiffness_per_curvature": True, "clamped_at_base": True}
+    beam = Segment("B", 0.6, 0.3, links=3, cross_section=(0.001, 0.08), joint_axes="y", bend=1.2, **clamped)
     item = flexible_object([beam])
     assert item.mechanism.joint_names == ("B_0_y", "B_1_y", "B_2_y")
     assert {spring.axis for spring in item.elastic_joints} == {"y"}
     assert [stiffness(item)[f"B_{i}_y"][0] for i in range(3)] == pytest.approx([2 * 1.2 / 0.2, 1.2 / 0.2, 1.2 / 0.2])
     x, y, z = 0.001**2 / 12, 0.08**2 / 12, 0.2**2 / 12
-    for joint in item.mechanism.with_numeric_values().joints:
-        np.testing.assert_allclose(numbers(joint.bodies[0].inertia_about_com), 0.1 * np.diag([y + z, x + z, x + y]))
+    for body in bodies(item):
+        np.testing.assert_allclose(numbers(body.inertia_about_com), 0.1 * np.diag([y + z, x + z, x + y]))
     [layout] = item.segment_layouts
     assert numbers(layout.radius, item.mechanism.parameters).item() == pytest.approx(math.hypot(0.001, 0.08) / 2)
 
@@ -135,9 +139,9 @@ def test_inertia_is_physical_for_every_theta(length, mass, radius, links, unequa
     shares = np.random.default_rng(seed).uniform(0.2, 1.0, links) if unequal else None
     item = flexible_object([Segment("C", 1.0, 1.0, 0.1, links=links, link_lengths=shares)])
     numeric = item.mechanism.with_numeric_values({"C.length": length, "C.mass": mass, "C.radius": radius})
-    bodies = [body for joint in numeric.joints for body in joint.bodies]
-    assert sum(float(body.mass) for body in bodies) == pytest.approx(mass)
-    for body in bodies:
+    found = bodies(replace(item, mechanism=numeric))
+    assert sum(float(body.mass) for body in found) == pytest.approx(mass)
+    for body in found:
         tensor = numbers(body.inertia_about_com)
         np.testing.assert_array_equal(tensor, tensor.T)
         moments = np.linalg.eigvalsh(tensor)
@@ -183,3 +187,86 @@ def test_errors_of_a_segment(name):
 def test_a_degenerate_polyline_is_refused(vertices):
     with pytest.raises(ModelError, match="vertices"):
         parallel_transport_rotations(vertices)
+
+
+# -- the paper's Y -----------------------------------------------------------------------------------------------------
+
+
+def test_the_paper_y_stands_where_it_should():
+    item = foam_y_object()
+    foot, junction, left, right = positions(item, ["object_root", "w_T1", "w_T2", "w_T3"])
+    half = math.sqrt(0.5)
+    np.testing.assert_allclose(foot, [0.85, 0.0, -0.93])
+    np.testing.assert_allclose(junction, foot + np.array([0, 0, 0.813]))
+    np.testing.assert_allclose(left, junction + 0.610 * half * np.array([0, 1, 1]), atol=1e-15)
+    np.testing.assert_allclose(right, junction + 0.737 * half * np.array([0, -1, 1]), atol=1e-15)
+    moved = flexible_object(foam_y_segments(), homogeneous_transform(np.eye(3), [0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(positions(moved, ["w_T1"])[0], [0, 0, 1.813])
+    assert flexible_object(foam_y_segments()).mechanism.joint_names == item.mechanism.joint_names
+
+
+def test_checked_in_urdf_is_what_the_generator_writes(urdf_folder):
+    assert mechanism_to_urdf(foam_y_object().mechanism) == (urdf_folder / "y_object.urdf").read_text(encoding="utf-8")
+
+
+def test_a_share_of_the_weight_leaves_the_inertia_whole():
+    whole, half = foam_y_object(), foam_y_object(gravity_fraction=0.5)
+    for body, light in zip(bodies(whole), bodies(half), strict=True):
+        assert float(light.mass) == float(body.mass)
+        np.testing.assert_array_equal(numbers(light.inertia_about_com), numbers(body.inertia_about_com))
+        assert (body.gravity_fraction, float(light.gravity_fraction)) == (None, 0.5)
+
+
+# -- a tapered rod -----------------------------------------------------------------------------------------------------
+
+LENGTH, MASS, BEND, TIP_MASS, GRAVITY = 1.2, 0.05, 40.0, 0.02, 9.81
+
+
+def rod(links: int, tip_radius: float = 0.003) -> TaperedRod:
+    sizes = {"length": LENGTH, "mass": MASS, "base_radius": 0.006, "tip_radius": tip_radius}
+    return TaperedRod(**sizes, links=links, joint_axes="x", gravity_fraction=0.0)
+
+
+def test_mass_and_centre_are_those_of_a_frustum() -> None:
+    found, k = bodies(rod(5).build(0.0)), 0.5
+    masses = np.array([float(body.mass) for body in found])
+    centres = [LENGTH * i / 5 + float(body.center_of_mass[2]) for i, body in enumerate(found)]
+    assert masses.sum() == pytest.approx(MASS)
+    assert masses @ centres / MASS == pytest.approx(LENGTH / 4 * (1 + 2 * k + 3 * k**2) / (1 + k + k**2))
+
+
+def test_without_taper_its_links_are_cylinders() -> None:
+    item = rod(3, tip_radius=0.006)
+    plain = flexible_object(item.model_segments(0.02), gravity_fraction=0.0)
+    for one, other in zip(bodies(item.build(0.02)), bodies(plain), strict=True):
+        tensors = [numbers(body.inertia_about_com) for body in (one, other)]
+        assert tensors[0] == pytest.approx(tensors[1], rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize("links", [12, 24])
+def test_a_tip_load_bends_it_as_beam_theory_says(links: int) -> None:
+    """A cone cut off at the tip, under a force F there, bends F L^3 / (3 B taper), B being the base's rigidity."""
+    system = System.build(objects=[(rod(links).build(0.01), None, None)], gravity=(0.0, -GRAVITY, 0.0))
+    system = system.with_effects([make_effect("point_mass", "w_rod", system, {"mass": TIP_MASS})])
+    theta = system.parameters.vector({"rod.bend": BEND})
+    rest = EquilibriumSolver(compile_step(system, 0.01, use_compiler=False)).solve([], theta)
+    assert rest.is_converged
+    q = ca.SX(ca.DM(rest.state[: system.n_coordinates]))
+    place = forward_kinematics(system.mechanism, q).frame_position("w_rod")
+    place = ca.Function("tip", [system.parameters.symbols], [place])(theta)
+    expected = -TIP_MASS * GRAVITY * LENGTH**3 / (3 * BEND * 0.5)
+    assert float(place[1]) == pytest.approx(expected, rel=3 / links**2 + 2e-3)
+
+
+def test_a_configuration_and_init_describe_it(tmp_path: Path) -> None:
+    text = "{kind: tapered_rod, length: 1.2, mass: 0.05, base_radius: 0.006, tip_radius: 0.003, links: 4}"
+    (tmp_path / "run.yaml").write_text(f"model: {{object: {text}}}\nparameters: {{rod.taper: {{initial: 0.4}}}}\n")
+    run = load_config(tmp_path / "run.yaml")
+    system = build_system(run, link_division=2)
+    assert system.parameters["rod.taper"].value == 0.4
+    assert len(system.segment_layout("rod").link_joints) == 8
+    assert divided_link_parameter_scale(run, "rod.bend", 2) == 1  # a rigidity
+    given = {"length": LENGTH, "mass": MASS, "radius": 0.006, "tip_radius": 0.003}
+    made = init_command_object_templates()["tapered_rod"].build(given, 4)
+    assert made.settings == replace(rod(4), joint_axes="xy", gravity_fraction=1.0)
+    assert set(made.start_values) == {"rod.bend", "rod.damping"}

@@ -11,22 +11,16 @@ import pytest
 from placed_frames import numbers
 
 from yid_ocp.errors import ModelError
-from yid_ocp.model import Mechanism
+from yid_ocp.model import Mechanism, forward_kinematics
 from yid_ocp.model import urdf as urdf_files
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement, merge_bodies
 from yid_ocp.model.rotations import homogeneous_transform
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import mechanism_to_urdf, read_urdf, resolve_urdf_path
 
-LINK = '<link name="{name}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-
-
-LINK += "</inertial></link>"
-
-
+BODY = '<link name="{name}"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial></link>'
+TENSOR = 'ixx="{0}" iyy="{1}" izz="{2}" ixy="0" ixz="0" iyz="0"'
 JOINT = '<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>'
-
-
 JOINT += '<limit lower="-1" upper="2" effort="3" velocity="4"/></joint>'
 
 
@@ -37,7 +31,7 @@ def urdf(tmp_path: Path, *parts: str) -> Path:
 
 
 def link(name):
-    return LINK.format(name=name)
+    return BODY.format(name=name, mass=1, tensor=TENSOR.format(1, 1, 1))
 
 
 def joint(name, parent, child, kind="revolute", axis="0 0 1"):
@@ -57,11 +51,8 @@ def assert_equal_mechanisms(one, two, tolerance=1e-12):
         body, other = merge_bodies(a.bodies), merge_bodies(b.bodies)
         assert (body is None) == (other is None)
         if body is not None and other is not None:
-            pairs += [
-                (body.mass, other.mass),
-                (body.center_of_mass, other.center_of_mass),
-                (body.inertia_about_com, other.inertia_about_com),
-            ]
+            keys = ("mass", "center_of_mass", "inertia_about_com")
+            pairs += [(getattr(body, key), getattr(other, key)) for key in keys]
         for x, y in pairs:
             np.testing.assert_allclose(numbers(x), numbers(y), rtol=tolerance, atol=tolerance)
     for name, frame in one.frames.items():
@@ -87,12 +78,8 @@ def test_limits_and_kinds(urdf_folder):
     slide, spin = by_name["slide"], by_name["spin"]
     assert (slide.kind, slide.coordinate_unit, slide.lower_limit, slide.upper_limit) == ("prismatic", "m", -0.4, 0.6)
     assert (slide.effort_limit, slide.velocity_limit) == (120.0, 0.8)
-    assert (spin.kind, spin.coordinate_unit, spin.lower_limit, spin.upper_limit) == (
-        "revolute",
-        "rad",
-        -math.inf,
-        math.inf,
-    )
+    assert (spin.kind, spin.coordinate_unit) == ("revolute", "rad")
+    assert (spin.lower_limit, spin.upper_limit) == (-math.inf, math.inf)
     assert (spin.effort_limit, spin.velocity_limit) == (30.0, 6.0)
     np.testing.assert_allclose(slide.axis, [1 / 3, 2 / 3, 2 / 3], rtol=1e-15)
 
@@ -118,8 +105,6 @@ def test_a_locked_joint_stands_at_its_value_or_within_its_range(urdf_folder):
     q[[whole.joint_index(name) for name in ("nod", "extend", "slide")]] = [0.2, 0.05, 0.3]
     fixed = read_urdf(path, joints=["spin"], locked={"slide": 0.3})
     assert fixed.joint_names == ("spin",)
-    from yid_ocp.model import forward_kinematics
-
     long = forward_kinematics(whole.with_numeric_values(), ca.SX(ca.DM(q)))
     short = forward_kinematics(fixed.with_numeric_values(), ca.SX(ca.DM([0.0])))
     for frame in ("nose", "tool", "lever", "ground"):
@@ -161,12 +146,8 @@ def test_a_point_mass_needs_no_inertia(tmp_path):
     np.testing.assert_array_equal(numbers(body.inertia_about_com), np.zeros((3, 3)))
 
 
-BODY = '<link name="tip"><inertial><mass value="{mass}"/><inertia {tensor}/></inertial></link>'
-TENSOR = 'ixx="{0}" iyy="{1}" izz="{2}" ixy="0" ixz="0" iyz="0"'
-
-
 def with_tip(mass="1", moments=(1, 1, 1), tensor=TENSOR, change=("", "")):
-    tip = BODY.format(mass=mass, tensor=tensor.format(*moments)).replace(*change)
+    tip = BODY.format(name="tip", mass=mass, tensor=tensor.format(*moments)).replace(*change)
     return link("base"), tip, joint("turn", "base", "tip")
 
 
@@ -210,12 +191,6 @@ BROKEN = {
 }
 
 
-def test_what_is_missing_in_a_urdf_is_said(tmp_path):
-    (tmp_path / "page.urdf").write_text("<html></html>")
-    with pytest.raises(ModelError, match="the URDF cannot be read: 'name' is missing"):
-        read_urdf(tmp_path / "page.urdf")
-
-
 @pytest.mark.parametrize("name", list(BROKEN))
 def test_a_broken_urdf_is_refused(name, tmp_path):
     parts, words = BROKEN[name]
@@ -224,6 +199,9 @@ def test_a_broken_urdf_is_refused(name, tmp_path):
         read_urdf(path)
     for word in [*words, str(path)]:
         assert word in str(caught.value)
+    (tmp_path / "page.urdf").write_text("<html></html>")
+    with pytest.raises(ModelError, match="the URDF cannot be read: 'name' is missing"):
+        read_urdf(tmp_path / "page.urdf")
 
 
 @pytest.mark.parametrize(
@@ -276,9 +254,8 @@ def test_moments_that_no_body_has_are_said(tmp_path, caplog):
 
 
 def follower(tmp_path, following="first"):
-    second = joint("second", "middle", "tip").replace(
-        "</joint>", f'<mimic joint="{following}" multiplier="-2" offset="0.5"/></joint>'
-    )
+    mimic = f'<mimic joint="{following}" multiplier="-2" offset="0.5"/></joint>'
+    second = joint("second", "middle", "tip").replace("</joint>", mimic)
     return urdf(tmp_path, link("base"), link("middle"), link("tip"), joint("first", "base", "middle"), second)
 
 
@@ -286,25 +263,19 @@ def test_a_joint_that_follows_is_locked_where_its_leader_stands(tmp_path, caplog
     file = follower(tmp_path)
     assert read_urdf(file).joint_names == ("first",)
     assert "'second' follows 'first'" in caplog.text
-    pose = np.array(
-        ca.DM(read_urdf(file, joints=(), locked={"first": 0.2}).frames["tip"].placement.homogeneous_matrix())
-    )
+    pose = numbers(read_urdf(file, joints=(), locked={"first": 0.2}).frames["tip"].placement.homogeneous_matrix())
     angle = 0.2 + (0.5 - 2 * 0.2)
     np.testing.assert_allclose(pose[:2, :2], [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-
-
-def test_a_joint_that_follows_cannot_be_chosen(tmp_path):
+    # and cannot be chosen
     with pytest.raises(ModelError, match="follows 'first'"):
         read_urdf(follower(tmp_path), joints=("first", "second"))
     with pytest.raises(ModelError, match="follows a joint 'frist'"):
         read_urdf(follower(tmp_path, "frist"))
 
 
-def test_mechanisms_that_ship_with_the_package_are_found_by_name(urdf_folder) -> None:
+def test_mechanisms_that_ship_are_found_by_name_also_where_a_wheel_put_them(urdf_folder, tmp_path, monkeypatch) -> None:
     assert resolve_urdf_path("default:turntable.urdf").samefile(urdf_folder / "turntable.urdf")
 
-
-def test_and_where_a_wheel_put_them(urdf_folder, tmp_path, monkeypatch) -> None:
     class Installed(PurePosixPath):
         def locate(self):
             return urdf_folder / self.name

@@ -1,5 +1,8 @@
+"""What sensors read at a node, effects included, and its derivatives."""
+
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -10,9 +13,10 @@ from small_problems import H, measured
 
 from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
-from yid_ocp.errors import SolverError
+from yid_ocp.errors import ModelError, SolverError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model.parameters import Parameter, Parameters
+from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.model.system import Effect, NodeState, System
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.sensors import ChannelKind, EffortSensor, PointSensor, Sensor, sensor_reading_function
@@ -29,7 +33,8 @@ class Drift(Effect):
         return output + self.parameters[f"{LABEL}.gain"].symbol * (memory**2 + ca.sin(state.load[0]))
 
 
-CAMERA = PointSensor("points_camera", ("w_T1", "w_T2"), ("w_T1", "w_T2"), tuple(map(tuple, np.eye(4))))
+POSE = homogeneous_transform(rotation_from_rpy(0.3, -0.2, 1.0), [2.0, 0.5, 0.4])
+CAMERA = PointSensor("points_camera", ("joint", "tip"), ("w_T1", "w_T2"), tuple(map(tuple, POSE)))
 EFFORT = EffortSensor(("left_a", "left_b"))
 NAMES = ("T1.length", "drift@left.gain", "camera_scale@camera.scale", "effort_gain@left_b.inverse")
 
@@ -85,6 +90,49 @@ def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None
     read = np.array(function(z=0.5, load=effort, theta=whole.parameters.vector())["y"]).ravel()
     drift = 0.2 * (0.25 + np.sin(2.0))
     assert read == pytest.approx([2.0 + drift, 0.8 * 3.0 + drift])
+
+
+def test_a_point_worked_out_by_hand(system: System, read) -> None:
+    q = np.zeros(system.n_coordinates)
+    a, b = 0.3, -0.7
+    q[[system.mechanism.joint_index(name) for name in ("left_a", "left_b")]] = a, b
+    along = 0.5 + 0.5 * math.cos(b)
+    expected = [along * math.sin(a), -0.5 * math.sin(b), along * math.cos(a)]
+    assert read(system, PointSensor("points_arm", ("hand",), ("left_gripper",)), q) == pytest.approx(expected)
+
+
+def test_every_channel_knows_its_own_frame(system: System, read) -> None:
+    """The near surface lies at the radius of the tube that each point is on: 30 mm for T1, 10 mm for T2."""
+    near = system.with_effects([make_effect("surface_offset", "camera", system, {"fraction": 1.0})])
+    shift = (read(near, CAMERA) - read(system, CAMERA)).reshape(2, 3)
+    assert np.linalg.norm(shift, axis=1) == pytest.approx([0.03, 0.01])
+    rays = POSE[:3, 3] - read(system, CAMERA).reshape(2, 3)
+    assert np.cross(shift, rays) == pytest.approx(np.zeros((2, 3)), abs=1e-12)
+    assert (np.sum(shift * rays, axis=1) > 0).all()
+
+
+def test_points_along_a_segment(system: System, read) -> None:
+    """Halfway along two links lies the joint between them; a quarter beyond it, half of the second link."""
+    q = np.random.default_rng(1).uniform(-0.5, 0.5, system.n_coordinates)
+    found = read(system, PointSensor("points", ("a", "b", "c", "d"), ("T1:50%", "T1_0_tip", "T1:75%", "w_T1")), q)
+    half, joint, further, tip = found.reshape(4, 3)
+    assert half == pytest.approx(joint)
+    assert further == pytest.approx((joint + tip) / 2)
+    near = system.with_effects([make_effect("surface_offset", "camera", system, {"fraction": 1.0})])
+    along = PointSensor("points_camera", ("a",), ("T1:75%",), tuple(map(tuple, POSE)))
+    assert np.linalg.norm(read(near, along, q) - read(system, along, q)) == pytest.approx(0.03)
+
+
+def test_an_effort_sensor_reads_its_joints_in_its_own_order(system: System, read) -> None:
+    effort = np.arange(1.0, system.n_coordinates + 1)
+    a, b = (system.mechanism.joint_index(name) for name in ("left_a", "left_b"))
+    assert read(system, EffortSensor(("left_b", "left_a")), effort=effort) == pytest.approx([effort[b], effort[a]])
+
+
+@pytest.mark.parametrize("sensor", [EffortSensor(("x9",)), PointSensor("points", ("p",), ("x9",))])
+def test_a_joint_or_frame_that_is_not_there_is_refused(sensor: Sensor, system: System, read) -> None:
+    with pytest.raises(ModelError, match="x9"):
+        read(system, sensor)
 
 
 @dataclass(frozen=True)
