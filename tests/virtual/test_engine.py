@@ -48,9 +48,8 @@ def test_starts_in_static_equilibrium_of_the_symbolic_equations(runs: Runs, arms
     force = rigid.lagrangian_by_q - ca.gradient(system.elastic_energy(q), q) + system.input_force(u, q, q)
     jacobian = ca.jacobian(system.constraint_residual(kinematics), q)
     function = ca.Function("statics", [q, u, system.parameters.symbols], [force, jacobian])
-    load, gradient = (
-        np.array(ca.densify(e)) for e in function(run.q[0], run.effort[0], system.parameters.vector(TRUTH))
-    )
+    found = function(run.q[0], run.effort[0], system.parameters.vector(TRUTH))
+    load, gradient = (np.array(ca.densify(part)) for part in found)
     multiplier = np.linalg.lstsq(gradient.T, load, rcond=None)[0]
     assert np.abs(load - gradient.T @ multiplier).max() < 1e-5
     assert np.abs(run.v[0]).max() == 0.0
@@ -71,9 +70,8 @@ def test_other_grasps_hold(kind: str) -> None:
     grasp = Grasp("left", "left_gripper", "w_T2", kind, held_orientation=turned)  # type: ignore[arg-type]
     system = replace(system, grasps=(grasp,))
     motion = random_multisine_motion(system, TRUTH, seed=1, initial_joint_angles=posture)
-    run = simulate_in_mujoco(
-        system, TRUTH, motion, SimulationOptions(0.5, time_step=5e-4), initial_joint_angles=posture
-    )
+    options = SimulationOptions(0.5, time_step=5e-4)
+    run = simulate_in_mujoco(system, TRUTH, motion, options, initial_joint_angles=posture)
     assert np.abs(run.q[-1] - run.q[0]).max() > 0.02
     phi = grasp_gaps(system)
     residual = np.array([np.array(phi(row)).ravel() for row in run.q])
@@ -104,10 +102,7 @@ def test_what_a_slow_recording_keeps_of_a_fast_controller() -> None:
     ("choices", "match"),
     [
         ({"time_step": 3e-4}, "does not divide the period of 100 Hz"),
-        (
-            {"time_step": 3e-4, "controller_rate": 1000.0, "effort_kind": "mean"},
-            "does not divide the period of 1000 Hz",
-        ),
+        ({"time_step": 3e-4, "controller_rate": 1e3, "effort_kind": "mean"}, "not divide the period of 1000 Hz"),
         ({"controller_rate": 150.0, "effort_kind": "mean"}, "150 Hz is no multiple of the recording's 100 Hz"),
         ({"controller_rate": 50.0}, "50 Hz is no multiple"),
         ({"controller_rate": 1000.0}, "1000 Hz is not held over a sample of 100 Hz"),
@@ -126,6 +121,15 @@ def test_simulations_that_do_not_fit_are_refused() -> None:
         simulate_in_mujoco(replace(system, driven=system.driven[:3], prescribed=system.driven[3:]), None, motion)
 
 
+def grippers_beside(system: System, values: dict[str, float], time_step: float, held: System) -> MujocoScene:
+    """The scene with the joints a tenth of a radian from where the grippers meet another system's object."""
+    scene = MujocoScene.from_model(system, mujoco, compile_mjcf(mujoco_xml(system, values, time_step=time_step)))
+    scene.data.qpos[:] = scene.model.qpos_spring
+    for name, angle in grasping_joint_angles(held, TRUTH).items():
+        scene.data.qpos[scene.model.joint(name).id] = angle + 0.1
+    return scene
+
+
 def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
     coarse = SYSTEMS[2]
     fine = System.build(
@@ -136,29 +140,19 @@ def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
         damping=0.1,
     )
     assert fine.n_coordinates > 80  # MuJoCo takes sparse matrices for more than 60, if it is let
-    model = compile_mjcf(mujoco_xml(fine, {name: 2 * value for name, value in TRUTH.items()}, time_step=1e-4))
-    scene = MujocoScene.from_model(fine, mujoco, model)
-    scene.data.qpos[:] = model.qpos_spring
-    for name, angle in grasping_joint_angles(coarse, TRUTH).items():
-        scene.data.qpos[model.joint(name).id] = angle + 0.1  # beside what is held, as where an object hangs bent
-    mujoco.mj_step(model, scene.data, nstep=3)
+    scene = grippers_beside(fine, {name: 2 * value for name, value in TRUTH.items()}, 1e-4, coarse)
+    mujoco.mj_step(scene.model, scene.data, nstep=3)
     assert scene.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number == 0
     assert scene.data.solver_niter[0] < 10
 
 
-def test_grippers_beside_what_they_hold_close_at_a_short_step_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_grippers_beside_what_they_hold_close_at_a_short_step_too(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)  # MuJoCo leaves a log where it is
     system = SYSTEMS[2]
-    model = compile_mjcf(mujoco_xml(system, TRUTH, time_step=5e-5))
-    scene = MujocoScene.from_model(system, mujoco, model)
-    scene.data.qpos[:] = model.qpos_spring
-    for name, angle in grasping_joint_angles(system, TRUTH).items():
-        scene.data.qpos[model.joint(name).id] = angle + 0.1
-    balance = settle_to_equilibrium(scene, np.array(model.dof_damping))
+    scene = grippers_beside(system, TRUTH, 5e-5, system)
+    balance = settle_to_equilibrium(scene, np.array(scene.model.dof_damping))
     scene.data.qfrc_applied[scene.moved_joint_ids] = balance
-    mujoco.mj_forward(model, scene.data)
+    mujoco.mj_forward(scene.model, scene.data)
     for grasp in system.grasps:
         holder, held = (scene.data.site(f"grasp_{grasp.name}_{end}").xpos for end in ("holder", "held"))
         assert np.abs(holder - held).max() < 1e-7

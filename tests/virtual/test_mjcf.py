@@ -1,17 +1,208 @@
+"""Systems and effects in MuJoCo's terms: equal to the equations that they have here, or refused."""
+
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import casadi as ca
+import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH, assert_same_mechanics, clamped_beam
+from virtual_examples import SYSTEMS, TRUTH, assert_same_mechanics, clamped_beam, mujoco
 
+from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError, ModelError
-from yid_ocp.model.flexible import Segment, flexible_object
+from yid_ocp.export.models import effect_format_support
+from yid_ocp.model import (
+    Effect,
+    Grasp,
+    MidpointState,
+    Parameter,
+    Parameters,
+    Segment,
+    StepTerms,
+    System,
+    flexible_object,
+)
 from yid_ocp.model.mechanism import Frame, Placement
-from yid_ocp.model.parameters import Parameter, Parameters
-from yid_ocp.model.system import Effect, Grasp, MidpointState, StepTerms, System, floating_clamp
-from yid_ocp.virtual.mjcf import mujoco_xml
+from yid_ocp.model.system import floating_clamp
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.virtual.mjcf import ParameterEvaluator, compile_mjcf, joint_dynamics_terms, mujoco_xml
+
+MECHANICAL = {
+    "kelvin_voigt": ("T", {"tau": 0.05}),
+    "cubic_stiffness": ("T", {"k3": 4.0}),
+    "rest_curvature": ("T", {"qx": 0.1, "qy": -0.05}),
+    "bend_anisotropy": ("T", {"ratio": 0.3}),
+    "joint_spring": ("elbow", {"stiffness": 5.0, "rest_angle": 0.4}),
+    "density": ("B", {"scale": 1.2}),
+    "link_mass": ("elbow", {"scale": 0.8}),
+    "point_mass": ("w_B", {"mass": 0.05}),
+    "payload": ("tip", {"mass": 0.4, "mx": 0.02, "mz": 0.04}),
+    "length_scale": ("T", {"scale": 1.02}),
+    "rotor_inertia": ("shoulder", {"armature": 0.3}),
+    "joint_viscous": ("elbow", {"b": 0.2}),
+    "gravity_tilt": ("world", {"rx": 0.02, "ry": -0.03}),
+    "mount_compliance": ("base", {"stiffness": 50.0}),
+}
+OTHERS = {
+    "gravity_scale": ("object", {"fraction": -0.4}, "native"),
+    "grasp_offset": ("hold", {"dx": 0.01}, "native"),
+    "effort_gain": ("elbow", {"scale": 1.25}, "native"),
+    "effort_offset": ("elbow", {"offset": 0.3}, "native"),
+    "effort_delay": ("gripper", {"delay": 0.02}, "native"),
+    "effort_lag": ("elbow", {"time_constant": 0.03}, "native"),
+    "joint_coulomb": ("elbow", {"tau_c": 0.4}, "emulated"),
+    "joint_presliding": ("elbow", {"tau_c": 0.4}, "emulated"),
+    "grasp_compliance": ("hold", {"stiffness": 500.0, "damping": 3.0}, "emulated"),
+    "standard_linear_solid": ("T", {"ratio": 0.3}, "not representable"),
+    "hysteresis": ("T", {"stiffness": 0.5}, "not representable"),
+    "joint_stribeck": ("elbow", {"tau_s": 0.3}, "not representable"),
+    "aerodynamic_drag": ("T", {"cd": 1.0}, "not representable"),
+    "grasp_slip": ("hold", {"slip_per_load": 1e-3}, "not representable"),
+    "encoder_offset": ("elbow", {"offset": 0.01}, "not representable"),
+    "series_elasticity": ("elbow", {"stiffness": 500.0}, "not representable"),
+    "backlash": ("elbow", {"width": 0.01}, "not representable"),
+    "camera_translation": ("camera", {"x": 0.01}, "not representable"),
+    "camera_rotation": ("camera", {"rx": 0.01}, "not representable"),
+    "camera_scale": ("camera", {"scale": 1.01}, "not representable"),
+    "camera_latency": ("camera", {"delay": 0.05}, "not representable"),
+    "surface_offset": ("camera", {"fraction": 0.5}, "not representable"),
+    "clock_scale": ("clock", {"scale": 1.05}, "not representable"),
+    # two branches on joints without mass, which only writing the model shows
+    "junction_compliance": ("w_T", {"stiffness": 50.0}, "native"),
+}
+
+
+# actuators of another system: tests/virtual/test_servos.py
+OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", "back_emf"}
+
+
+@pytest.fixture(scope="module")
+def system() -> System:
+    """Two driven joints, a trunk with two branches, the tip of one of them held by the ceiling."""
+    item = flexible_object(
+        [
+            Segment("T", 0.4, 0.2, 0.01, 2, bend=8.0, twist=5.0),
+            Segment("B", 0.2, 0.1, 0.01, 1, parent="T", bend=6.0),
+            Segment("C", 0.2, 0.1, 0.01, 1, parent="T", bend=6.0),
+        ]
+    )
+    robot = read_urdf("default:double_pendulum.urdf")
+    grasps = [Grasp("hold", "ceiling", "w_B")]
+    driven = robot.joint_names
+    return System.build(robot, objects=[(item, "tip", None)], grasps=grasps, driven=driven, damping=0.1)
+
+
+def with_effect(system: System, kind: str, location: str, values: dict[str, float]) -> System:
+    return system.with_effects([make_effect(kind, location, system, values)])
+
+
+def test_every_kind_of_the_library_is_looked_at() -> None:
+    ours = {kind for kind in EFFECTS if EFFECTS[kind].__module__.startswith("yid_ocp.effects")}
+    assert set(MECHANICAL) | set(OTHERS) | OF_SERVOS | {"joint_load_friction"} == ours
+
+
+@pytest.mark.parametrize("kind", MECHANICAL)
+def test_mechanics_of_an_effect_equals_the_symbolic_one(system: System, kind: str) -> None:
+    if kind == "cubic_stiffness" and not hasattr(mujoco.MjModel, "jnt_stiffnesspoly"):
+        pytest.skip("this MuJoCo has no polynomial stiffness")
+    assert_same_mechanics(with_effect(system, kind, *MECHANICAL[kind]), {})
+
+
+@pytest.mark.parametrize("kind", [*MECHANICAL, *OTHERS])
+def test_what_is_said_of_it(system: System, kind: str) -> None:
+    location, values, *status = (*MECHANICAL[kind], "native") if kind in MECHANICAL else OTHERS[kind]
+    [said] = effect_format_support(with_effect(system, kind, location, values), {}, "mjcf").values()
+    assert [said.status] == status
+    neutral = with_effect(system, kind, location, {})
+    assert effect_format_support(neutral, {}, "mjcf")[f"{kind}@{location}"].how.startswith("neutral")
+
+
+def test_what_has_no_term_is_refused(system: System) -> None:
+    for kind, (location, values, status) in OTHERS.items():
+        changed = with_effect(system, kind, location, values)
+        [said] = effect_format_support(changed, {}, "mjcf").values()
+        motion = not said.how.startswith("what a sensor reads")
+        if kind == "junction_compliance" or (status == "not representable" and motion):
+            with pytest.raises(ModelError):
+                mujoco_xml(changed, emulate=True)
+        if status == "emulated":
+            with pytest.raises(ModelError):
+                mujoco_xml(changed)
+            mujoco_xml(changed, emulate=True)
+
+
+def test_a_part_of_the_weight(system: System) -> None:
+    changed = with_effect(system, "gravity_scale", "object", {"fraction": -0.4})
+    model, whole = (compile_mjcf(mujoco_xml(s)) for s in (changed, system))
+    light, heavy = mujoco.MjData(model), mujoco.MjData(whole)
+    for m, d in ((model, light), (whole, heavy)):
+        d.qpos[:] = np.linspace(-0.5, 0.5, m.nq)
+        mujoco.mj_forward(m, d)
+    loads = np.zeros(model.nv)  # of the object's weight, by the Jacobians of its bodies
+    for body in range(model.nbody):
+        if model.body(body).name.startswith(("T_", "B_", "C_")):
+            jacobian = np.zeros((3, model.nv))
+            mujoco.mj_jacBodyCom(whole, heavy, jacobian, None, body)
+            loads += jacobian.T @ (whole.body_mass[body] * whole.opt.gravity)
+    np.testing.assert_allclose(light.qfrc_passive - heavy.qfrc_passive, -0.4 * loads, atol=1e-9)
+
+
+def test_recorded_torques_become_those_that_act(system: System) -> None:
+    system = replace(system, grasps=(), gravity=ca.SX(ca.DM.zeros(3)))
+    for kind in ("effort_gain", "effort_offset", "effort_lag"):
+        location, values, _ = OTHERS[kind]
+        system = with_effect(system, kind, location, values)
+    late = with_effect(system, "effort_delay", "gripper", {"delay": 0.02})
+    for changed, delay in ((system, 0.0), (late, 0.02)):
+        if delay and not hasattr(mujoco.MjModel, "actuator_delay"):
+            continue
+        model = compile_mjcf(mujoco_xml(changed, time_step=1e-3, actuators=True))
+        data = mujoco.MjData(model)
+        at, found = model.joint("elbow").id, []
+        for _ in range(120):
+            data.ctrl[:] = 2.0
+            mujoco.mj_step(model, data)
+            found.append(data.qfrc_actuator[at])
+        # the lag acts on what was recorded, the other two on what follows it
+        t = 1e-3 * np.arange(120) - delay
+        expected = 2.0 * (1 - np.exp(-np.maximum(t, 0.0) / 0.03)) / 1.25 - 0.3 / 1.25
+        np.testing.assert_allclose(found, expected, atol=0.06)  # a step late
+        assert found[-1] == pytest.approx(expected[-1], abs=2e-3)
+
+
+def test_a_grasp_that_gives_way_is_a_tendon(system: System) -> None:
+    changed = with_effect(system, *("grasp_compliance", *OTHERS["grasp_compliance"][:2]))
+    model = compile_mjcf(mujoco_xml(changed, emulate=True))
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.1
+    mujoco.mj_forward(model, data)
+    apart = data.site("grasp_hold_holder").xpos - data.site("grasp_hold_held").xpos
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian, None, model.site("grasp_hold_held").id)
+    plain = compile_mjcf(mujoco_xml(replace(changed, grasps=()), emulate=True))
+    other = mujoco.MjData(plain)
+    other.qpos[:] = 0.1
+    mujoco.mj_forward(plain, other)
+    np.testing.assert_allclose(data.qfrc_passive - other.qfrc_passive, 500.0 * jacobian.T @ apart, atol=1e-8)
+    assert model.tendon_damping[0] == pytest.approx(3.0)
+
+
+def test_dry_friction_is_friction_of_the_joint(system: System) -> None:
+    changed = with_effect(system, "joint_coulomb", "elbow", {"tau_c": 0.4})
+    assert joint_dynamics_terms(changed, ParameterEvaluator(changed))["elbow"].dry_friction == 0.4
+    model = compile_mjcf(mujoco_xml(changed, emulate=True))
+    assert model.dof_frictionloss[model.joint("elbow").id] == 0.4
+
+
+def test_the_page_lists_what_is_native(repository) -> None:
+    text = (repository / "docs" / "export.md").read_text(encoding="utf-8")
+    rows = re.search(r"\| effect \| in MJCF \|\n(.*?)\n\n", text, re.DOTALL)
+    assert rows is not None
+    listed = {kind for row in rows[1].splitlines()[1:] for kind in re.findall(r"`(\w+)`", row.split("|")[1])}
+    native = {kind for kind, (*_, status) in OTHERS.items() if status == "native"} - {"junction_compliance"}
+    assert listed == native | set(MECHANICAL) | OF_SERVOS
 
 
 @pytest.mark.parametrize(
