@@ -35,7 +35,6 @@ from yid_ocp.model.objects.cable import (
     CableOptions,
     cable_system,
     edge_length_parameter_values,
-    estimable_parameter_names,
     read_vertex_positions,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -68,6 +67,24 @@ def branched_cable(folder: Path = FOLDER) -> CableTopology:
         {"a": ("p4", "a1", "a2", "a3", "a4"), "b": ("p8", "b1", "b2", "b3")},
         read_vertex_positions(folder / "bdlo1_undeformed.csv"),
     )
+
+
+def estimable_parameter_names(cable: CableTopology, options: CableOptions) -> tuple[str, ...]:
+    """Names of the parameters that a cable's motion alone can identify: stiffness, damping and rest shape, no mass."""
+    names: list[str] = []
+    for name in cable.branch_vertex_names:
+        names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
+        if options.branches.get(name, options.default_branch).separate_twist_damping:
+            names.append(f"{name}.twist_damping")
+        if options.shape_memory is not None:
+            names.append(f"{name}.memory")
+    if options.shape_memory is not None:
+        names.append("start.speed_scale")
+    if options.has_rest_angle_parameters:
+        for name, chain in cable.branch_vertex_names.items():
+            links = len(chain) - (2 if name == cable.parent_segment else 1)
+            names += [f"{name}_{i}_{axis}.rest" for i in range(links) for axis in "xy"]
+    return tuple(names)
 
 
 def cable_options(cable: CableTopology, recordings: list[Recording], options: CableOptions) -> ProblemOptions:

@@ -19,7 +19,7 @@ from yid_ocp.virtual.injected import (
     _CORD_LENGTH,
     _CREASE_ANGLE,
     _DRIFT_TIME,
-    _FORCE_KINDS,
+    _FORCES,
     _MAGNET_DISTANCE,
     _MAGNET_POLE_SIZE,
     _MUJOCO_MODEL_KINDS,
@@ -182,7 +182,7 @@ def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
     assert set(INJECTABLE_EFFECT_KINDS) <= set(EFFECTS)
     assert not set(OUT_OF_LIBRARY_EFFECTS) & set(EFFECTS)
     tested_elsewhere = {"rotor_inertia", "standard_linear_solid", "hysteresis", *TWINS}
-    assert {label.partition("@")[0] for label in SIZES} | tested_elsewhere == {*_MUJOCO_MODEL_KINDS, *_FORCE_KINDS}
+    assert {label.partition("@")[0] for label in SIZES} | tested_elsewhere == {*_MUJOCO_MODEL_KINDS, *_FORCES}
     assert set(_SENSOR_ERROR_KINDS) <= set(INJECTABLE_EFFECT_KINDS)
 
 

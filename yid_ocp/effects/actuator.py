@@ -13,16 +13,8 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from yid_ocp.effects.base import (
-    EFFECTS,
-    EffectBase,
-    ParameterDefinition,
-    arm_joint_names,
-    compliance_parameter_definition,
-    effort_limit_over_baxter,
-    generalized_force_at_joint,
-    joint_names_by_arm,
-)
+from yid_ocp.effects import base
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, UNLIMITED_EFFORT_THRESHOLD, PositionServo
 from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 
@@ -32,9 +24,8 @@ _MIN_LIMIT_FRACTION = 0.1  # smallest torque limit that is searched, over the jo
 
 
 def _recorded_joints(system: System) -> tuple[str, ...]:
-    """Names of arm joints that are driven or prescribed."""
     known = {*system.driven, *system.prescribed}
-    return tuple(name for name in arm_joint_names(system) if name in known)
+    return tuple(name for name in base.arm_joint_names(system) if name in known)
 
 
 def _effort_joints(system: System) -> tuple[str, ...]:
@@ -43,12 +34,10 @@ def _effort_joints(system: System) -> tuple[str, ...]:
 
 
 def _servo_joints(system: System) -> tuple[str, ...]:
-    """Names of arm joints with a servo."""
-    return tuple(name for name in arm_joint_names(system) if name in system.servos)
+    return tuple(name for name in base.arm_joint_names(system) if name in system.servos)
 
 
 def _dc_motor_joints(system: System) -> tuple[str, ...]:
-    """Names of arm joints with a servo whose motor is of kind dc."""
     return tuple(name for name in _servo_joints(system) if system.servos[name].motor_kind == "dc")
 
 
@@ -60,7 +49,7 @@ def _geared_joints(system: System) -> tuple[str, ...]:
 def _effort_arms(system: System) -> tuple[str, ...]:
     """Names of arms with a joint whose recorded effort drives it or is compared."""
     known = set(_effort_joints(system))
-    return tuple(name for name, joints in joint_names_by_arm(system).items() if known & set(joints))
+    return tuple(name for name, joints in base.joint_names_by_arm(system).items() if known & set(joints))
 
 
 class _DistortedReading(EffectBase):
@@ -112,7 +101,9 @@ class SeriesElasticity(_DistortedReading):
     equation = "measured angle = q + effort/stiffness"
     required_excitation = "how hard it pulls at its ends"
     required_sensors = frozenset({"joints.position", "joints.effort"})
-    declared_parameters = (compliance_parameter_definition("rad/(N m)", 0.02, (1 / 2000, 1 / 100), "gear", "N m/rad"),)
+    declared_parameters = (
+        base.compliance_parameter_definition("rad/(N m)", 0.02, (1 / 2000, 1 / 100), "gear", "N m/rad"),
+    )
 
     def _error(self, effort: ca.SX) -> ca.SX:
         return self["compliance"] * effort
@@ -149,7 +140,7 @@ class Backlash(_DistortedReading):
         free, geared = (servo.torque(command, state.q[index] + give, state.v[index]) for give in (0, play))
         taken = play - self["width"] / 2 * ca.tanh(geared / _PLAY_TORQUE)
         return StepTerms(
-            generalized_force=generalized_force_at_joint(state.system, self.location, geared - free),
+            generalized_force=base.generalized_force_at_joint(state.system, self.location, geared - free),
             internal_equations={name: taken},
         )
 
@@ -215,7 +206,7 @@ class EffortOffset(_DistortedEffort):
     declared_parameters = (
         replace(
             ParameterDefinition("offset", "N m", 0.0, -10.0, 10.0, (-1.5, 1.5), "measured less true effort"),
-            range_scale=effort_limit_over_baxter,
+            range_scale=base.effort_limit_over_baxter,
         ),
     )
 
@@ -283,7 +274,6 @@ class _ServoChange(EffectBase):
     possible_locations = _servo_joints
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
-        """The fields of the servo that the effect changes."""
         return {}
 
     def apply_to_system(self, system: System) -> System:

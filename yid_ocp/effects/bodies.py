@@ -10,21 +10,8 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from yid_ocp.effects.base import (
-    EFFECTS,
-    EffectBase,
-    ParameterDefinition,
-    ReportedParameter,
-    arm_joint_names,
-    arm_link_end_frame_names,
-    arm_link_frame_names,
-    effort_limit_over_baxter,
-    effort_scaled_parameter_definition,
-    object_joint_names,
-    segment_name_of_frame,
-    segment_names,
-    with_changed_joint_bodies,
-)
+from yid_ocp.effects import base
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition, ReportedParameter
 from yid_ocp.model.kinematics import Kinematics, motion_cross_force_product, motion_cross_motion_product
 from yid_ocp.model.mechanism import Inertia, merge_bodies
 from yid_ocp.model.rotations import symbolic_rotation_from_rpy
@@ -64,11 +51,10 @@ class _ScaledBodies(EffectBase):
     required_excitation = "how hard it accelerates"
 
     def _joints(self, system: System) -> tuple[str, ...]:
-        """Names of the joints that carry the bodies."""
         raise NotImplementedError
 
     def apply_to_system(self, system: System) -> System:
-        return with_changed_joint_bodies(
+        return base.with_changed_joint_bodies(
             system, self._joints(system), lambda bodies: (b.scaled_by(self["scale"]) for b in bodies)
         )
 
@@ -78,7 +64,7 @@ class Density(_ScaledBodies):
     """All masses and inertias of a segment multiplied by a factor."""
 
     equation = "masses and inertias times scale"
-    possible_locations = segment_names
+    possible_locations = base.segment_names
     declared_parameters = (
         ParameterDefinition("scale", "1", 1.0, 0.2, 3.0, (0.7, 1.3), "factor on masses and inertias"),
     )
@@ -88,9 +74,8 @@ class Density(_ScaledBodies):
 
 
 def _joints_with_mass(system: System) -> tuple[str, ...]:
-    """Names of arm joints whose child link has mass."""
     tree = system.mechanism
-    return tuple(name for name in arm_joint_names(system) if tree.joints[tree.joint_index(name)].bodies)
+    return tuple(name for name in base.arm_joint_names(system) if tree.joints[tree.joint_index(name)].bodies)
 
 
 @EFFECTS.register("link_mass")
@@ -107,14 +92,13 @@ class LinkMass(_ScaledBodies):
 
 
 def _moving_frames(system: System) -> tuple[str, ...]:
-    """Names of all frames that a joint moves."""
     return tuple(name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0)
 
 
 def _tips_and_link_ends(system: System) -> tuple[str, ...]:
     """Names of segment tips, junctions and ends of arm links."""
     ends = (f"{prefix}_{s.name}" for s in system.segment_layouts for prefix in ("w", "junction"))
-    return (*(name for name in ends if name in system.mechanism.frames), *arm_link_end_frame_names(system))
+    return (*(name for name in ends if name in system.mechanism.frames), *base.arm_link_end_frame_names(system))
 
 
 @EFFECTS.register("point_mass")
@@ -137,7 +121,7 @@ class PointMass(EffectBase):
         frame = system.mechanism.frame(self.location)
         point = Inertia(self["mass"], frame.placement.translation, ca.SX(ca.DM.zeros(3, 3)))
         joint = system.mechanism.joints[frame.joint_index].name
-        return with_changed_joint_bodies(system, [joint], lambda bodies: (*bodies, point))
+        return base.with_changed_joint_bodies(system, [joint], lambda bodies: (*bodies, point))
 
 
 @EFFECTS.register("payload")
@@ -164,7 +148,7 @@ class Payload(EffectBase):
     is_local = True
     possible_locations = _moving_frames
     # payloads at two frames of one link are equivalent
-    candidate_locations = arm_link_frame_names
+    candidate_locations = base.arm_link_frame_names
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
@@ -217,7 +201,7 @@ class Payload(EffectBase):
             Inertia(ca.SX(1), centre + first, ca.densify(tensor)),
             Inertia(mass - 1, centre, ca.SX(ca.DM.zeros(3, 3))),
         )
-        return with_changed_joint_bodies(system, [joint.name], lambda bodies: (*bodies, *pair))
+        return base.with_changed_joint_bodies(system, [joint.name], lambda bodies: (*bodies, *pair))
 
 
 def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
@@ -244,23 +228,21 @@ def _bearable(system: System, frame: str) -> tuple[float, float]:
     """Upper bound and expected maximum of a mass at a frame [kg]."""
     tree = system.mechanism
     joint = tree.frame(frame).joint_index
-    if segment_name_of_frame(system, frame) is not None:
-        whole = sum(_carried_body(system, tree.joint_index(name)).mass for name in object_joint_names(system))
+    if base.segment_name_of_frame(system, frame) is not None:
+        whole = sum(_carried_body(system, tree.joint_index(name)).mass for name in base.object_joint_names(system))
         return max(0.5, whole), max(0.05, whole)
-    moving = set(arm_joint_names(system)) & {tree.joints[i].name for i in tree.ancestor_joint_indices(joint)}
-    size = max((effort_limit_over_baxter(system, name) for name in moving), default=1.0)
+    moving = set(base.arm_joint_names(system)) & {tree.joints[i].name for i in tree.ancestor_joint_indices(joint)}
+    size = max((base.effort_limit_over_baxter(system, name) for name in moving), default=1.0)
     return 10.0 * size, 3.0 * size
 
 
 def _length_names(system: System, segment: str) -> list[str]:
-    """Names of the parameters that are lengths of a segment's links."""
     own = f"{segment}.length"
     return [name for name in system.parameters.names if name == own or name.startswith(f"{own}_")]
 
 
 def _segments_with_length(system: System) -> tuple[str, ...]:
-    """Names of segments whose length is a parameter."""
-    return tuple(name for name in segment_names(system) if _length_names(system, name))
+    return tuple(name for name in base.segment_names(system) if _length_names(system, name))
 
 
 @EFFECTS.register("length_scale")
@@ -283,9 +265,9 @@ class RotorInertia(EffectBase):
 
     equation = "T += 1/2 armature v^2"
     required_excitation = "how hard it accelerates"
-    possible_locations = arm_joint_names
+    possible_locations = base.arm_joint_names
     declared_parameters = (
-        effort_scaled_parameter_definition("armature", "kg m^2", 5.0, 1.0, "inertia of the rotor at the joint"),
+        base.effort_scaled_parameter_definition("armature", "kg m^2", 5.0, 1.0, "inertia of the rotor at the joint"),
     )
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -306,7 +288,7 @@ class AerodynamicDrag(EffectBase):
 
     equation = "F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n"
     required_excitation = "how fast it moves"
-    possible_locations = segment_names
+    possible_locations = base.segment_names
     declared_parameters = (ParameterDefinition("cd", "1", 0.0, 0.0, 20.0, (0.0, 3.0), "drag coefficient"),)
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -331,7 +313,6 @@ class AerodynamicDrag(EffectBase):
 
 
 def _object(system: System) -> tuple[str, ...]:
-    """`object`, where there is one."""
     return ("object",) if system.segment_layouts else ()
 
 
@@ -356,7 +337,9 @@ class GravityScale(EffectBase):
             nominal = 1 if body.gravity_fraction is None else body.gravity_fraction
             return replace(body, gravity_fraction=nominal + self["fraction"])
 
-        return with_changed_joint_bodies(system, object_joint_names(system), lambda bodies: map(scaled, bodies))
+        return base.with_changed_joint_bodies(
+            system, base.object_joint_names(system), lambda bodies: map(scaled, bodies)
+        )
 
 
 @EFFECTS.register("gravity_tilt")

@@ -8,14 +8,8 @@ from typing import Literal
 
 import casadi as ca
 
-from yid_ocp.effects.base import (
-    EFFECTS,
-    EffectBase,
-    ParameterDefinition,
-    arm_joint_names,
-    effort_scaled_parameter_definition,
-    generalized_force_at_joint,
-)
+from yid_ocp.effects import base
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
 from yid_ocp.model.system import MidpointState, StepTerms, System
 
 _SIGN_SMOOTHING_SPEED = 0.02  # v_s in sgn(v) = tanh(v/v_s) [rad/s]
@@ -38,14 +32,14 @@ FRICTION_LAWS: Mapping[FrictionLaw, tuple[str, ...]] = {
 
 def _servo_joints(system: System) -> tuple[str, ...]:
     """Names of arm joints with a servo: recorded torques leave no room for what a gear takes of them."""
-    return tuple(name for name in arm_joint_names(system) if name in system.servos)
+    return tuple(name for name in base.arm_joint_names(system) if name in system.servos)
 
 
 class _JointFriction(EffectBase):
     """Friction of an arm joint as a function of its speed."""
 
     required_excitation = "how fast it moves"
-    possible_locations = arm_joint_names
+    possible_locations = base.arm_joint_names
 
     def _friction(self, v: ca.SX) -> ca.SX:
         """The torque that works against the speed v."""
@@ -53,7 +47,9 @@ class _JointFriction(EffectBase):
 
     def step_terms(self, state: MidpointState) -> StepTerms:
         v = state.v[state.system.mechanism.joint_index(self.location)]
-        return StepTerms(dissipative_force=generalized_force_at_joint(state.system, self.location, -self._friction(v)))
+        return StepTerms(
+            dissipative_force=base.generalized_force_at_joint(state.system, self.location, -self._friction(v))
+        )
 
 
 @EFFECTS.register("joint_viscous")
@@ -61,7 +57,7 @@ class JointViscous(_JointFriction):
     """Viscous friction F = -b v in addition to the model's damping."""
 
     equation = "F = -b v"
-    declared_parameters = (effort_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
+    declared_parameters = (base.effort_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["b"] * v
@@ -72,7 +68,7 @@ class JointCoulomb(_JointFriction):
     """Coulomb friction F = -tau_c tanh(v/v_s), v_s = `_SIGN_SMOOTHING_SPEED`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
-    declared_parameters = (effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
+    declared_parameters = (base.effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
 
     def _friction(self, v: ca.SX) -> ca.SX:
         return self["tau_c"] * ca.tanh(v / _SIGN_SMOOTHING_SPEED)
@@ -84,7 +80,9 @@ class JointStribeck(_JointFriction):
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     declared_parameters = (
-        effort_scaled_parameter_definition("tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"),
+        base.effort_scaled_parameter_definition(
+            "tau_s", "N m", 10.0, 2.0, "friction at low speed beside sliding friction"
+        ),
         ParameterDefinition("v_stribeck", "rad/s", 0.1, 5e-3, 2.0, (0.01, 0.3), "speed beyond which it is gone", True),
     )
 
@@ -124,7 +122,7 @@ class JointLoadFriction(_JointFriction):
         v = state.v[state.system.mechanism.joint_index(self.location)]
         friction = self["share"] * size * ca.tanh(v / _LOAD_SIGN_SMOOTHING_SPEED)
         # beside weight and motor it takes energy out, and its size follows both
-        return StepTerms(generalized_force=generalized_force_at_joint(state.system, self.location, -friction))
+        return StepTerms(generalized_force=base.generalized_force_at_joint(state.system, self.location, -friction))
 
 
 @EFFECTS.register("joint_presliding")
@@ -149,9 +147,9 @@ class JointPresliding(EffectBase):
 
     equation = "F = -tau_c s, ds/dt = (v - |v| s) / yield_angle"
     required_excitation = "how fast it moves"
-    possible_locations = arm_joint_names
+    possible_locations = base.arm_joint_names
     declared_parameters = (
-        effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
+        base.effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "friction that holds and slides"),
         ParameterDefinition("yield_angle", "rad", 5e-3, 1e-5, 0.5, (1e-4, 0.05), "angle over which it yields", True),
     )
 
@@ -176,7 +174,7 @@ class JointPresliding(EffectBase):
         # e^-x by what is left over x^2, so that nothing is lost next to zero, where an arm that rests stays
         change = turned / width * (1 - x * _left(x)) - before * rounded * (1 - rounded * _left(rounded))
         mean = turned / width * _left(x) + before * (1 - rounded * _left(rounded))
-        force = generalized_force_at_joint(state.system, self.location, -self["tau_c"] * mean)
+        force = base.generalized_force_at_joint(state.system, self.location, -self["tau_c"] * mean)
         return StepTerms(
             generalized_force=force, internal_equations={name: state.h * rate - change}, static_equations={name: s}
         )
@@ -195,9 +193,9 @@ class JointSpring(EffectBase):
 
     equation = "V += 1/2 stiffness (q - rest_angle)^2"
     required_excitation = "how far it bends"
-    possible_locations = arm_joint_names
+    possible_locations = base.arm_joint_names
     declared_parameters = (
-        effort_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
+        base.effort_scaled_parameter_definition("stiffness", "N m/rad", 300.0, 60.0, "stiffness of the spring"),
         ParameterDefinition("rest_angle", "rad", 0.0, -math.pi, math.pi, (-2.0, 2.0), "where it is relaxed", True),
     )
 

@@ -38,7 +38,6 @@ class _SegmentEffect(EffectBase):
     possible_locations = segment_names
 
     def _springs(self, state: MidpointState) -> list[tuple[ElasticJoint, int]]:
-        """The segment's elastic joints with their indices."""
         index = state.system.mechanism.joint_index
         return [(spring, index(spring.joint_name)) for spring in segment_elastic_joints(state.system, self.location)]
 
@@ -50,7 +49,6 @@ class _SegmentMemory(_SegmentEffect):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Names of the segment's elastic joints."""
         return tuple(spring.joint_name for spring in segment_elastic_joints(system, location))
 
 
@@ -202,7 +200,6 @@ class RestCurvature(_SpringChange):
 
 
 def _doubly_bending_segments(system: System) -> tuple[str, ...]:
-    """Names of segments that bend about both x and y."""
     bent = {(spring.segment_name, spring.axis) for spring in system.elastic_joints}
     return tuple(name for name in segment_names(system) if {(name, "x"), (name, "y")} <= bent)
 

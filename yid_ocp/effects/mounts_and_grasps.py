@@ -7,14 +7,8 @@ from typing import Any
 
 import casadi as ca
 
-from yid_ocp.effects.base import (
-    EFFECTS,
-    EffectBase,
-    ParameterDefinition,
-    clamp_names,
-    compliance_parameter_definition,
-    grasp_names,
-)
+from yid_ocp.effects import base
+from yid_ocp.effects.base import EFFECTS, EffectBase, ParameterDefinition
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS
 from yid_ocp.model.mechanism import Joint, Placement
 from yid_ocp.model.system import Grasp, MidpointState, StepTerms, System
@@ -24,7 +18,7 @@ _SPRING_RELAXATION_TIME = 5e-3  # of mount and junction springs: too short to da
 
 def _root_joints_by_base(system: System) -> dict[str, tuple[str, ...]]:
     """First joints of all segments without a parent, by what carries them: a clamp's name, else `base`."""
-    tree, clamps = system.mechanism, clamp_names(system)
+    tree, clamps = system.mechanism, base.clamp_names(system)
     found: dict[str, tuple[str, ...]] = {}
     for first in (s.link_joints[0][0] for s in system.segment_layouts if s.parent_segment is None):
         above = tree.ancestor_joint_indices(tree.joint_index(first))[:-1]
@@ -50,7 +44,7 @@ class _JointInsertion(EffectBase):
 
     required_excitation = "how hard it pulls at its ends"
     declared_parameters = (
-        compliance_parameter_definition("rad/(N m)", 1.0, (1 / 500, 1 / 5), "two-axis spring", "N m/rad"),
+        base.compliance_parameter_definition("rad/(N m)", 1.0, (1 / 500, 1 / 5), "two-axis spring", "N m/rad"),
     )
 
     def _sprung(self, system: System, hung: tuple[str, ...], at: Placement | None, label: str) -> System:
@@ -115,10 +109,9 @@ class _GraspChange(EffectBase):
     """An effect that changes one grasp."""
 
     required_excitation = "how hard it pulls at its ends"
-    possible_locations = grasp_names
+    possible_locations = base.grasp_names
 
     def _changes(self, grasp: Grasp) -> dict[str, Any]:
-        """The fields of the grasp that the effect changes."""
         raise NotImplementedError
 
     def apply_to_system(self, system: System) -> System:
@@ -151,7 +144,7 @@ class GraspCompliance(_GraspChange):
 
     equation = "phi + C damping dphi/dt = C force"
     declared_parameters = (
-        compliance_parameter_definition("m/N", 0.1, (1e-4, 1e-2), "grasp", "N/m"),
+        base.compliance_parameter_definition("m/N", 0.1, (1e-4, 1e-2), "grasp", "N/m"),
         ParameterDefinition("damping", "N s/m", 0.0, 0.0, 100.0, (0.1, 20.0), "damping of the grasp", True),
     )
 
@@ -186,7 +179,7 @@ class GraspSlip(_GraspChange):
     def step_terms(self, state: MidpointState) -> StepTerms:
         [name] = self.internal_coordinates
         row, grasps = state.internal_rows[name], state.system.grasps
-        at = grasp_names(state.system).index(self.location)
+        at = base.grasp_names(state.system).index(self.location)
         first = sum(grasp.n_constraint_equations for grasp in grasps[:at])
         axis = state.kinematics.frame_pose(grasps[at].held_frame).rotation[:, 2]
         load = ca.dot(axis, state.constraint_force[first : first + 3])

@@ -17,12 +17,10 @@ from yid_ocp.model.system import NodeState, System
 
 
 def _camera(system: System) -> tuple[str, ...]:
-    """`camera`, where the system has points."""
     return ("camera",) if system.point_frames else ()
 
 
 def _camera_of_tubes(system: System) -> tuple[str, ...]:
-    """`camera`, where the system has points and segments."""
     return _camera(system) if system.segment_layouts else ()
 
 
@@ -38,7 +36,6 @@ class _CameraEffect(EffectBase):
     possible_locations = _camera
 
     def _seen(self, point: ca.SX, camera: Placement, state: NodeState) -> ca.SX:
-        """Where a true point is seen."""
         return point
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:

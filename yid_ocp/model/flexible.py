@@ -177,7 +177,6 @@ class _Parts:
 
 
 def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fraction: ca.SX | None) -> None:
-    """Append a segment's links to the object."""
     own = _segment_parameters(segment)
     parts.parameters.extend(own.values())
     mass, shares = own["mass"].symbol, _length_shares(segment)

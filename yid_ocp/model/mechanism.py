@@ -259,7 +259,6 @@ def map_expressions(description: Any, change: Callable[[ca.SX], ca.SX]) -> Any:
 
 
 def _fraction(name: str, said: str) -> float:
-    """Fraction of a length from a percentage in a frame's name."""
     try:
         value = float(said.strip().removesuffix("%")) if said.strip().endswith("%") else math.nan
     except ValueError:

@@ -322,7 +322,6 @@ def _origin(element: Any) -> Array:
 
 
 def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia, ...]) -> Joint:
-    """The file's joint with its limits, infinite where there are none."""
     x, y, z = map(float, snap_near_integer_entries(_unit_axis(source)))
 
     def bound(key: str, otherwise: float) -> float:
@@ -408,7 +407,6 @@ def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None =
 
 
 def _write_link(robot: ElementTree.Element, name: str, joint: Joint) -> None:
-    """The link that a joint moves, with the joint's bodies merged."""
     link = ElementTree.SubElement(robot, "link", name=name)
     body = merge_bodies(joint.bodies)
     if body is None:

@@ -197,7 +197,6 @@ def smoothed_effort_data(
 
 @SENSOR_READERS.register("motors.current")
 def _read_motor_currents(around: SensorReadingContext) -> list[SensorData]:
-    """Measurements of prescribed joints' motor currents, filtered like joint efforts."""
     return [
         found
         for group in around.recording.channel_groups

@@ -49,7 +49,6 @@ class PointSensor(Sensor):
 
 @SENSOR_READERS.register("points")
 def _read_point_groups(around: SensorReadingContext) -> list[SensorData]:
-    """Measurements of every used group of points."""
     return [
         _points(around, group, around.sensor_usage(group.name))
         for group in around.recording.points

@@ -42,34 +42,27 @@ _WALL_DISTANCE = 0.01  # of a soft wall from the tip at rest [m]
 _WARM_UP_TIME = 1.5  # time constant with which a cold gear loses its friction [s]
 
 # a change of the system's description; servos are MuJoCo's own actuators, which delay and clip
-_DESCRIPTION_KINDS: tuple[str, ...] = (
+_DESCRIPTION_KINDS = (
     *("density", "point_mass", "length_scale", "link_mass", "rest_curvature", "bend_anisotropy", "gravity_tilt"),
     *("grasp_offset", "servo_gain", "servo_delay", "servo_saturation"),
 )
 # a term that MuJoCo's own model has
-_MUJOCO_MODEL_KINDS: tuple[str, ...] = ("kelvin_voigt", "joint_viscous", "rotor_inertia", "payload")
+_MUJOCO_MODEL_KINDS = ("kelvin_voigt", "joint_viscous", "rotor_inertia", "payload")
 # an error of a sensor or clock
-_SENSOR_ERROR_KINDS: tuple[str, ...] = (
+_SENSOR_ERROR_KINDS = (
     *("effort_gain", "effort_offset", "effort_delay", "encoder_offset", "series_elasticity", "backlash"),
     *("camera_translation", "camera_rotation", "camera_scale", "camera_latency", "surface_offset"),
 )
 
 
-@dataclass
 class _EffectContext:
     """What forces read of the experiment; until the motion has begun the object comes to rest."""
 
-    system: System
-    value: ParameterEvaluator
-    joint_stiffness: Mapping[str, float]  # [N m/rad], elastic joints only
-    rest_angles: Mapping[str, float]  # [rad]
-    has_motion_begun: bool = False
-
-    @staticmethod
-    def from_system(system: System, values: Mapping[str, float]) -> _EffectContext:
-        value, springs = ParameterEvaluator(system, values), system.elastic_joints
-        stiffness = {s.joint_name: float(value(s.stiffness)[0]) for s in springs}
-        return _EffectContext(system, value, stiffness, {s.joint_name: float(value(s.rest_angle)[0]) for s in springs})
+    def __init__(self, system: System, values: Mapping[str, float]) -> None:
+        self.system, self.has_motion_begun = system, False
+        self.value, springs = ParameterEvaluator(system, values), system.elastic_joints
+        self.joint_stiffness = {s.joint_name: float(self.value(s.stiffness)[0]) for s in springs}  # [N m/rad]
+        self.rest_angles = {s.joint_name: float(self.value(s.rest_angle)[0]) for s in springs}  # [rad]
 
     def segment_springs(self, model: Any, segment: str) -> tuple[Array, Array, Array]:
         """Ids, stiffnesses and rest angles of a segment's elastic joints."""
@@ -281,7 +274,7 @@ def _weigh(scene: _EffectContext, model: Any, place: str, size: _Values) -> None
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-_FORCES: Mapping[str, _ForceBuilder] = {
+_FORCES: Mapping[str, _ForceBuilder] = {  # of the library's effects
     "cubic_stiffness": _spring_law(lambda size, angle, stiffness, t: -size["k3"] * angle**3),
     "standard_linear_solid": _memory_law(
         np.copy,
@@ -306,9 +299,7 @@ _FORCES: Mapping[str, _ForceBuilder] = {
     "joint_presliding": _memory_law(lambda q: 0.0, _slid, lambda size, stiffness, q, s: -size["tau_c"] * s),
     "effort_lag": _in_motion(_effort_lag),
 }
-"""Forces of the library's effects that are worked out here."""
-_FORCE_KINDS = tuple(_FORCES)
-INJECTABLE_EFFECT_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCE_KINDS, *_SENSOR_ERROR_KINDS)
+INJECTABLE_EFFECT_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCES, *_SENSOR_ERROR_KINDS)
 """Effect kinds of the library that can be simulated in MuJoCo."""
 
 
@@ -466,17 +457,13 @@ def run_experiment_with_effects(
 
 
 class _InjectedTerms:
-    """Effects as MuJoCo terms: `edit_model` edits the model, MuJoCo calls `add_forces` at every step.
-
-    `effects` are of `_MUJOCO_MODEL_KINDS`, `_FORCE_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
-    """
+    """Effects of `_MUJOCO_MODEL_KINDS`, `_FORCES` or `OUT_OF_LIBRARY_EFFECTS` as `InjectedSimulatorTerms`."""
 
     def __init__(self, system: System, values: Mapping[str, float], effects: Sequence[InjectedEffect]) -> None:
         self._effects, self._forces = tuple(effects), list[_ForceCallback]()
-        self._scene = _EffectContext.from_system(system, values)
+        self._scene = _EffectContext(system, values)
 
     def edit_model(self, model: Any) -> None:
-        """Edit a compiled `mujoco.MjModel` and work out the forces."""
         for effect in self._effects:
             size, place, scene = effect.values, effect.location, self._scene
             if effect.kind == "kelvin_voigt":
@@ -488,16 +475,14 @@ class _InjectedTerms:
                 model.dof_armature[model.joint(place).id] += size["armature"]
             elif effect.kind == "payload":
                 _weigh(scene, model, place, size)
-            elif effect.kind in OUT_OF_LIBRARY_EFFECTS:
-                self._forces.append(OUT_OF_LIBRARY_EFFECTS[effect.kind](scene, model, place, size["size"]))
-            else:
+            elif effect.kind in _FORCES:
                 self._forces.append(_FORCES[effect.kind](scene, model, place, size))
+            else:
+                self._forces.append(OUT_OF_LIBRARY_EFFECTS[effect.kind](scene, model, place, size["size"]))
 
     def start_motion(self, data: Any) -> None:
-        """Start the memory of effects that have one."""
         self._scene.has_motion_begun = True
 
     def add_forces(self, model: Any, data: Any) -> None:
-        """Add the forces to `qfrc_passive`."""
         for push in self._forces:
             push(model, data)

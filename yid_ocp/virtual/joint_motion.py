@@ -248,7 +248,6 @@ def _gap_function(
 
 
 def _reached(system: System, tree: Mechanism, posture: Array, sought: Sequence[int], gap: ca.Function) -> Array:
-    """The posture with the joints sought where they close all gaps."""
 
     def at(x: Array) -> Array:
         full = posture.copy()

@@ -423,7 +423,6 @@ def _add_grasps(system: System, value: ParameterEvaluator, root: Element, time_s
 
 
 def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element, time_step: float) -> None:
-    """Actuators from recorded torques to those that act, and position servos."""
     for joint in system.driven:
         gain, offset, delay, lag = _actuation(system, system.effects, joint, value)
         attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)

@@ -287,7 +287,6 @@ class _ServoCommander:
         self.initial_command = scene.data.qpos[scene.moved_joint_ids].copy()
 
     def apply_input(self, t: float) -> Array:
-        """Apply the commands at time t [s] and return them, shape (nu,) [rad or m]."""
         commands = np.asarray(self.initial_command + self._motion.offset_and_derivatives(t)[0])
         self._scene.data.ctrl[:] = commands
         return commands

@@ -132,25 +132,6 @@ def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[st
     return values
 
 
-def estimable_parameter_names(cable: CableTopology, options: CableOptions | None = None) -> tuple[str, ...]:
-    """Names of the parameters that a cable's motion alone can identify: stiffness, damping and rest shape, no mass."""
-    options = options or CableOptions()
-    names: list[str] = []
-    for name in cable.branch_vertex_names:
-        names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
-        if options.branches.get(name, options.default_branch).separate_twist_damping:
-            names.append(f"{name}.twist_damping")
-        if options.shape_memory is not None:
-            names.append(f"{name}.memory")
-    if options.shape_memory is not None:
-        names.append(START_SPEED_SCALE_PARAMETER_NAME)
-    if options.has_rest_angle_parameters:
-        for name, chain in cable.branch_vertex_names.items():
-            links = len(chain) - (2 if name == cable.parent_segment else 1)
-            names += [f"{name}_{i}_{axis}.rest" for i in range(links) for axis in "xy"]
-    return tuple(names)
-
-
 def cable_system(
     lengths: Mapping[tuple[str, str], float], cable: CableTopology, options: CableOptions | None = None
 ) -> System:
