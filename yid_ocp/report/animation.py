@@ -48,9 +48,7 @@ class _AnimatedMotion:
         fresh, places = self.is_new_measurement, self.positions.reshape(len(self.positions), -1)
         return {
             "name": self.name,
-            "sticks": [
-                [*entry.end_indices, round(entry.radius, 4), int(entry.is_object_part)] for entry in self.sticks
-            ],
+            "sticks": [[*own.end_indices, round(own.radius, 4), int(own.is_object_part)] for own in self.sticks],
             "points": dict(self.point_indices),
             "fresh": None if fresh is None else fresh.astype(int).tolist(),
             "places": [[round(_POSITION_SCALE * x) if isfinite(x) else None for x in row] for row in places.tolist()],
@@ -87,49 +85,43 @@ class ModelTrajectory:
         return np.stack([np.interp(t, self.t, column) for column in self.q.T], axis=1)
 
 
-class _StickFigure:
-    """Positions of joints, tips and points of a system at parameters theta (ntheta,), and the lines between them."""
+def _model_motion(told: ModelTrajectory, q: Array) -> _AnimatedMotion:
+    """Joints, tips and points of a system at configurations q (F, n), and the lines between them."""
+    system, tree = told.system, told.system.mechanism
+    symbols, names, owned = ca.SX.sym("q", system.n_coordinates), tree.joint_names, _link_radii(system, told.theta)
+    kinematics = forward_kinematics(tree, symbols)
+    origins = list(kinematics.joint_origins)
+    pairs = [(joint.parent_index, j, names[j] in owned) for j, joint in enumerate(tree.joints)]
+    points: dict[str, int] = {}
+    for name in _shown_frames(system):
+        frame = tree.frame(name)
+        origins.append(kinematics.frame_position(frame))
+        points |= {name: len(origins) - 1} if name in system.point_frames else {}
+        if frame.joint_index >= 0:
+            pairs.append((frame.joint_index, len(origins) - 1, names[frame.joint_index] in owned))
+    base = len(origins)
+    places = ca.Function("places", [symbols, system.parameters.symbols], [ca.horzcat(*origins, ca.SX(3, 1))])
 
-    def __init__(self, system: System, theta: Array) -> None:
-        tree, symbols = system.mechanism, [ca.SX.sym("q", system.n_coordinates), system.parameters.symbols]
-        kinematics = forward_kinematics(tree, symbols[0])
-        origins, names = list(kinematics.joint_origins), list(tree.joint_names)
-        owned = _link_radii(system, theta)
-        pairs = [(joint.parent_index, j, names[j] in owned) for j, joint in enumerate(tree.joints)]
-        points: dict[str, int] = {}
-        for name in _shown_frames(system):
-            frame = tree.frame(name)
-            origins.append(kinematics.frame_position(frame))
-            points |= {name: len(origins) - 1} if name in system.point_frames else {}
-            if frame.joint_index >= 0:
-                pairs.append((frame.joint_index, len(origins) - 1, names[frame.joint_index] in owned))
-        base = len(origins)
-        origins.append(ca.SX(3, 1))
-        places = ca.Function("places", symbols, [ca.horzcat(*origins)])
-        # joints of one link share a place: those that are together at two postures
-        postures = (np.zeros(system.n_coordinates), np.linspace(0.3, 1.1, system.n_coordinates))
-        both = [np.array(places(posture, theta)) for posture in postures]
-        apart = np.maximum(*(np.linalg.norm(own[:, :, None] - own[:, None], axis=0) for own in both))
-        first = np.argmax(apart < _MIN_STICK_LENGTH, axis=1).tolist()
-        # a robot stands on its base, an object on the ground or in a hand
-        known: dict[tuple[int, int], tuple[float, bool]] = {}
-        for a, b, own in pairs:
-            if a >= 0 or not own:
-                # an effect may have put joints between two links
-                child = owned.get(names[b] if b < len(names) else names[a], _ARM_RADIUS)
-                radius = owned.get(names[a], child) if own else _ARM_RADIUS
-                known[first[base if a < 0 else a], first[b]] = (radius, own)
-        known = {ends: told for ends, told in known.items() if ends[0] != ends[1]}
-        kept = sorted({k for ends in known for k in ends} | {first[k] for k in points.values()})
-        at = {k: i for i, k in enumerate(kept)}
-        self.point_indices = {name: at[first[k]] for name, k in points.items()}
-        self.sticks = [_Stick((at[a], at[b]), radius, own) for (a, b), (radius, own) in known.items()]
-        self._theta, self._places = theta, ca.Function("kept", symbols, [ca.horzcat(*(origins[k] for k in kept))])
-
-    def positions_at(self, q: Array) -> Array:
-        """Positions of all end points at configurations q (F, n), shape (F, K, 3) [m]."""
-        stacked = np.array(self._places.map(len(q))(q.T, np.tile(self._theta[:, None], (1, len(q)))))
+    def positions(q: Array) -> Array:
+        stacked = np.array(places.map(len(q))(q.T, np.tile(told.theta[:, None], (1, len(q)))))
         return stacked.T.reshape(len(q), -1, 3)
+
+    # joints of one link share a place: those that are together at two postures
+    both = positions(np.stack([np.zeros(system.n_coordinates), np.linspace(0.3, 1.1, system.n_coordinates)]))
+    apart = np.linalg.norm(both[:, :, None] - both[:, None], axis=3).max(axis=0)
+    first = np.argmax(apart < _MIN_STICK_LENGTH, axis=1).tolist()
+    # a robot stands on its base, an object on the ground or in a hand
+    known: dict[tuple[int, int], tuple[float, bool]] = {}
+    for a, b, own in pairs:
+        ends = (first[base if a < 0 else a], first[b])
+        if (a >= 0 or not own) and ends[0] != ends[1]:
+            # an effect may have put joints between two links
+            child = owned.get(names[b] if b < len(names) else names[a], _ARM_RADIUS)
+            known[ends] = (owned.get(names[a], child) if own else _ARM_RADIUS, own)
+    kept = sorted({k for ends in known for k in ends} | {first[k] for k in points.values()})
+    at = {k: i for i, k in enumerate(kept)}
+    sticks = [_Stick((at[a], at[b]), radius, own) for (a, b), (radius, own) in known.items()]
+    return _AnimatedMotion(told.name, sticks, positions(q)[:, kept], {name: at[first[k]] for name, k in points.items()})
 
 
 def _link_radii(system: System, theta: Array) -> dict[str, float]:
@@ -137,12 +129,8 @@ def _link_radii(system: System, theta: Array) -> dict[str, float]:
     tree, layouts = system.mechanism, system.segment_layouts
     evaluate = ca.Function("radii", [system.parameters.symbols], [ca.vertcat(*(layout.radius for layout in layouts))])
     radii = np.array(evaluate(theta)).ravel().tolist() if layouts else []
-    owned = {
-        joint: radius
-        for layout, radius in zip(layouts, radii, strict=True)
-        for link in layout.link_joints
-        for joint in link
-    }
+    carried = [(layout.link_joints, radius) for layout, radius in zip(layouts, radii, strict=True)]
+    owned = {joint: radius for links, radius in carried for link in links for joint in link}
     # what an effect put below the object is part of it, a robot's hand that carries it is not
     for j, name in reversed(list(enumerate(tree.joint_names))):
         children = [tree.joint_names[k] for k, joint in enumerate(tree.joints) if joint.parent_index == j]
@@ -168,11 +156,7 @@ def make_animation(title: str, told: Sequence[ModelTrajectory], recording: Recor
     Of a recording its points are shown, and its arms where it recorded their angles; at most `_MAX_FRAMES` frames.
     """
     t = _frame_times(told[0].t)
-    motions = []
-    for entry in told:
-        figure = _StickFigure(entry.system, entry.theta)
-        positions = figure.positions_at(entry._q_at(t))
-        motions.append(_AnimatedMotion(entry.name, figure.sticks, positions, figure.point_indices))
+    motions = [_model_motion(entry, entry._q_at(t)) for entry in told]
     if recording is not None:
         motions.append(_measured_motion(told[0], recording, t))
     return Animation(title, t, tuple(motions))
@@ -198,8 +182,8 @@ def _measured_motion(told: ModelTrajectory, recording: Recording, t: Array) -> _
         for name in recorded:
             column = joints.position[:, joints.names.index(name)]
             q[:, system.mechanism.joint_index(name)] = np.interp(t, joints.t, column)
-        figure = _StickFigure(system, told.theta)
-        sticks, places = [stick for stick in figure.sticks if not stick.is_object_part], figure.positions_at(q)
+        moved_arms = _model_motion(told, q)
+        sticks, places = [own for own in moved_arms.sticks if not own.is_object_part], moved_arms.positions
     seen: dict[str, Array] = {}
     fresh: dict[str, BoolArray] = {}
     for group in recording.points:

@@ -18,8 +18,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-BLIND_CALIBRATION_LABELS = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
-"""Kinds of the calibration of a blind validation."""
+
+_LegendPlace = Literal["lower right", "upper left"]
+
+
+def blind_calibration_rates(result: Mapping[str, Any]) -> dict[str, dict[float, Mapping[str, float]]]:
+    """Rates by promised level of a blind validation: of intervals of effects' parameters, and of p-values."""
+    labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
+    rates = {label: result["calibration"][key] for key, label in labels.items()}
+    return {label: {entry["level"]: entry for entry in own if entry["of"]} for label, own in rates.items()}
 
 
 def draw_method_convergence(path: Path, comparison: MethodComparison) -> None:
@@ -53,24 +60,25 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     """
     from matplotlib.figure import Figure
 
+    lines = {
+        "gap": ("gap seen", 0.95),
+        "first": ("kind and place first", 1.0),
+        "right": ("alone or in a set of three", 1.05),
+    }
+    sizes = {
+        label: {shift * float(size): own[key] for size, own in result["detection_intervals"].items()}
+        for key, (label, shift) in lines.items()
+    }
     figure = Figure(figsize=(5.6, 4.0), layout="constrained")
     axes = figure.subplots()
-    lines = (
-        ("gap", "gap seen", 0.95),
-        ("first", "kind and place first", 1.0),
-        ("right", "alone or in a set of three", 1.05),
-    )
-    for key, label, shift in lines:
-        known = {float(size): own[key] for size, own in result["detection_intervals"].items()}
-        _draw_rates(axes, [shift * size for size in known], list(known.values()), label)
+    _draw_rates(axes, sizes, "lower right")
     axes.set(xscale="log", xlabel="size over the detectable size", ylabel="part of the cases", ylim=(-0.03, 1.03))
-    _save_rates(figure, folder / "detection.png", "lower right")
+    _save(figure, folder / "detection.png")
 
-    shown = result["confusion"]
-    rows, columns = shown["true"], shown["said"]
+    rows, columns = result["confusion"]["true"], result["confusion"]["said"]
     figure = Figure(figsize=(3.0 + 0.34 * len(columns), 2.2 + 0.26 * len(rows)), layout="constrained")
     axes = figure.subplots()
-    counts = np.array(shown["counts"], float).reshape(len(rows), len(columns))
+    counts = np.array(result["confusion"]["counts"], float).reshape(len(rows), len(columns))
     parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
     if rows:
         axes.imshow(parts, cmap="Blues", vmin=0.0, vmax=1.0)
@@ -85,27 +93,24 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     figure = Figure(figsize=(5.0, 4.6), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="grey", linewidth=1)
-    for key, label in BLIND_CALIBRATION_LABELS.items():
-        entries = [entry for entry in result["calibration"][key] if entry["of"]]
-        _draw_rates(axes, [entry["level"] for entry in entries], entries, label)
+    _draw_rates(axes, blind_calibration_rates(result), "upper left")
     axes.set(xlabel="promised", ylabel="kept")
-    _save_rates(figure, folder / "calibration.png", "upper left")
+    _save(figure, folder / "calibration.png")
 
 
-def _draw_rates(axes: Axes, places: list[float], rates: list[Mapping[str, Any]], label: str) -> None:
-    if rates:
-        values, low, high = ([own[key] for own in rates] for key in ("rate", "low", "high"))
-        bars = asymmetric_error_bars(values, low, high)
-        spread = [bars["arrayminus"], bars["array"]]
-        axes.errorbar(places, values, yerr=spread, marker="o", capsize=3, label=label)
-
-
-def _save_rates(figure: Figure, path: Path, legend_place: Literal["lower right", "upper left"]) -> None:
-    (axes,) = figure.axes
+def _draw_rates(
+    axes: Axes, curves: Mapping[str, Mapping[float, Mapping[str, float]]], legend_place: _LegendPlace
+) -> None:
+    for label, known in curves.items():
+        if known:
+            values, low, high = ([own[key] for own in known.values()] for key in ("rate", "low", "high"))
+            bars = asymmetric_error_bars(values, low, high)
+            axes.errorbar(
+                list(known), values, yerr=[bars["arrayminus"], bars["array"]], marker="o", capsize=3, label=label
+            )
     axes.grid(alpha=0.3)
-    if axes.get_legend_handles_labels()[1]:
+    if any(curves.values()):
         axes.legend(loc=legend_place)
-    _save(figure, path)
 
 
 def _save(figure: Figure, path: Path, dpi: int = 120) -> None:

@@ -20,7 +20,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
 from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
-from yid_ocp.report.png_figures import BLIND_CALIBRATION_LABELS
+from yid_ocp.report.png_figures import blind_calibration_rates
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
 from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, SummaryBlock, SummaryStatement, SummaryTable
 
@@ -160,10 +160,7 @@ def _blind_validation(findings: ReportData) -> Mapping[str, Any] | None:
     if counts.size:
         figure = figures.confusion_matrix_figure(said["true"], said["said"], counts)
         shown.append(("What was said of what", figure))
-    kept = {
-        label: {entry["level"]: entry for entry in result["calibration"][key] if entry["of"]}
-        for key, label in BLIND_CALIBRATION_LABELS.items()
-    }
+    kept = blind_calibration_rates(result)
     if any(kept.values()):
         figure = figures.rate_intervals_figure(kept, "promised", "kept", True)
         shown.append(("What is promised, and what is kept", figure))
