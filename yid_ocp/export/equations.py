@@ -12,7 +12,6 @@ import numpy as np
 
 from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.analysis.step_symbols import (
-    FormulaText,
     StepSymbols,
     SymbolBlock,
     count_operations,
@@ -28,7 +27,6 @@ from yid_ocp.model.system import System
 
 _MAX_JACOBIAN_OPERATIONS = 60_000  # operations; longer C keeps a compiler busy for minutes
 _ARGUMENT_NAMES = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
-
 _MAX_ROW_OPERATIONS = 120  # operations up to which a row is written out; beyond, the bodies' part stays a letter
 _LATEX_PREAMBLE = r"""\documentclass[a4paper,10pt]{article}
 \usepackage[margin=18mm]{geometry}
@@ -90,22 +88,20 @@ def export_step_functions(
     `names.json` gives the values of theta beside the parameters' names, and the time step [s]. Returns the files
     written; `OutputError` where the folder, made if absent, or a file cannot be written.
     """
-    folder = make_folder(folder)
-    functions = _exported_step_functions(symbols)
-    written = [folder / f"{function.name()}.casadi" for function in functions]
-    for function, path in zip(functions, written, strict=True):
-        with atomic_write(path) as temporary:
+    folder, functions, written = make_folder(folder), _exported_step_functions(symbols), []
+    for function in functions:
+        written.append(folder / f"{function.name()}.casadi")
+        with atomic_write(written[-1]) as temporary:
             function.save(str(temporary))
     source, listed = folder / "equations.c", folder / "names.json"
     write_text(source, casadi_c_source("equations", functions))
-    parameters = symbols.equations.system.parameters
-    values = {p.name: {"value": float(value), "unit": p.unit} for p, value in zip(parameters, theta, strict=True)}
+    parameters = zip(symbols.equations.system.parameters, theta, strict=True)
     names = {
         "format": "yid-equations/1",
         "functions": {f.name(): {"arguments": f.name_in(), "results": f.name_out()} for f in functions},
         "rows": {block.name: list(block.full_names) for block in symbols.row_blocks},
         "columns": {block.name: list(block.full_names) for block in symbols.column_blocks},
-        "parameters": values,
+        "parameters": {p.name: {"value": float(value), "unit": p.unit} for p, value in parameters},
         "time_step": time_step,
     }
     write_json(listed, names)
@@ -121,7 +117,8 @@ def write_equation_sheet(path: Path, symbols: StepSymbols, theta: Array, free: S
     values = dict(zip(system.parameters.names, map(float, theta), strict=True))
     lines = [rf"\section*{{One step of {escape_latex(system.mechanism.name)}}}", *_rules(symbols, time_step)]
     if free:
-        rows = [(escape_latex(n), f"${_value(values[n])}$", _unit(system.parameters[n].unit)) for n in free]
+        units = {n: system.parameters[n].unit.replace(" ", r"\,") for n in free}
+        rows = [(escape_latex(n), f"${_value(values[n])}$", rf"$\mathrm{{{unit}}}$") for n, unit in units.items()]
         lines += [r"\section*{Letters that stay}", *_table("lrl", ("parameter", "value", "unit"), rows)]
     lines += [*_tree_tables(system, values), r"\section*{Rows}"]
     for block in symbols.row_blocks:
@@ -161,22 +158,19 @@ def _tree_tables(system: System, values: dict[str, float]) -> list[str]:
         name = escape_latex(joint.name)
         parent = escape_latex(mechanism.joints[joint.parent_index].name) if joint.parent_index >= 0 else "world"
         rotation = np.array(ca.DM(joint.placement.rotation))
-        turned = "" if np.allclose(rotation, np.eye(3)) else f"${_matrix(rotation)}$"
-        place = f"${_vector(np.array(ca.DM(joint.placement.translation)).ravel())}$"
-        axis, role = f"${_vector(joint.axis)}$", roles.get(joint.name, "free")
-        joints.append((name, joint.kind, parent, role, axis, place, turned))
+        turned = "" if np.allclose(rotation, np.eye(3)) else _matrix(rotation)
+        axis, place = _vector(joint.axis), _vector(joint.placement.translation)
+        joints.append((name, joint.kind, parent, roles.get(joint.name, "free"), axis, place, turned))
         # what gravity pulls at may differ from the mass; only inertia is listed
         body = merge_bodies(replace(b, gravity_fraction=None) for b in joint.bodies)
         if body is not None:
-            com = np.array(ca.DM(body.center_of_mass)).ravel()
-            tensor = np.array(ca.DM(body.inertia_about_com))
-            bodies.append((name, f"${_value(float(body.mass))}$", f"${_vector(com)}$", f"${_matrix(tensor)}$"))
-    gravity = np.array(ca.DM(built.gravity)).ravel()
+            tensor = _matrix(np.array(ca.DM(body.inertia_about_com)))
+            bodies.append((name, f"${_value(float(body.mass))}$", _vector(body.center_of_mass), tensor))
     return [
         r"\section*{Joints}",
         *_table("lllllll", ("joint", "kind", "parent", "role", "axis", "place [m]", "rotation"), joints),
         r"\section*{Bodies}",
-        rf"Gravity ${_vector(gravity)}$ m/s$^2$. Centres and inertias (about the centre) in the joint's frame.",
+        rf"Gravity {_vector(built.gravity)} m/s$^2$. Centres and inertias (about the centre) in the joint's frame.",
         *_table("lrll", ("joint", "mass [kg]", "centre [m]", r"inertia [kg m$^2$]"), bodies),
     ]
 
@@ -190,8 +184,14 @@ def _rows(symbols: StepSymbols, block: SymbolBlock, values: dict[str, float], fr
     rest = {"del": e.p0 + e.balance_remainder, "p1": e.p1_remainder}.get(block.name)
     lines = [rf"\subsection*{{{escape_latex(block.name)}: {block.meaning}}}"]
 
-    def formula(expression: ca.SX) -> FormulaText:
-        return format_expressions([expression], symbols.column_symbols, symbols.column_display_names, latex=True)
+    def formula(letter: str, begin: str, expression: ca.SX) -> str:
+        """A paragraph that TeX may break at any sign, its shared parts behind it."""
+        made = format_expressions([expression], symbols.column_symbols, symbols.column_display_names, latex=True)
+        [text] = made.expression_texts
+        sign = "+ " if begin and not text.startswith("-") else ""
+        where = ", ".join(f"${name} = {part}$" for name, part in made.shared_subexpressions)
+        end = f" \\quad where {where}" if where else ""
+        return rf"$\displaystyle {letter} = {begin}{sign}{text}$" + end + "\n"
 
     if rest is not None:
         sign = "-" if block.name == "del" else "+"
@@ -201,29 +201,19 @@ def _rows(symbols: StepSymbols, block: SymbolBlock, values: dict[str, float], fr
             rf"of the bodies above{pull}."
         )
     for i, label in enumerate(block.labels):
-        letter = block.latex_template.replace("#", rf"\mathrm{{{escape_latex(label)}}}")
+        name = rf"\mathrm{{{escape_latex(label)}}}"
+        letter = block.latex_template.replace("#", name)
         whole = ca.substitute(block.expressions[i], old, new)
         count = count_operations([whole], symbols.column_symbols)
         if count <= _MAX_ROW_OPERATIONS:
-            made = formula(whole)
-            lines.append(_equation(letter, made.expression_texts[0], made))
+            lines.append(formula(letter, "", whole))
         elif rest is not None:
-            made = formula(ca.substitute(rest[i], old, new))
-            bodies = rf"B_{{\mathrm{{{escape_latex(label)}}}}}"
-            pulled = "" if not e.lam.numel() else rf" - G_{{\mathrm{{{escape_latex(label)}}}}}"
+            pulled = "" if not e.lam.numel() else rf" - G_{{{name}}}"
             lost = "" if e.closed_form_force is None else r" + \text{drag}"
-            [text] = made.expression_texts
-            added = text if text.startswith("-") else f"+ {text}"
-            lines.append(_equation(letter, f"{bodies}{pulled}{lost} {added}", made))
+            lines.append(formula(letter, rf"B_{{{name}}}{pulled}{lost} ", ca.substitute(rest[i], old, new)))
         else:
             lines.append(rf"${letter}$: {count} operations, in \texttt{{rows.casadi}} and \texttt{{equations.c}}")
     return lines
-
-
-def _equation(letter: str, value: str, made: FormulaText) -> str:
-    """A row as a paragraph that TeX may break at any sign, with its shared parts behind it."""
-    where = ", ".join(f"${name} = {text}$" for name, text in made.shared_subexpressions)
-    return rf"$\displaystyle {letter} = {value}$" + (f" \\quad where {where}" if where else "") + "\n"
 
 
 def _table(columns: str, head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -237,14 +227,11 @@ def _value(value: float) -> str:
     return rf"{mantissa} \cdot 10^{{{int(exponent)}}}" if exponent else mantissa
 
 
-def _vector(values: Iterable[float]) -> str:
-    return "(" + r",\, ".join(_value(float(value)) for value in values) + ")"
+def _vector(values: ca.SX | Sequence[float]) -> str:
+    """A vector of numbers in mathematics mode."""
+    return "$(" + r",\, ".join(_value(float(value)) for value in np.array(ca.DM(values)).ravel()) + ")$"
 
 
 def _matrix(values: Array) -> str:
     rows = r" \\ ".join(" & ".join(_value(float(x)) for x in row) for row in values)
-    return rf"\left(\begin{{smallmatrix}} {rows} \end{{smallmatrix}}\right)"
-
-
-def _unit(unit: str) -> str:
-    return rf"$\mathrm{{{unit.replace(' ', chr(92) + ',')}}}$"
+    return rf"$\left(\begin{{smallmatrix}} {rows} \end{{smallmatrix}}\right)$"

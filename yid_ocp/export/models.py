@@ -6,7 +6,7 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 from xml.etree.ElementTree import Element, SubElement
 
 import casadi as ca
@@ -27,11 +27,8 @@ from yid_ocp.virtual.mjcf import (
     model_aspects_of_parameters,
 )
 
-_SupportStatus = Literal["native", "emulated", "not representable"]
-_ORDER: tuple[_SupportStatus, ...] = ("native", "emulated", "not representable")
-
 EXPORT_MANIFEST_FORMAT = "yid-export/1"
-
+_SupportStatus = Literal["native", "emulated", "not representable"]
 _MIN_LINK_MASS, _MIN_LINK_INERTIA = 1e-9, 1e-12
 """Mass [kg] and inertia [kg m^2] given to massless links, for engines that require them."""
 
@@ -43,18 +40,17 @@ def system_to_urdf(system: System, values: Mapping[str, float]) -> str:
     """
     tree, terms = _tree(system, values)
     root = ElementTree.fromstring(mechanism_to_urdf(tree))
+    sizes = {"boundmass": _MIN_LINK_MASS, "boundinertia": _MIN_LINK_INERTIA}
     mujoco = Element("mujoco")
-    sizes = {"boundmass": format_xml_numbers([_MIN_LINK_MASS]), "boundinertia": format_xml_numbers([_MIN_LINK_INERTIA])}
-    sizes["fusestatic"] = "false"
-    SubElement(mujoco, "compiler", sizes)
+    limits = {key: format_xml_numbers([value]) for key, value in sizes.items()}
+    SubElement(mujoco, "compiler", {**limits, "fusestatic": "false"})
     root.insert(0, mujoco)
     for joint in root.findall("joint"):
         own = terms.get(joint.get("name", ""))
         if own is not None and joint.get("type") != "fixed":
-            sizes = {"damping": format_xml_numbers([own.damping]), "friction": format_xml_numbers([own.dry_friction])}
-            SubElement(joint, "dynamics", sizes)
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="unicode") + "\n"
+            sizes = {"damping": own.damping, "friction": own.dry_friction}
+            SubElement(joint, "dynamics", {key: format_xml_numbers([value]) for key, value in sizes.items()})
+    return _xml_text(root)
 
 
 def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
@@ -62,8 +58,7 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
     tree, terms = _tree(system, values)
     root = Element("sdf", version="1.10")
     world = SubElement(root, "world", name="world")
-    gravity = SubElement(world, "gravity")
-    gravity.text = format_xml_numbers(ParameterEvaluator(system, values)(system.gravity))
+    SubElement(world, "gravity").text = format_xml_numbers(ParameterEvaluator(system, values)(system.gravity))
     model = SubElement(world, "model", name="model")
     for i, joint in enumerate(tree.joints):
         _sdf_link(model, tree, i)
@@ -74,6 +69,10 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
         attached = {} if frame.joint_index < 0 else {"attached_to": on}
         element = SubElement(model, "frame", {"name": f"frame_{name}", **attached})
         _sdf_pose(element, frame.placement)
+    return _xml_text(root)
+
+
+def _xml_text(root: Element) -> str:
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -113,18 +112,18 @@ def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: JointDynami
         size = getattr(joint, f"{key}_limit")
         if math.isfinite(size):
             _sdf_number(limit, key, size)
-    dynamics = SubElement(axis, "dynamics")
-    _sdf_number(dynamics, "damping", terms.damping)
-    _sdf_number(dynamics, "friction", terms.dry_friction)
+    sizes = {"damping": terms.damping, "friction": terms.dry_friction}
     if terms.stiffness > 0:
-        _sdf_number(dynamics, "spring_reference", terms.constant_force / terms.stiffness)
-        _sdf_number(dynamics, "spring_stiffness", terms.stiffness)
+        sizes |= {"spring_reference": terms.constant_force / terms.stiffness, "spring_stiffness": terms.stiffness}
+    dynamics = SubElement(axis, "dynamics")
+    for key, size in sizes.items():
+        _sdf_number(dynamics, key, size)
 
 
 def _sdf_pose(element: Element, placement: Placement, attributes: Mapping[str, str] | None = None) -> None:
     turn, at = np.array(ca.DM(placement.rotation)), np.array(ca.DM(placement.translation)).ravel()
-    pose = SubElement(element, "pose", dict(attributes or {}))
-    pose.text = format_xml_numbers([*at, *rpy_from_rotation(turn)])
+    text = format_xml_numbers([*at, *rpy_from_rotation(turn)])
+    SubElement(element, "pose", dict(attributes or {})).text = text
 
 
 def _sdf_number(element: Element, tag: str, value: float) -> None:
@@ -141,7 +140,7 @@ class FormatSupport:
 
 def _worst(parts: Sequence[FormatSupport]) -> FormatSupport:
     """The worst status of several parts that belong together, with the explanations of those that have it."""
-    status = max((part.status for part in parts), key=_ORDER.index)
+    status = max((part.status for part in parts), key=get_args(_SupportStatus).index)
     return FormatSupport(status, "; ".join(dict.fromkeys(part.how for part in parts if part.status == status)))
 
 

@@ -7,7 +7,7 @@ import math
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,39 +30,25 @@ _WORLD_FRAME = "world"
 
 @dataclass(frozen=True)
 class RosTopicTimeSeries:
-    """Time series of one ROS topic.
+    """Time series of one ROS topic at times t (M,) [s]; messages without a number are left out.
 
-    Attributes
-    ----------
-    t : ndarray, shape (M,)
-        [s]
-    values : mapping of str to ndarray, shape (M, n)
-        Of joints `position`, `velocity` and `effort`, as many as there are; of all else `xyz`, shape (M, 3), the forces
-        of a wrench. Messages without a number are left out.
-    names : sequence of str
-        Of the joints.
+    `values` are each (M, n): of joints `position`, `velocity` and `effort`, with as many columns as there are `names`;
+    of all else `xyz`, n = 3, the forces of a wrench.
     """
 
     topic: str
     kind: _SignalKind
     t: Array
     values: Mapping[str, Array]
-    names: Sequence[str] = field(default=())
+    names: Sequence[str] = ()
     frame: str = _WORLD_FRAME
 
 
 def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[str]) -> float:
     """Write signals into one MCAP file, with the definitions of their messages, in the order of time.
 
-    Returns
-    -------
-    float
-        Shift added to all times because stamps cannot be negative: whole seconds, usually zero [s].
-
-    Raises
-    ------
-    OutputError
-        `rosbags` is not installed, there is nothing to write, or the file cannot be written.
+    Returns the shift added to all times because stamps cannot be negative: whole seconds, usually zero [s]. Raises
+    `OutputError` when `rosbags` is not installed, there is nothing to write, or the file cannot be written.
     """
     path = Path(path)
     try:
@@ -100,14 +86,13 @@ def ros_signals_from_recording(recording: Recording) -> list[RosTopicTimeSeries]
     found: list[RosTopicTimeSeries] = []
     for group in recording.groups:
         if isinstance(group, JointGroup):
-            own = group.channels
-            parts = {
-                "/joint_states": {name: name for name in ("position", "velocity", "effort")},
-                "/joint_commands": {name: f"{name}_command" for name in ("position", "velocity")},
-                "/external_efforts": {"effort": "external_effort"},
-            }
-            for topic, channels in parts.items():
-                values = {name: own[channel] for name, channel in channels.items() if channel in own}
+            for topic, form, names in (
+                ("/joint_states", "{}", ("position", "velocity", "effort")),
+                ("/joint_commands", "{}_command", ("position", "velocity")),
+                ("/external_efforts", "external_{}", ("effort",)),
+            ):
+                channels = {name: group.channels.get(form.format(name)) for name in names}
+                values = {name: known for name, known in channels.items() if known is not None}
                 found += [RosTopicTimeSeries(topic, "joints", group.t, values, group.names)] if values else []
         else:
             for i, name in enumerate(group.names):
@@ -120,15 +105,18 @@ def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[
     """Stamp [ns] and message of every time at which there is a number."""
     types = store.types
 
+    def vector(kind: str, xyz: Array) -> Any:
+        return types[f"geometry_msgs/msg/{kind}"](*map(float, xyz))
+
     def content(i: int) -> list[Any]:
         if signal.kind == "joints":
             # none at all of what is not known
             known = (signal.values.get(name) for name in ("position", "velocity", "effort"))
             rows = (np.zeros(0) if values is None else np.ascontiguousarray(values[i], float) for values in known)
             return [list(signal.names), *rows]
-        xyz = _vector(types, "Point" if signal.kind == "point" else "Vector3", signal.values["xyz"][i])
-        no_torque = _vector(types, "Vector3", np.zeros(3))
-        return [types["geometry_msgs/msg/Wrench"](xyz, no_torque) if signal.kind == "wrench" else xyz]
+        xyz = vector("Point" if signal.kind == "point" else "Vector3", signal.values["xyz"][i])
+        is_wrench = signal.kind == "wrench"
+        return [types["geometry_msgs/msg/Wrench"](xyz, vector("Vector3", np.zeros(3))) if is_wrench else xyz]
 
     known = np.any([np.isfinite(values).any(axis=1) for values in signal.values.values()], axis=0)
     for i in np.flatnonzero(known):
@@ -138,17 +126,11 @@ def _messages(signal: RosTopicTimeSeries, shift: float, store: Any) -> Iterator[
         yield stamp, types[_MESSAGE_TYPES[signal.kind]](header, *content(int(i)))
 
 
-def _vector(types: Any, kind: str, xyz: Array) -> Any:
-    return types[f"geometry_msgs/msg/{kind}"](*map(float, xyz))
-
-
 def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Path, ...]:
     """Write one table per group, `<group>.csv`, with the columns that `read_csv` knows and all digits.
 
     Standard deviations, the kind of effort, sensor, frame, pose and clock are not in the tables; a point not seen is an
-    empty cell.
-
-    Returns the files written, joints first; `OutputError` where the folder or a file cannot be written.
+    empty cell. Returns the files, joints first; `OutputError` where the folder or a file cannot be written.
     """
     folder = make_folder(folder)
     written = []
@@ -170,26 +152,16 @@ def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Pa
 def joint_trajectory_message(
     names: Sequence[str], t: Array, position: Array, velocity: Array, acceleration: Array, effort: Array
 ) -> dict[str, Any]:
-    """A joint trajectory as a dict in the form of ROS's trajectory_msgs/JointTrajectory.
+    """A joint trajectory of nj joints as a dict in the form of ROS's trajectory_msgs/JointTrajectory.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Of nj joints.
-    t : ndarray, shape (N,)
-        Since the start [s].
-    position, velocity, acceleration, effort : ndarray, shape (N, nj)
-
-    References
-    ----------
+    Times t (N,) count from the start [s]; all others are (N, nj). See
     https://docs.ros.org/en/api/trajectory_msgs/html/msg/JointTrajectory.html
     """
     points = []
     for i, time in enumerate(t):
         second = math.floor(time)
         since = {"sec": second, "nanosec": min(round(1e9 * (time - second)), 999_999_999)}
-        rates = {"velocities": velocity[i].tolist(), "accelerations": acceleration[i].tolist()}
-        own = {"positions": position[i].tolist(), **rates, "effort": effort[i].tolist()}
-        points.append({**own, "time_from_start": since})
+        rows = {"positions": position, "velocities": velocity, "accelerations": acceleration, "effort": effort}
+        points.append({**{key: values[i].tolist() for key, values in rows.items()}, "time_from_start": since})
     header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
     return {"header": header, "joint_names": list(names), "points": points}
