@@ -39,15 +39,37 @@ def diagnose_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of a diagnosis."""
     yield from issue_summary_blocks(result)
     yield SummaryStatement(result["summary"], "verdict")
-    yield SummaryTable([*_gap_error_rows(result)], "Errors on held-out recordings", is_key_table=True)
-    yield SummaryTable([*_gap_location_rows(result)], "Where")
+    before, steps = result["gap"]["before"], result.get("steps", ())
+    rows: TableRows = [("held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit")]
+    for channel, error in before["rmse"].items():
+        errors = [error, *(step["rmse"].get(channel) for step in steps)]
+        shown = [format_error_value_and_unit(value, before["unit"][channel]) for value in errors]
+        rows.append((channel, *(text for text, _ in shown), shown[0][1]))
+    yield SummaryTable(rows, "Errors on held-out recordings", is_key_table=True)
+    rows = [("where", "share of the gap", "when [s]")]
+    for place in result.get("where", ()):
+        if place["share"] > _MIN_GAP_SHARE:
+            when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:_MAX_WINDOWS])
+            more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
+            rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
+    yield SummaryTable(rows, "Where")
     yield SummaryTable([*_event_rows(result)], "Events")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
     left = len(result["which"]) - _MAX_CANDIDATES
     yield f"{left} more candidates are in result.json" if left > 0 else ""
     yield f"these recordings could not show: {', '.join(result['unseen'])}" if result.get("unseen") else ""
-    yield SummaryTable([*_baseline_rows(result)], "Since the baseline")
-    yield SummaryTable([*_counterfactual_rows(result)], "Without the effects, and with them")
+    rows = [("parameter", "baseline", "now", "unit", "moved by", "")]
+    for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
+        values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
+        moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
+        rows.append((name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""))
+    yield SummaryTable(rows, "Since the baseline")
+    rows = [("channel", "made", "without a diagnosis", "effects removed or added", "unit")]
+    for key, made in (("removed", "without the effects"), ("added", "with the effects")):
+        for channel, entry in (result.get("counterfactual") or {}).get(key, {"rmse": {}})["rmse"].items():
+            sizes = (f"{entry[part]:.3g}" for part in ("without_diagnosis", "counterfactual"))
+            rows.append((channel, made, *sizes, entry["unit"]))
+    yield SummaryTable(rows, "Without the effects, and with them")
     yield SummaryTable(torque_offset_table_rows(result), "How far the torques are off")
     if result.get("doubts"):
         yield "what is in doubt about the recordings may be what the verdict is about"
@@ -55,24 +77,6 @@ def diagnose_summary(result: Mapping[str, Any]) -> SummaryParts:
         yield "to separate what looks alike, plan a motion:"
         yield CodeBlock(_planning_command(result["next_plan"]))
     yield f"verdict: {result['verdict'].replace('_', ' ')} ({sum(result['seconds'].values()):.1f} s)"
-
-
-def _gap_error_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    before, steps = result["gap"]["before"], result.get("steps", ())
-    yield "held-out channel", "nominal", *(f"+ {step['added']}" for step in steps), "unit"
-    for channel, error in before["rmse"].items():
-        errors = [error, *(step["rmse"].get(channel) for step in steps)]
-        shown = [format_error_value_and_unit(value, before["unit"][channel]) for value in errors]
-        yield channel, *(text for text, _ in shown), shown[0][1]
-
-
-def _gap_location_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "where", "share of the gap", "when [s]"
-    for place in result.get("where", ()):
-        if place["share"] > _MIN_GAP_SHARE:
-            when = ", ".join(f"{begin:.3g} to {end:.3g}" for begin, end in place["windows"][:_MAX_WINDOWS])
-            more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
-            yield place["location"], f"{100 * place['share']:.1f} %", when + more
 
 
 def _event_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
@@ -99,23 +103,6 @@ def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         yield f"{entry['kind']}@{entry['location']}", ", ".join(values), closed, *numbers
 
 
-def _baseline_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "parameter", "baseline", "now", "unit", "moved by", ""
-    for name, entry in (result.get("baseline") or {"parameters": {}})["parameters"].items():
-        values = (value_and_uncertainty_text(entry[when], entry[f"{when}_std"], None) for when in ("before", "now"))
-        moved = "not informed" if entry["score"] is None else f"{entry['score']:+.2g} std"
-        yield name, *values, entry["unit"], moved, "changed" if entry["changed"] else ""
-
-
-def _counterfactual_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "channel", "made", "without a diagnosis", "effects removed or added", "unit"
-    found = result.get("counterfactual") or {}
-    for key, made in (("removed", "without the effects"), ("added", "with the effects")):
-        for channel, entry in found.get(key, {"rmse": {}})["rmse"].items():
-            errors = (f"{entry[part]:.3g}" for part in ("without_diagnosis", "counterfactual"))
-            yield channel, made, *errors, entry["unit"]
-
-
 def _planning_command(section: Mapping[str, Any]) -> str:
     words = ["yid-ocp", "plan", str(Path(section["parameter_run"]) / "config.yaml")]
     for key, value in section.items():
@@ -135,14 +122,12 @@ def blind_summary(result: Mapping[str, Any]) -> SummaryParts:
     yield from others
     yield replace(cases, is_page_only=True)
     count, right, alarms = len(result["marks"]), *(result["intervals"][key] for key in ("kind_first", "false_alarms"))
-    cases_text = f"{count} {'case' if count == 1 else 'cases'}"
-    yield SummaryStatement(f"{cases_text} of seed {result['seed']}, drawn for {result['purpose']}", "verdict")
+    said = [f"{count} {'case' if count == 1 else 'cases'} of seed {result['seed']}, drawn for {result['purpose']}"]
     if right["of"]:
-        said = f"of {right['of']} gaps found, {right['count']} were named right: kind and place first"
-        yield SummaryStatement(said, "verdict")
+        said.append(f"of {right['of']} gaps found, {right['count']} were named right: kind and place first")
     if alarms["of"]:
-        said = f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm"
-        yield SummaryStatement(said, "verdict")
+        said.append(f"of {alarms['of']} clean recordings, {alarms['count']} gave a false alarm")
+    yield from (SummaryStatement(text, "verdict") for text in said)
 
 
 def blind_tables_markdown(result: Mapping[str, Any]) -> list[str]:
@@ -193,22 +178,21 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         cases.append((*kept, *found, *place, *shares, _number(entry["seconds"], ".0f", " s")))
     tables = {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Cases": cases}
     if result.get("calibration_of_thresholds") is not None:
-        tables["Thresholds"] = _threshold_rows(result["calibration_of_thresholds"])
+        tables["Thresholds"] = [*_threshold_rows(result["calibration_of_thresholds"])]
     return [SummaryTable(rows, title) for title, rows in tables.items()]
 
 
-def _threshold_rows(calibration: Mapping[str, Any]) -> TableRows:
+def _threshold_rows(calibration: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     """Quantiles of a `yid-calibration/1` beside what is set."""
     kinds = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}
     head = ("diagnosis.", "is", "advised", "what", "quantile", "coverage", "of", "effects beyond it, by size")
-    rows: TableRows = [(*head, "strange ones beyond it")]
+    yield *head, "strange ones beyond it"
     for own in calibration["rules"].values():
         name, value = own["setting"], _number(own["quantile"], ".3g")
         sizes = ", ".join(f"{size}: {_rate(found)}" for size, found in own["effects_beyond"].items())
         cells = (f"{own['is']:.3g}", f"{calibration['settings'][name]:.3g}", own["statistic"], value)
         cases = (_share(own["coverage"]), f"{own['cases']} {kinds[own['of']]}", sizes or "-")
-        rows.append((name, *cells, *cases, _rate(own["strange_beyond"])))
-    return rows
+        yield name, *cells, *cases, _rate(own["strange_beyond"])
 
 
 def _number(value: float | None, form: str, unit: str = "") -> str:

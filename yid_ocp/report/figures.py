@@ -13,8 +13,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.report.terminal import display_scale_and_unit
 
 if TYPE_CHECKING:
-    import plotly.graph_objects
-
+    from plotly.graph_objects import Figure
 
 # on a dark page each becomes what templates/dark.json says; figures use no other colors
 _TEXT_COLOR, _GRID_COLOR, _BACKGROUND_COLOR = "#22303c", "#d9dee3", "#ffffff"
@@ -47,19 +46,15 @@ def _line_color(i: int) -> str:
     return LINE_COLORS[i % len(LINE_COLORS)]
 
 
-def figure_html(figure: plotly.graph_objects.Figure) -> str:
+def figure_html(figure: Figure) -> str:
     """HTML element of a figure; the page's script draws it in light or dark colors."""
     figure.update_layout(template=None)  # all is said here; the default one is some kilobytes each
     told = str(figure.to_json()).replace("<", "\\u003c")
-    return (
-        f'<div class="plot" style="height:{figure.layout.height}px">'
-        f'<script type="application/json">{told}</script></div>'
-    )
+    script = f'<script type="application/json">{told}</script>'
+    return f'<div class="plot" style="height:{figure.layout.height}px">{script}</div>'
 
 
-def _styled_figure(
-    height: int, x: str, y: str, base: plotly.graph_objects.Figure | None = None
-) -> plotly.graph_objects.Figure:
+def _styled_figure(height: int, x: str, y: str, base: Figure | None = None) -> Figure:
     """A plotly figure (`base` or an empty one) with height [px], axis titles, and the report's colors and fonts."""
     import plotly.graph_objects as go
 
@@ -71,7 +66,7 @@ def _styled_figure(
 
 
 def _add_curves(
-    figure: plotly.graph_objects.Figure,
+    figure: Figure,
     curves: Iterable[tuple[str, Sequence[float], Sequence[float]]],
     later_dash: str = "solid",
 ) -> None:
@@ -82,7 +77,7 @@ def _add_curves(
             figure.add_scatter(x=list(x), y=list(y), mode="lines+markers", name=name, line=line)
 
 
-def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.graph_objects.Figure:
+def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> Figure:
     """Figure of the cost at every accepted point, one curve per intermediate horizon."""
     figure = _styled_figure(320, "accepted point", "cost")
     figure.update_yaxes(**_POWERS)
@@ -94,14 +89,9 @@ def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> plotly.
 
 @dataclass(frozen=True)
 class TimePlotData:
-    """Data of one plot over time: measured points and predicted lines.
+    """Data of one plot over time: points measured (M,) at t (M,), predicted lines (t, value), and shades.
 
-    Attributes
-    ----------
-    lines : mapping of name to (t, value)
-    t, measured : ndarray, shape (M,), optional
-    band_half_height : float or None
-        Half the height of what is shaded about zero.
+    `band_half_height` is half the height of what is shaded about zero.
     """
 
     axis_title: str
@@ -124,12 +114,7 @@ def prediction_and_residual_plots(
 ) -> tuple[TimePlotData, TimePlotData]:
     """Two plots: measured and predicted values, and their residual with a band of two noise standard deviations.
 
-    Parameters
-    ----------
-    t, measured, std : ndarray, shape (M,)
-    lines : mapping of name to ndarray, shape (M,)
-    course : (t (K,), value (K,)), optional
-        The first of the lines at more times, for what is measured seldom.
+    All are (M,); `course` (t (K,), value (K,)) is the first of the lines at more times, for what is measured seldom.
     """
     seen = np.isfinite(measured) & np.isfinite(std)
     factor, shown = display_scale_and_unit(unit)
@@ -152,7 +137,7 @@ def prediction_and_residual_plots(
 
 def time_plots_figure(
     curves: Sequence[TimePlotData], dots: str = LINE_COLORS[1], lines: Mapping[str, str] | None = None
-) -> plotly.graph_objects.Figure:
+) -> Figure:
     """Figure with measured points and lines, one row per plot.
 
     `dots` is the color of what is measured, `lines` are those of the lines by name; one after the other when absent.
@@ -216,7 +201,7 @@ def _axis_title(curve: TimePlotData, y: float) -> dict[str, Any]:
     return {"text": curve.axis_title, "showarrow": False, "font": {"size": 12}, **at}
 
 
-def lines_over_time_figure(curve: TimePlotData) -> plotly.graph_objects.Figure:
+def lines_over_time_figure(curve: TimePlotData) -> Figure:
     """Figure of the lines of one plot, each in its own color."""
     figure = _styled_figure(320 + 8 * len(curve.lines), "time [s]", "")
     for i, (name, (t, value)) in enumerate(curve.lines.items()):
@@ -228,31 +213,28 @@ def lines_over_time_figure(curve: TimePlotData) -> plotly.graph_objects.Figure:
     # the legend below takes as many rows as the screen is narrow
     below = {"orientation": "h", "y": -0.22, "yanchor": "top", "x": 0, "font": {"size": 11}}
     figure.update_layout(legend=below, margin={"t": 30})
-    figure.add_annotation(_axis_title(curve, 1))
-    return figure
+    return figure.add_annotation(_axis_title(curve, 1))
 
 
-def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> plotly.graph_objects.Figure:
+def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> Figure:
     """Histogram figure of whitened residuals per sensor group, with the standard normal density."""
     figure = _styled_figure(340, "residual in standard deviations", "density")
     edge = max([4.0, *(float(np.quantile(np.abs(r), 0.995)) for r in residuals.values() if len(r))])
     for i, (name, values) in enumerate(residuals.items()):
         bins = np.linspace(-edge, edge, int(np.clip(2 * np.sqrt(len(values)), 8, 60)) + 1)
         density, _ = np.histogram(np.clip(values, -edge, edge), bins=bins, density=True)
-        figure.add_scatter(
-            x=(0.5 * (bins[1:] + bins[:-1])).tolist(), y=density.tolist(), mode="lines",
-            line={"color": _line_color(i), "shape": "hvh"}, name=f"{name} ({len(values)} values)",
-        )  # fmt: skip
+        steps = {"x": (0.5 * (bins[1:] + bins[:-1])).tolist(), "y": density.tolist()}
+        line = {"color": _line_color(i), "shape": "hvh"}
+        figure.add_scatter(**steps, mode="lines", line=line, name=f"{name} ({len(values)} values)")
     even = np.linspace(-edge, edge, 121)
-    normal = np.exp(-0.5 * even**2) / np.sqrt(2 * np.pi)
+    normal = {"x": even.tolist(), "y": (np.exp(-0.5 * even**2) / np.sqrt(2 * np.pi)).tolist()}
     line = {"color": _TEXT_COLOR, "dash": "dot"}
-    figure.add_scatter(x=even.tolist(), y=normal.tolist(), mode="lines", line=line, name="standard normal")
-    return figure
+    return figure.add_scatter(**normal, mode="lines", line=line, name="standard normal")
 
 
 def excess_cost_over_time_figure(
     costs: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-) -> plotly.graph_objects.Figure:
+) -> Figure:
     """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
     figure.update_yaxes(**_POWERS)
@@ -274,7 +256,7 @@ def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: S
 
 def rate_intervals_figure(
     curves: Mapping[str, Mapping[float, Mapping[str, float]]], x: str, y: str, is_calibration: bool
-) -> plotly.graph_objects.Figure:
+) -> Figure:
     """Figure of rates between 0 and 1 with intervals; each entry has `rate`, `low` and `high`.
 
     A calibration has its diagonal, all others a logarithmic axis.
@@ -287,17 +269,12 @@ def rate_intervals_figure(
         figure.update_xaxes(type="log")
     for i, (name, known) in enumerate(curves.items()):
         rates, low, high = ([entry[key] for entry in known.values()] for key in ("rate", "low", "high"))
-        figure.add_scatter(
-            x=list(known), y=rates, mode="lines+markers", name=name, error_y=asymmetric_error_bars(rates, low, high),
-            line={"color": _line_color(i)},
-        )  # fmt: skip
-    figure.update_yaxes(range=[-0.03, 1.03])
-    return figure
+        drawn = {"x": list(known), "y": rates, "error_y": asymmetric_error_bars(rates, low, high)}
+        figure.add_scatter(**drawn, mode="lines+markers", name=name, line={"color": _line_color(i)})
+    return figure.update_yaxes(range=[-0.03, 1.03])
 
 
-def profile_likelihood_figure(
-    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float
-) -> plotly.graph_objects.Figure:
+def profile_likelihood_figure(curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float) -> Figure:
     """Profile-likelihood figure: increase of chi2 over the parameter's value relative to the estimate."""
     figure = _styled_figure(380, "value over best value", "chi2 above the best")
     _add_curves(figure, ((name, ratio, delta) for name, (ratio, delta) in curves.items()), "dash")
@@ -306,7 +283,7 @@ def profile_likelihood_figure(
     return figure.update_yaxes(range=[-0.2, 2.5 * level])
 
 
-def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) -> plotly.graph_objects.Figure:
+def scatter_figure(clouds: Mapping[str, tuple[Array, Array]], x: str, y: str) -> Figure:
     """Figure of points (x, y) by name."""
     figure = _styled_figure(340, x, y)
     for i, (name, (across, up)) in enumerate(clouds.items()):
@@ -326,16 +303,13 @@ def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
 # -- one row per name -------------------------------------------------------------------------------------------------
 
 
-def _rows_figure(height: int, names: Sequence[str], title: str) -> plotly.graph_objects.Figure:
+def _rows_figure(height: int, names: Sequence[str], title: str) -> Figure:
     """An empty figure with one named row for each name, the first on top."""
-    figure = _styled_figure(height, title, "")
-    figure.update_yaxes(autorange="reversed", categoryorder="array", categoryarray=list(names), automargin=True)
-    return figure
+    order = {"categoryorder": "array", "categoryarray": list(names)}
+    return _styled_figure(height, title, "").update_yaxes(autorange="reversed", automargin=True, **order)
 
 
-def estimates_figure(
-    values: Mapping[str, tuple[float, float | None, float, bool]], unit: str
-) -> plotly.graph_objects.Figure:
+def estimates_figure(values: Mapping[str, tuple[float, float | None, float, bool]], unit: str) -> Figure:
     """Figure of estimates ± 2 std and initial values, one row per parameter: (value, std, initial, found)."""
     names = list(values)
     figure = _rows_figure(110 + 34 * len(names), names, unit)
@@ -352,13 +326,12 @@ def estimates_figure(
     largest = max([abs(number) for value, _, initial, _ in values.values() for number in (value, initial)] or [1.0])
     lowest = min(0.0, *(value for value, *_ in values.values()))
     figure.update_xaxes(range=[lowest - 0.05 * largest, 1.6 * largest])
-    figure.update_yaxes(tickfont={"size": 11})
-    return figure
+    return figure.update_yaxes(tickfont={"size": 11})
 
 
 def parameter_values_by_source_figure(
     rows: Mapping[str, Mapping[str, tuple[float, float | None]]], unit: str
-) -> plotly.graph_objects.Figure:
+) -> Figure:
     """Figure of values ± 2 std from several sources, one row per parameter and one color per source."""
     sources = list(dict.fromkeys(source for row in rows.values() for source in row))
     names = list(rows)
@@ -376,15 +349,13 @@ def parameter_values_by_source_figure(
     low, high = min(numbers), max(numbers)
     # bars of what cannot be told would squeeze all others
     figure.update_xaxes(range=[low - 0.1 * (high - low or 1.0), high + 0.25 * (high - low or 1.0)])
-    figure.update_yaxes(
-        tickvals=list(range(len(names))), ticktext=names, range=[len(names) - 0.5, -0.5], automargin=True
-    )
-    return figure
+    ends = [len(names) - 0.5, -0.5]
+    return figure.update_yaxes(tickvals=list(range(len(names))), ticktext=names, range=ends, automargin=True)
 
 
 def _heat_figure(
     height: int, names: tuple[Sequence[str], Sequence[str]], parts: Array, titles: tuple[str, str], tickangle: int
-) -> plotly.graph_objects.Figure:
+) -> Figure:
     """Figure of numbers between 0 and 1 for each pair of a row's and a column's name."""
     rows, columns = (list(own) for own in names)
     figure = _styled_figure(height, titles[1], titles[0])
@@ -394,11 +365,10 @@ def _heat_figure(
     )  # fmt: skip
     every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
     figure.update_xaxes(tickangle=tickangle, tickvals=columns, **every)
-    figure.update_yaxes(autorange="reversed", tickvals=rows, **every)
-    return figure
+    return figure.update_yaxes(autorange="reversed", tickvals=rows, **every)
 
 
-def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts: Array) -> plotly.graph_objects.Figure:
+def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts: Array) -> Figure:
     """Confusion-matrix figure of counts of what was said of what is true, colored by the fraction of their row."""
     parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
     figure = _heat_figure(200 + 24 * len(rows), (rows, columns), parts, ("true", "said first"), -50)
@@ -406,7 +376,7 @@ def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts:
     return figure.update_traces(text=text, hovertemplate="%{y}: said %{x}<extra></extra>")
 
 
-def explained_fraction_matrix_figure(names: Sequence[str], values: Array) -> plotly.graph_objects.Figure:
+def explained_fraction_matrix_figure(names: Sequence[str], values: Array) -> Figure:
     """Heat-map figure of explained fractions `values` (n, n), row explained by column, shown in per cent."""
     figure = _heat_figure(190 + 27 * len(names), (names, names), values, ("trace of", "explained by [%]"), -40)
     text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]
@@ -424,9 +394,7 @@ class ValueBeforeAfter:
     reference: float | None = None
 
 
-def values_before_after_figure(
-    rows: Mapping[str, ValueBeforeAfter], axis: str, words: tuple[str, str, str]
-) -> plotly.graph_objects.Figure:
+def values_before_after_figure(rows: Mapping[str, ValueBeforeAfter], axis: str, words: tuple[str, str, str]) -> Figure:
     """Figure of values before and after, one row each; error bars are two standard deviations.
 
     `axis` says what the numbers are, with their unit; `words` name before, after and the marks.
@@ -472,14 +440,10 @@ class TimeHeatMapRow:
     hover_texts: Sequence[str]  # J
 
 
-def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> plotly.graph_objects.Figure:
-    """Heat-map figure over time, one row per quantity; grey: not informed by the data.
+def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str) -> Figure:
+    """Heat-map figure over time with interval edges (J + 1,) [s], one row per quantity; grey: not informed by the data.
 
-    Parameters
-    ----------
-    edges : ndarray, shape (J + 1,) [s]
-    axis : str
-        What the colors are.
+    `axis` says what the colors are.
     """
     values = np.array([row.values for row in rows])
     seen = np.abs(values[np.isfinite(values)])
@@ -527,9 +491,7 @@ class RankedCandidate:
     predicted_decrease: float
 
 
-def candidate_ranking_figure(
-    entries: Sequence[RankedCandidate], closed: str, promised: str
-) -> plotly.graph_objects.Figure:
+def candidate_ranking_figure(entries: Sequence[RankedCandidate], closed: str, promised: str) -> Figure:
     """Figure that ranks candidates by refitted closure (where refitted) and by first-order predicted decrease.
 
     `closed` and `promised` are the titles of the two axes.
@@ -559,7 +521,5 @@ def candidate_ranking_figure(
             if value < left:
                 text = f"◀ {value:.0f}"
                 figure.add_annotation(x=left, y=name, text=text, showarrow=False, xanchor="left", row=1, col=1)
-    names = [entry.name for entry in entries][::-1]
-    figure.update_yaxes(type="category", categoryorder="array", categoryarray=names, automargin=True)
-    figure.update_yaxes(range=[-0.6, len(names) - 0.4])
-    return figure
+    names, ends = [entry.name for entry in entries][::-1], [-0.6, len(entries) - 0.4]
+    return figure.update_yaxes(type="category", categoryarray=names, categoryorder="array", automargin=True, range=ends)

@@ -22,7 +22,6 @@ log = logging.getLogger(__name__)
 _SHARED_SCRIPT_LEVELS = 2
 """Levels above a page where a script that it may share is looked for: a batch is two above the pages of its runs."""
 _WRAP_LENGTH = 24  # characters from which the cells of a column are wrapped
-_VERDICTS = {words: verdict for verdict, words in VERDICT_TABLE_TEXTS.items()}
 _NUMBER = re.compile(
     r"^(–|-|unknown|failed|(< |± )?[-+]?\d[\d.]*(e[-+]?\d+)?( %| ms| s| Hz)?( ± [\d.]+(e[-+]?\d+)?( %)?)?)?$"
 )
@@ -46,14 +45,14 @@ def write_report(path: Path, findings: ReportData) -> bool:
     environment = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    filters = {"number": _format_number, "listed": _column_classes, "verdict": _VERDICTS.get, "drawn": figure_html}
-    environment.filters |= filters
+    environment.filters |= {"number": _format_number, "listed": _column_classes, "drawn": figure_html}
+    environment.filters["verdict"] = {words: verdict for verdict, words in VERDICT_TABLE_TEXTS.items()}.get
     environment.tests["table"] = lambda block: isinstance(block, SummaryTable)
     environment.tests["command"] = lambda block: isinstance(block, CodeBlock)
-    sections, shared = render_sections(findings, environment), _shared_script(path)
-    packed = "" if shared else _packed_script()
-    known = {"findings": findings, "sections": sections, "shared": shared, "packed": packed}
-    write_text(path, environment.get_template("page.html").render(known))
+    shared = _shared_script(path)
+    scripts = {"shared": shared, "packed": "" if shared else _packed_script()}
+    page = environment.get_template("page.html")
+    write_text(path, page.render(findings=findings, sections=render_sections(findings, environment), **scripts))
     return True
 
 

@@ -52,17 +52,17 @@ def solve_summary(result: Mapping[str, Any]) -> SummaryParts:
     yield from () if failed else misfit_summary_blocks(result["fit"])
     yield from issue_summary_blocks(result)
     yield SummaryTable([*_estimate_rows(free, failed)], "Parameters", is_key_table=True)
-    rows: TableRows = [("channel", "error (rms)", "unit", "samples")]
-    for channel, own in result["residuals"].items():
-        rows.append((channel, *format_error_value_and_unit(own["rmse"], own["unit"]), str(own["n"])))
-    yield SummaryTable(rows, "Errors where it was fitted")
+    residuals = result["residuals"].items()
+    errors = [(name, *format_error_value_and_unit(own["rmse"], own["unit"]), str(own["n"])) for name, own in residuals]
+    yield SummaryTable([("channel", "error (rms)", "unit", "samples"), *errors], "Errors where it was fitted")
     yield from _held_out_blocks(result)
     yield SummaryTable(torque_offset_table_rows(result), "How far the torques are off")
     yield from discretisation_shift_sentences(result)
     yield from result.get("discretisation_notes", ())
     if failed:
-        said = "the values are the best point that was reached; nothing can be said about how sure they are"
-        yield SummaryStatement(said, "verdict")
+        yield SummaryStatement(
+            "the values are the best point that was reached; nothing can be said about how sure they are", "verdict"
+        )
     else:
         yield from (SummaryStatement(text, "verdict") for text in _found_and_lost(free))
         if result["fit"]["explains"]:
@@ -86,27 +86,25 @@ def _estimate_rows(free: Mapping[str, Mapping[str, Any]], failed: bool) -> Itera
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryParts:
     """Errors of each shown channel, in each recording and over three or more, with those of guesses without a model."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
-    found: dict[str, list[tuple[str, float, dict[str, float]]]] = {}
-    rows: TableRows = [("held-out recording", "channel", "error (rms)", "unit", "without a model")]
-
-    def enter(recording: str, channel: str, rmse: float, guesses: Mapping[str, float]) -> None:
-        unit = channel_or_group_unit(units, channel)
-        without = (f"{format_error_value_and_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
-        rows.append((recording, channel, *format_error_value_and_unit(rmse, unit), ", ".join(without)))
-
+    found: dict[str, list[tuple[str, str, float, dict[str, float]]]] = {}
+    errors = []
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
             guesses = {name: errors[channel] for name, errors in entry["baselines"].items() if channel in errors}
-            own = (entry["recording"], entry["rmse"][channel], guesses)
-            found.setdefault(channel, []).append(own)
-            enter(own[0], channel, *own[1:])
-    for channel, own_errors in found.items():
-        if len(own_errors) > 2:
-            recordings, errors, guessed = zip(*own_errors, strict=True)
+            errors.append((entry["recording"], channel, entry["rmse"][channel], guesses))
+            found.setdefault(channel, []).append(errors[-1])
+    for channel, own in found.items():
+        if len(own) > 2:
+            guessed = [guesses for *_, guesses in own]
             shared = [name for name in guessed[0] if all(name in each for each in guessed)]
             medians = {name: statistics.median(each[name] for each in guessed) for name in shared}
-            enter(f"median of {len(recordings)}", channel, statistics.median(errors), medians)
-    named = dict.fromkeys(name for errors in found.values() for *_, guesses in errors for name in guesses)
+            errors.append((f"median of {len(own)}", channel, statistics.median(rmse for *_, rmse, _ in own), medians))
+    rows: TableRows = [("held-out recording", "channel", "error (rms)", "unit", "without a model")]
+    for recording, channel, rmse, guesses in errors:
+        unit = channel_or_group_unit(units, channel)
+        without = (f"{format_error_value_and_unit(other, unit)[0]} ({name})" for name, other in guesses.items())
+        rows.append((recording, channel, *format_error_value_and_unit(rmse, unit), ", ".join(without)))
+    named = dict.fromkeys(name for own in found.values() for *_, guesses in own for name in guesses)
     legend = "; ".join(f"{name}, {_BASELINE_DESCRIPTIONS[name]}" for name in named if name in _BASELINE_DESCRIPTIONS)
     for entry in result["held_out"]:
         if "message" in entry:
@@ -246,26 +244,22 @@ def identifiability_summary(result: Mapping[str, Any]) -> SummaryParts:
     if not result["profiles"]:
         yield "intervals of parameters are worked out on request: --intervals NAME,NAME or --intervals all"
     yield from (f"{name}: {note}" for name, entry in result["profiles"].items() for note in entry["notes"])
-    if result["what_if"] is not None:
-        yield from _what_if(result["what_if"], len(parameters))
+    if (asked := result["what_if"]) is not None:
+        rows = [("change", "found", "gain [nat]", "")]
+        for entry in [asked["base"], *asked["singles"], *asked["smallest"]]:
+            gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
+            rows.append((entry["words"], f"{entry['identifiable']} of {len(parameters)}", gain, entry["message"]))
+        yield SummaryTable(rows, "What another experiment would tell")
+        said = "with no set of up to three changes can all of them be found"
+        if asked["smallest"]:
+            said = f"fewest changes with which all of them can be found: {asked['smallest'][0]['words']}"
+        yield SummaryStatement(said, "verdict")
     found = [name for name, entry in parameters.items() if entry["verdict"] == "identifiable"]
     text = f"{len(found) or 'none'} of {len(parameters)} parameters can be found from these recordings"
     yield SummaryStatement(text, "conclusion")
     lost = [name for name in found if parameters[name]["verdict_unknown"] != "identifiable"]
     unknown = f"not found if start and grasps were unknown: {', '.join(lost)}" if lost else ""
     yield SummaryStatement(unknown, "verdict")
-
-
-def _what_if(asked: Mapping[str, Any], count: int) -> SummaryParts:
-    rows: TableRows = [("change", "found", "gain [nat]", "")]
-    for entry in [asked["base"], *asked["singles"], *asked["smallest"]]:
-        gain = "" if entry["gain"] is None else f"{entry['gain']:.1f}"
-        rows.append((entry["words"], f"{entry['identifiable']} of {count}", gain, entry["message"]))
-    yield SummaryTable(rows, "What another experiment would tell")
-    said = "with no set of up to three changes can all of them be found"
-    if asked["smallest"]:
-        said = f"fewest changes with which all of them can be found: {asked['smallest'][0]['words']}"
-    yield SummaryStatement(said, "verdict")
 
 
 def _relative(value: float | None) -> str:
@@ -284,10 +278,9 @@ def friction_summary(result: Mapping[str, Any]) -> SummaryParts:
         note += "" if entry["converged"] else " (the fit did not converge)"
         rows.append((law, *sizes, unit, note))
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
-    rows = [("parameter", "value", "unit")]
-    for name, entry in result["laws"][best]["parameters"].items():
-        rows.append((name, value_and_uncertainty_text(entry["value"], entry["std"], None), entry["unit"]))
-    yield SummaryTable(rows, f"Fit with the law '{best}'")
+    fitted = result["laws"][best]["parameters"].items()
+    own = [(name, value_and_uncertainty_text(e["value"], e["std"], None), e["unit"]) for name, e in fitted]
+    yield SummaryTable([("parameter", "value", "unit"), *own], f"Fit with the law '{best}'")
     text = f"the law '{best}' is warranted: it is the simplest whose error is within one standard error of the least "
     text += f"({', '.join(result['kinds'])} left out in turn)"
     yield SummaryStatement(text, "conclusion")
@@ -303,12 +296,8 @@ def plan_summary(result: Mapping[str, Any]) -> SummaryParts:
         shares = ("" if own[key] is None else f"{100 * own[key]:.0f} %" for key in ("velocity", "effort"))
         rows.append((name, f"{travel:.3g}", *shares))
     yield SummaryTable(rows, "What it asks of the joints", is_key_table=True)
-    if result["goal"] == "information":
-        yield from _information_tables(result)
-        said = _information_sentences(result)
-    else:
-        said = _place_sentences(result)
-    yield from (SummaryStatement(text, "verdict") for text in said)
+    parts = _information_parts(result) if result["goal"] == "information" else _place_sentences(result)
+    yield from (SummaryStatement(part, "verdict") if isinstance(part, str) else part for part in parts)
     yield SummaryStatement(f"{result['status']}: {result['message']}", "conclusion")
 
 
@@ -333,7 +322,7 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield "the parameters are those of the configuration, so nothing is said of how uncertain that is"
 
 
-def _information_tables(result: Mapping[str, Any]) -> Iterator[SummaryTable]:
+def _information_parts(result: Mapping[str, Any]) -> SummaryParts:
     rows: TableRows = [("parameter", "from the recordings", "from this motion", "from both", "verdict of this motion")]
     for name, own in result["parameters"].items():
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
@@ -342,12 +331,8 @@ def _information_tables(result: Mapping[str, Any]) -> Iterator[SummaryTable]:
     yield SummaryTable(rows, "What it tells")
     rows = [("effect", "beside what could be", "apart in the recordings", "apart in this motion")]
     for own in result["distances"]:
-        apart = (f"{own[when]:.3g} std" for when in ("before", "after"))
-        rows.append((own["effect"], own["explained_by"], *apart))
+        rows.append((own["effect"], own["explained_by"], *(f"{own[when]:.3g} std" for when in ("before", "after"))))
     yield SummaryTable(rows, "Effects")
-
-
-def _information_sentences(result: Mapping[str, Any]) -> Iterator[str]:
     starts, best = result["starts"], result["starts"][result["best"]]
     gains = sorted((s["judged"] for s in starts if s["judged"] is not None), reverse=True)
     others = f"; {len(starts)} starts ended at {gains[0]:.3g} to {gains[-1]:.3g} nat" if len(gains) > 1 else ""
@@ -392,7 +377,14 @@ def check_summary(result: Mapping[str, Any]) -> SummaryParts:
         rests.append(f"{entry['recording']}: {'; '.join(said)}" if said else "")
     yield SummaryTable(rows, "Recordings", is_key_table=True)
     yield from rests
-    yield from _convergence(result["convergence"])
+    convergence = result["convergence"]
+    for key, head in (("links", "links"), ("time_step", "time step [s]")):
+        rows = [(head, "lowest frequencies [Hz]", "")]
+        for row in convergence[key]:
+            remark = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
+            rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
+        yield SummaryTable(rows, f"Frequencies by {head}")
+    yield f"frequencies: {convergence['message']}" if convergence["message"] else ""
     moved = discretisation_shift_sentences(result)
     yield "if the initial values were the estimates:" if moved else ""
     yield from moved
@@ -416,16 +408,6 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
     return "; ".join(said)
 
 
-def _convergence(convergence: Mapping[str, Any]) -> SummaryParts:
-    for key, head in (("links", "links"), ("time_step", "time step [s]")):
-        rows: TableRows = [(head, "lowest frequencies [Hz]", "")]
-        for row in convergence[key]:
-            remark = row["message"] or (f"{row['growing']} modes grow" if row["growing"] else "")
-            rows.append((f"{row['value']:g}", ", ".join(f"{f:.4g}" for f in row["hertz"]), remark))
-        yield SummaryTable(rows, f"Frequencies by {head}")
-    yield f"frequencies: {convergence['message']}" if convergence["message"] else ""
-
-
 @register_summary("yid-inspect/1")
 def inspect_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of a model's equations and linearised step."""
@@ -436,8 +418,8 @@ def inspect_summary(result: Mapping[str, Any]) -> SummaryParts:
     yield SummaryStatement(size, "verdict")
     rows: TableRows = [("parameter", "value", "unit", "bounds", "")]
     for name, entry in result["parameters"].items():
-        free = "free" if entry["free"] else ""
-        rows.append((name, f"{entry['value']:.6g}", entry["unit"], parameter_bounds_text(entry, 6), free))
+        bounds, free = parameter_bounds_text(entry, 6), "free" if entry["free"] else ""
+        rows.append((name, f"{entry['value']:.6g}", entry["unit"], bounds, free))
     yield SummaryTable(rows, "Parameters", is_key_table=True)
     sizes = [(f["name"], str(f["operations"]), str(f["nonzeros"])) for f in equations["functions"]]
     yield SummaryTable([("function", "operations", "nonzeros"), *sizes], "Functions")
@@ -447,29 +429,24 @@ def inspect_summary(result: Mapping[str, Any]) -> SummaryParts:
     yield from _patterns(result)
     said = f"linearised at {linear['at']}: spectral radius of A {linear['spectral_radius']:.6g}"
     yield SummaryStatement(said, "verdict")
-    rows = [("matrix", "norm", "largest difference from finite differences")]
-    for name, norm in linear["norms"].items():
-        rows.append((name, f"{norm:.4g}", f"{linear['finite_difference_errors'][name]:.1e}"))
-    yield SummaryTable(rows, "Linearised step")
+    errors = linear["finite_difference_errors"]
+    norms = [(name, f"{norm:.4g}", f"{errors[name]:.1e}") for name, norm in linear["norms"].items()]
+    yield SummaryTable([("matrix", "norm", "largest difference from finite differences"), *norms], "Linearised step")
     yield "matrices: linearisation.h5"
-    yield from _dependence(result)
+    of_free = [entry for name, entry in result["dependence"].items() if result["parameters"][name]["free"]]
+    shown, left = of_free[:_MAX_INSPECTED_PARAMETERS], len(of_free) - _MAX_INSPECTED_PARAMETERS
+    asked = (result["dependence"][name] for name in result["asked"])
+    yield from (entry["words"] for entry in [*shown, *(entry for entry in asked if entry not in shown)])
+    if left > 0:
+        yield f"and {left} more free parameters, in result.json"
+    if any(entry["seen"] is None for entry in of_free):
+        yield "what sensors see to first order is looked for about a rest, which this is not"
+    yield "where every parameter enters: result.json; all equations and names: equations.txt"
     for entry in result["entries"]:
         value = "unknown" if entry["value"] is None else f"{entry['value']:.6g}"
         yield CodeBlock("\n".join(entry["lines"]))
         yield CodeBlock("" if entry["zero"] else f"which is {value} at {linear['at']}")
     yield f"exported: {', '.join(result['exported'])}" if result["exported"] else ""
-
-
-def _dependence(result: Mapping[str, Any]) -> Iterator[str]:
-    free = [entry for name, entry in result["dependence"].items() if result["parameters"][name]["free"]]
-    shown, left = free[:_MAX_INSPECTED_PARAMETERS], len(free) - _MAX_INSPECTED_PARAMETERS
-    asked = (result["dependence"][name] for name in result["asked"])
-    yield from (entry["words"] for entry in [*shown, *(entry for entry in asked if entry not in shown)])
-    if left > 0:
-        yield f"and {left} more free parameters, in result.json"
-    if any(entry["seen"] is None for entry in free):
-        yield "what sensors see to first order is looked for about a rest, which this is not"
-    yield "where every parameter enters: result.json; all equations and names: equations.txt"
 
 
 def _patterns(result: Mapping[str, Any]) -> SummaryParts:
@@ -517,16 +494,13 @@ def track_summary(result: Mapping[str, Any]) -> SummaryParts:
     said = result["refused"] or f"{good} of {len(result['frames'])} frames are good, the fit took {spent:.0f} ms each"
     yield SummaryStatement(said, "verdict")
     yield from (f"dropped {number}: {reason}" for reason, number in result["dropped"].items())
-    yield result["camera"]["message"]
-    yield from result["sizes"]["messages"]
-    yield result["root"]
+    yield from (result["camera"]["message"], *result["sizes"]["messages"], result["root"])
     yield from (thing["text"] for thing in result["things"])
 
 
 @register_summary("yid-export/1")
 def export_summary(manifest: Mapping[str, Any]) -> SummaryParts:
     """Summary of a manifest: what of a model a format cannot express, and its replay."""
-    rows: TableRows = [("of the model", "in the file", "how, or why not")]
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     changed = {
         name: entry
@@ -534,9 +508,9 @@ def export_summary(manifest: Mapping[str, Any]) -> SummaryParts:
         if entry["status"] != "native" and name.rpartition(".")[0] not in effects
     }
     grasps = {f"grasp {name}": entry for name, entry in manifest.get("grasps", {}).items()}
-    for name, entry in (manifest["effects"] | grasps | changed).items():
-        rows.append((name, entry["status"], entry["how"]))
-    yield SummaryTable(rows)
+    entries = (manifest["effects"] | grasps | changed).items()
+    rows: TableRows = [("of the model", "in the file", "how, or why not")]
+    yield SummaryTable([*rows, *((name, entry["status"], entry["how"]) for name, entry in entries)])
     gate = manifest["gate"]
     if gate is None:
         return

@@ -18,7 +18,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
-from yid_ocp.report.animation import Animation, ModelTrajectory, make_animation
+from yid_ocp.report.animation import ModelTrajectory, make_animation
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import blind_calibration_rates
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
@@ -44,30 +44,26 @@ _JOINT_CHANNEL_UNITS = {
 @register_report_section("verdict", 0, "What was found")
 def _verdict(findings: ReportData) -> Mapping[str, Any] | None:
     """Conclusions, verdicts and the blocks up to the key table."""
-    blocks, end = _result_blocks(findings)
-    told = [block for block in blocks if isinstance(block, SummaryStatement)]
-    said = [block.text for kind in ("conclusion", "verdict") for block in told if block.kind == kind]
-    return {"verdict": said, "blocks": _without_verdicts(blocks[:end])} if blocks else None
+    said, first, _ = _result_blocks(findings)
+    return {"verdict": said, "blocks": first} if said or first else None
 
 
 @register_report_section("numbers", 60, "In numbers")
 def _remaining_tables(findings: ReportData) -> Mapping[str, Any] | None:
-    """Blocks after the key table, without verdicts."""
-    blocks, end = _result_blocks(findings)
-    rest = _without_verdicts(blocks[end:])
+    *_, rest = _result_blocks(findings)
     return {"blocks": rest} if rest else None
 
 
-def _result_blocks(findings: ReportData) -> tuple[list[SummaryBlock], int]:
-    """Summary blocks of a result, none for an unknown format, and the index after the key table, 0 without one."""
+def _result_blocks(findings: ReportData) -> tuple[list[str], list[SummaryBlock], list[SummaryBlock]]:
+    """Conclusions and verdicts of a result, and the other blocks up to its key table and after it."""
     known = SUMMARY_BY_FORMAT.get(str(findings.result.get("format")))
     blocks = [] if known is None else known(findings.result)
     ends = (i + 1 for i, block in enumerate(blocks) if isinstance(block, SummaryTable) and block.is_key_table)
-    return blocks, next(ends, 0)
-
-
-def _without_verdicts(blocks: list[SummaryBlock]) -> list[SummaryBlock]:
-    return [block for block in blocks if not (isinstance(block, SummaryStatement) and block.kind != "note")]
+    end = next(ends, 0)
+    told = [block for block in blocks if isinstance(block, SummaryStatement) and block.kind != "note"]
+    said = [block.text for kind in ("conclusion", "verdict") for block in told if block.kind == kind]
+    first, rest = ([block for block in part if block not in told] for part in (blocks[:end], blocks[end:]))
+    return said, first, rest
 
 
 @register_report_section("estimates", 10, "Estimates")
@@ -114,10 +110,9 @@ def _parameter_history(findings: ReportData) -> Mapping[str, Any] | None:
     result = findings.result if findings.result.get("format") == "yid-history/1" else findings.result.get("history")
     if not result or result.get("format") != "yid-history/1":
         return None
-    rows = [
-        (name, entry["unit"], {run: (own["value"], own["std"]) for run, own in entry["values"].items()})
-        for name, entry in result["parameters"].items()
-    ]
+    rows = []
+    for name, entry in result["parameters"].items():
+        rows.append((name, entry["unit"], {run: (own["value"], own["std"]) for run, own in entry["values"].items()}))
     return {"figures": figures_by_unit(rows, figures.parameter_values_by_source_figure)}
 
 
@@ -149,10 +144,9 @@ def _blind_validation(findings: ReportData) -> Mapping[str, Any] | None:
         return None
     shown = []
     if result["detection"]:
-        sizes = {
-            label: {float(size): own[key] for size, own in result["detection_intervals"].items()}
-            for key, label in (("gap", "gap seen"), ("right", "named right"))
-        }
+        intervals = {float(size): own for size, own in result["detection_intervals"].items()}
+        labels = {"gap": "gap seen", "right": "named right"}
+        sizes = {label: {size: own[key] for size, own in intervals.items()} for key, label in labels.items()}
         figure = figures.rate_intervals_figure(sizes, "size over the detectable size", "part of the cases", False)
         shown.append(("Detection by size, with binomial 95 % intervals", figure))
     said = result["confusion"]
@@ -269,27 +263,24 @@ def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
 @register_report_section("scene", 3, "In motion")
 def _animation(findings: ReportData) -> Mapping[str, Any] | None:
     """The command's animations, else the predicted motion of each recording, held-out first."""
-    scenes = [entry for entry in findings.animations or _predicted_motions(findings) if len(entry.t) > 1]
-    told = json.dumps([entry.to_dict() for entry in scenes[:_MAX_ANIMATIONS]], separators=(",", ":"))
+    scenes = [*findings.animations]
+    if not scenes:
+        for own in sorted(_predicted_episodes(findings), key=lambda own: own.role != _HELD_OUT)[:_MAX_ANIMATIONS]:
+            system, grid = own.problem.system, own.episode.grid
+            q = own.prediction.rollout.state[:, : system.n_coordinates]
+            told = ModelTrajectory("predicted", system, own.theta, grid.node_times, q)
+            scenes.append(make_animation(own.title, [told], own.episode.recording))
+    scenes = [entry for entry in scenes if len(entry.t) > 1]
+    text = json.dumps([entry.to_dict() for entry in scenes[:_MAX_ANIMATIONS]], separators=(",", ":"))
     names = [[motion.name for motion in entry.motions] for entry in scenes]
     both = any("measured" in own and len(own) > 1 for own in names)
-    return {"scenes": told.replace("<", "\\u003c"), "both": both} if scenes else None
-
-
-def _predicted_motions(findings: ReportData) -> Sequence[Animation]:
-    result = []
-    for own in sorted(_predicted_episodes(findings), key=lambda own: own.role != _HELD_OUT)[:_MAX_ANIMATIONS]:
-        system = own.problem.system
-        q = own.prediction.rollout.state[:, : system.n_coordinates]
-        told = ModelTrajectory("predicted", system, own.theta, own.episode.grid.node_times, q)
-        result.append(make_animation(own.title, [told], own.episode.recording))
-    return result
+    return {"scenes": text.replace("<", "\\u003c"), "both": both} if scenes else None
 
 
 @register_report_section("fit", 20, "How well it fits")
 def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
     """Measured and predicted values with residuals over time, and a residual histogram."""
-    found: list[tuple[str, list[TimePlotData]]] = []
+    found = []
     whitened: dict[str, list[Array]] = {}
     for own in _predicted_episodes(findings):
         found += [(f"{name} in {own.title}", curves) for name, curves in _fitted_curves(own)]
