@@ -14,6 +14,7 @@ import hypothesis
 import numpy as np
 import pytest
 import threadpoolctl
+from pendulum_run import carried_out as carried_out
 from pendulum_run import cli as cli
 from pendulum_run import left_nothing as left_nothing
 from pendulum_run import pendulum as pendulum

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,6 +64,20 @@ def cli(capsys):
         code = main([str(argument) for argument in arguments])
         captured = capsys.readouterr()
         return SimpleNamespace(code=code, out=captured.out, err=captured.err)
+
+    return run
+
+
+@pytest.fixture
+def carried_out(cli, tmp_path):
+    """Run a command that succeeds, into the folder `out`; what `cli` returns, with the folder and its result."""
+
+    def run(*arguments: object, settings: Sequence[str] = (), out: str = "run") -> SimpleNamespace:
+        done = cli(*arguments, "--out", tmp_path / out, *(part for entry in settings for part in ("--set", entry)))
+        assert done.code == 0, done.err
+        done.folder = tmp_path / out
+        done.result = json.loads((done.folder / "result.json").read_text(), parse_constant=pytest.fail)
+        return done
 
     return run
 

@@ -124,12 +124,11 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
     assert "iteration 1" in done.err
 
 
-def test_a_resolved_configuration_runs_again(cli, pendulum, tmp_path):
-    assert cli("solve", pendulum, "--out", "first", "--set", "output.write_report=false").code == 0
-    assert not (tmp_path / "first" / "report.html").exists()
-    assert cli("solve", "first/config.yaml", "--out", "second").code == 0
-    first, second = (json.loads((tmp_path / name / "result.json").read_text()) for name in ("first", "second"))
-    assert first["parameters"] == second["parameters"]
+def test_a_resolved_configuration_runs_again(carried_out, pendulum):
+    first = carried_out("solve", pendulum, settings=["output.write_report=false"], out="first")
+    assert not (first.folder / "report.html").exists()
+    second = carried_out("solve", first.folder / "config.yaml", out="second")
+    assert first.result["parameters"] == second.result["parameters"]
 
 
 def test_without_the_extra_report(pendulum, tmp_path):
@@ -147,13 +146,12 @@ def test_without_the_extra_report(pendulum, tmp_path):
     assert not (tmp_path / "run" / "report.html").exists()
 
 
-def test_quiet_prints_the_folder_alone_and_set_changes_the_run(cli, pendulum, tmp_path):
+def test_quiet_prints_the_folder_alone_and_set_changes_the_run(carried_out, pendulum):
     settings = ("parameters.elbow.damping.free=false", "problem.duration=0.5")
-    done = cli("solve", pendulum, "--quiet", "--out", tmp_path / "a", *(f"--set={setting}" for setting in settings))
-    assert (done.code, done.out.strip(), done.err) == (0, str(tmp_path / "a"), "")
-    result = json.loads((tmp_path / "a" / "result.json").read_text())
-    assert not result["parameters"]["elbow.damping"]["free"]
-    assert result["residuals"]["joints.effort.shoulder"]["n"] < 60
+    done = carried_out("solve", pendulum, "--quiet", settings=settings)
+    assert (done.out.strip(), done.err) == (str(done.folder), "")
+    assert not done.result["parameters"]["elbow.damping"]["free"]
+    assert done.result["residuals"]["joints.effort.shoulder"]["n"] < 60
 
 
 def test_a_named_empty_folder_may_be_used(cli, pendulum, tmp_path):
@@ -217,10 +215,7 @@ def test_a_notice_is_shown_once(cli, pendulum, monkeypatch):
         (["check"], ("the following arguments are required: CONFIG.yaml", "where: yid-ocp check", "--help")),
         (["check", "a.yaml", "b.yaml"], ("'b.yaml' is one argument too many",)),
         (["solve", "--qiet"], ("there is no option '--qiet'", "where: yid-ocp solve", "did you mean '--quiet'?")),
-        (
-            ["batch", "a.yaml", "--command", "slv"],
-            ("there is no choice of --command 'slv'", "allowed: solve, diagnose"),
-        ),
+        (["batch", "a", "--command", "slv"], ("there is no choice of --command 'slv'", "allowed: solve, diagnose")),
     ],
 )
 def test_a_wrong_command_line_is_told_like_all_that_is_wrong(cli, arguments, words):
@@ -230,38 +225,34 @@ def test_a_wrong_command_line_is_told_like_all_that_is_wrong(cli, arguments, wor
         assert word in done.err
 
 
-def test_check(cli, pendulum, tmp_path):
-    done = cli("check", pendulum, "--out", "c")
-    assert done.code == 0, done.err
-    result = json.loads((tmp_path / "c" / "result.json").read_text())
+def test_check(carried_out, pendulum):
+    done = carried_out("check", pendulum)
+    result = done.result
     assert result["format"] == "yid-check/1"
     assert result["model"]["n"] == 2
     assert [entry["role"] for entry in result["recordings"]] == ["estimate", "held_out"]
     assert {"time_step", "links", "std"} == set(result["discretisation"]["shoulder.stiffness"])
     assert "if the initial values were the estimates:" in done.out
     assert "100 Hz" in done.out
-    assert "run folder: c" in done.out
+    assert "run folder: run" in done.out
     assert not any("effort_kind" in text for text in result["warnings"])
     assert set(result["mechanics"]) == {"built", "file"}
     assert all(entry["agrees"] for entry in result["mechanics"].values())
     assert "double_pendulum.urdf as read: mass matrix, weight and inverse dynamics are Pinocchio's within" in done.out
 
 
-def test_check_says_what_kind_of_torque_is_assumed(cli, pendulum, pendulum_data, tmp_path):
+def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendulum_data, tmp_path):
     (tmp_path / "untold.h5").write_bytes((pendulum_data.folder / "estimate.h5").read_bytes())
     with h5py.File(tmp_path / "untold.h5", "r+") as file:
         del file["joints"].attrs["effort_kind"]
-    done = cli("check", pendulum, "--out", "c", "--set", "recordings.estimate=[untold.h5]")
-    assert done.code == 0, done.err
-    result = json.loads((tmp_path / "c" / "result.json").read_text())
+    result = carried_out("check", pendulum, settings=["recordings.estimate=[untold.h5]"]).result
     [said] = [text for text in result["warnings"] if "effort_kind" in text]
     assert said.startswith("untold: ")
     assert said.endswith("it is taken as a sample")
 
 
-def test_check_refines_links_and_time_step(cli, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "beam.yaml").write_text(
+def test_check_refines_links_and_time_step(carried_out, written):
+    file = written(
         "model:\n"
         "  object:\n"
         "    kind: segments\n"
@@ -272,27 +263,23 @@ def test_check_refines_links_and_time_step(cli, tmp_path, monkeypatch):
         "  gravity: [0, 0, 0]\n"
         "parameters: {beam.bend: {initial: 0.5}, beam.twist: {initial: 0.5}}\n"
     )
-    done = cli("check", "beam.yaml", "--out", "c")
-    assert done.code == 0, done.err
-    convergence = json.loads((tmp_path / "c" / "result.json").read_text())["convergence"]
+    done = carried_out("check", file)
+    convergence = done.result["convergence"]
     assert [row["value"] for row in convergence["links"]] == [4, 8]
     assert [row["value"] for row in convergence["time_step"]] == [0.01, 0.005, 0.0025]
     # a clamped uniform beam: f1 = 1.8751^2/(2 pi) sqrt(EI/(rho A L^4))
     exact = 1.8751**2 / 6.2832 * (0.5 / (0.3 / 0.5 * 0.5**4)) ** 0.5
-    finest = convergence["links"][-1]["hertz"][0]
-    coarsest = convergence["links"][0]["hertz"][0]
+    coarsest, finest = (row["hertz"][0] for row in convergence["links"])
     assert abs(finest - exact) < 0.05 * exact
     assert abs(finest - exact) < abs(coarsest - exact)
     assert "warning: frequency" in done.out
 
 
-def test_inspect(cli, pendulum, tmp_path):
+def test_inspect(carried_out, pendulum, tmp_path):
     entries = ("del[elbow], elbow.damping", "p1[shoulder]", "elbow.mass")
     asked = [part for entry in entries for part in ("--entry", entry)]
-    done = cli("inspect", pendulum, "--out", "i", *asked, "--export", "eq")
-    assert done.code == 0, done.err
-    folder = tmp_path / "i"
-    result = json.loads((folder / "result.json").read_text())
+    done = carried_out("inspect", pendulum, *asked, "--export", "eq")
+    folder, result = done.folder, done.result
     assert result["format"] == "yid-inspect/1"
     assert [entry["role"] for entry in result["variables"]] == ["prescribed", "prescribed"]
     assert result["parameters"]["shoulder.stiffness"]["free"]
@@ -327,7 +314,7 @@ def test_inspect(cli, pendulum, tmp_path):
             assert line in done.out
     # a damper takes half of what the coordinate moves, which is nothing at rest; there the momentum stays what it was
     slope, momentum = result["entries"]
-    with h5py.File(tmp_path / "i" / "linearisation.h5") as file:
+    with h5py.File(folder / "linearisation.h5") as file:
         before = file["state"][2]
     assert slope["value"] == pytest.approx(0.0, abs=1e-12)
     assert abs(before) > 1e-3
@@ -338,15 +325,12 @@ def test_inspect(cli, pendulum, tmp_path):
     assert {"rows.casadi", "equations.c", "equations.tex", "names.json"} <= files
 
 
-def test_inspect_agrees_with_finite_differences(cli, tmp_path, monkeypatch, urdf_folder):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "free.yaml").write_text(
+def test_inspect_agrees_with_finite_differences(carried_out, written, urdf_folder):
+    file = written(
         f"model:\n  robot: {urdf_folder / 'double_pendulum.urdf'}\n  arms: {{mode: driven}}\n"
         "problem: {use_compiler: false}\n"
     )
-    done = cli("inspect", "free.yaml", "--out", "i")
-    assert done.code == 0, done.err
-    result = json.loads((tmp_path / "i" / "result.json").read_text())
+    result = carried_out("inspect", file).result
     assert all(error < 1e-6 for error in result["linearisation"]["finite_difference_errors"].values())
     assert result["equations"]["unknowns"] == 2
     assert result["equations"]["jacobian_nonzeros"] == 4
@@ -384,21 +368,16 @@ def test_check_warns_of_a_file_that_another_library_reads_otherwise(cli, pendulu
     assert "warning: double_pendulum.urdf cannot be compared, Pinocchio does not read it: no such joint" in done.out
 
 
-def test_simulate_is_a_recording_that_solve_reads(pendulum_data):
+def test_what_is_simulated_is_exported_and_imported(cli, pendulum_data, tmp_path):
     recording = read_recording(pendulum_data.folder / "estimate.h5")
     assert recording.joint_names == ("shoulder", "elbow")
     assert abs(recording.joints.effort).max() > 0.5
     # of prescribed joints: what they need at the nodes
     assert recording.joints.effort_kind == "sample"
     assert recording.true_parameters["shoulder.stiffness"] == pendulum_data.truth["shoulder.stiffness"]
-
-
-def test_import_and_export(cli, pendulum_data, tmp_path):
     exported = cli("export", pendulum_data.folder / "estimate.h5", "--out", tmp_path / "csv")
     assert exported.code == 0, exported.err
-    files = list((tmp_path / "csv").glob("*.csv"))
-    assert files
-    done = cli("import", files[0], "--out", tmp_path / "back.h5")
+    done = cli("import", next((tmp_path / "csv").glob("*.csv")), "--out", tmp_path / "back.h5")
     assert done.code == 0, done.err
     back = read_recording(tmp_path / "back.h5", allow_nan_effort=True)
     assert back.joint_names == ("shoulder", "elbow")

@@ -72,22 +72,24 @@ def configurations(repository):
     return {path.stem: path for path in files if not path.stem.startswith(("track_", "plan_"))}
 
 
+def recorded(repository, name):
+    """The file of a configuration whose recordings are here."""
+    file = configurations(repository)[name]
+    recordings = load_config(file).recordings
+    for path in (*recordings.estimate, *recordings.held_out):
+        if not resolve_recording_path(path).is_file():
+            pytest.skip(f"its recordings are not here: {path}")
+    return file
+
+
 def test_every_configuration_has_its_row(repository):
     assert set(configurations(repository)) == set(QUICK), "a new configuration needs a row in QUICK"
 
 
 @pytest.mark.parametrize("name", sorted(QUICK))
 def test_configuration_runs(cli, repository, tmp_path, name):
-    file = configurations(repository)[name]
-    run = load_config(file)
-    missing = [
-        path
-        for path in (*run.recordings.estimate, *run.recordings.held_out)
-        if not resolve_recording_path(path).is_file()
-    ]
-    if missing:
-        pytest.skip(f"its recordings are not here: {missing[0]}")
     settings = [part for setting in QUICK[name] for part in ("--set", setting)]
+    file = recorded(repository, name)
     done = cli("solve", file, "--out", tmp_path / "run", *settings, "--set", "output.write_report=false")
     assert done.code in (0, 1), done.err
     result = json.loads((tmp_path / "run" / "result.json").read_text())
@@ -116,16 +118,10 @@ WITHHELD = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", sorted(WITHHELD))
-def test_what_is_withheld_from_the_beams_model_is_named(cli, repository, tmp_path, what):
-    file = configurations(repository)["panda_beam"]
-    missing = [path for path in load_config(file).recordings.estimate if not resolve_recording_path(path).is_file()]
-    if missing:
-        pytest.skip(f"its recordings are not here: {missing[0]}")
+def test_what_is_withheld_from_the_beams_model_is_named(carried_out, repository, what):
     settings, truth = WITHHELD[what]
-    chosen = [part for setting in (*settings, "diagnosis.max_effects=1") for part in ("--set", setting)]
-    done = cli("diagnose", file, "--out", tmp_path / "run", *chosen, "--set", "output.write_report=false")
-    assert done.code == 0, done.err
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    settings = (*settings, "diagnosis.max_effects=1", "output.write_report=false")
+    result = carried_out("diagnose", recorded(repository, "panda_beam"), settings=settings).result
     assert result["verdict"] == "effect"
     assert result["effects"] == [truth]
     assert result["gap"]["closure_ci"][0] > 0.5
@@ -134,12 +130,9 @@ def test_what_is_withheld_from_the_beams_model_is_named(cli, repository, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize("exact", [False, True], ids=["as embedded", "exact torques"])
 @pytest.mark.parametrize("name", PAPER)
-def test_the_papers_experiments_in_full(cli, repository, clean, tmp_path, name, exact):
+def test_the_papers_experiments_in_full(carried_out, repository, clean, name, exact):
     files = [f"recordings.{purpose}=[{clean / name}_{purpose}.h5]" for purpose in ("estimate", "held_out")]
-    chosen = [part for setting in files for part in ("--set", setting)] if exact else []
-    done = cli("solve", configurations(repository)[name], "--out", tmp_path / "run", *chosen)
-    assert done.code == 0, done.err
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    result = carried_out("solve", configurations(repository)[name], settings=files if exact else ()).result
     assert result["fit"]["explains"]
     truth = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
     told = {parameter: result["parameters"][parameter] for parameter in truth}

@@ -22,9 +22,8 @@ from yid_ocp.workflow import solve as solve_module
 
 
 def test_a_solve_that_does_not_converge(cli, pendulum, tmp_path):
-    done = cli(
-        "solve", pendulum, "--out", "limit", "--set", "solver.max_iterations=1", "--set", "solver.name=steepest_descent"
-    )
+    settings = ("--set", "solver.max_iterations=1", "--set", "solver.name=steepest_descent")
+    done = cli("solve", pendulum, "--out", "limit", *settings)
     assert done.code == 1
     result = json.loads((tmp_path / "limit" / "result.json").read_text())
     assert result["status"] == "iteration_limit"

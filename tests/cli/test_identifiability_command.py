@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 VERDICTS = {"identifiable", "weak", "not_identifiable", "at_bound", "not_trusted"}
+COMMANDS, NO_REPORT = ("solve", "identifiability", "compare"), ("output.write_report=false",)
 PARTS = {
     "": {"format", "status", "parameters", "directions", "what_if", "inputs", "versions", "correlations"},
     "parameters": {"value", "unit", "std_relative", "verdict", "interval", "std_alone"},
@@ -29,52 +30,40 @@ def check_keys(result):
     assert {entry["verdict"] for entry in result["parameters"].values()} <= VERDICTS
 
 
-def read(folder):
-    return json.loads((folder / "result.json").read_text(), parse_constant=pytest.fail)
-
-
-def test_springs_that_cannot_be_told_apart(cli, repository, tmp_path):
+def test_springs_that_cannot_be_told_apart(carried_out, repository):
     asked = ("--what-if", "--unknown-start", "--unknown-grasp")
-    done = cli("identifiability", repository / "configs" / "springs_torsion.yaml", "--out", tmp_path / "run", *asked)
-    assert done.code == 0, done.err
+    done = carried_out("identifiability", repository / "configs" / "springs_torsion.yaml", *asked)
     assert "none of 2 parameters can be found" in done.out
     assert "1/spring_1.stiffness + 1/spring_2.stiffness, as springs in series are" in done.out
     assert "fewest changes with which all of them can be found: coupling_marker, seen by the camera" in done.out
-    result = read(tmp_path / "run")
+    result = done.result
     check_keys(result)
-    assert result["start"] == "unknown"
-    assert result["nuisances"] == 4
+    assert (result["start"], result["nuisances"]) == ("unknown", 4)
     for entry in result["parameters"].values():
         lower, upper = entry["interval"]
         assert lower == pytest.approx(1.2, rel=0.02)
         assert upper is None
-    report = (tmp_path / "run" / "report.html").read_text()
+    report = (done.folder / "report.html").read_text()
     assert "What another experiment would tell" in report
     assert "cannot be found" in report
-    assert {"config.yaml", "log.jsonl"} <= {entry.name for entry in (tmp_path / "run").iterdir()}
+    assert {"config.yaml", "log.jsonl"} <= {entry.name for entry in done.folder.iterdir()}
 
 
-def test_springs_that_can(cli, repository, tmp_path):
+def test_springs_that_can(carried_out, repository):
     file = repository / "configs" / "springs_series_joint.yaml"
-    options = ("--intervals", "spring_1.stiffness", "--set", "output.write_report=false")
-    done = cli("identifiability", file, "--out", tmp_path / "run", *options)
-    assert done.code == 0, done.err
+    done = carried_out("identifiability", file, "--intervals", "spring_1.stiffness", settings=NO_REPORT)
     assert "2 of 2 parameters can be found" in done.out
-    result = read(tmp_path / "run")
+    result = done.result
     check_keys(result)
-    assert result["what_if"] is None
-    assert result["nuisances"] == 0
+    assert (result["what_if"], result["nuisances"]) == (None, 0)
     assert result["parameters"]["spring_2.stiffness"]["interval"] is None
     lower, upper = result["parameters"]["spring_1.stiffness"]["interval"]
     assert lower < 200.0 < upper
 
 
-def test_judged_at_the_initial_values_without_solving(cli, repository, tmp_path):
+def test_judged_at_the_initial_values_without_solving(carried_out, repository):
     file = repository / "configs" / "springs_series_ends.yaml"
-    options = ("--initial", "--intervals", "none", "--set", "output.write_report=false")
-    done = cli("identifiability", file, "--out", tmp_path / "run", *options)
-    assert done.code == 0, done.err
-    result = read(tmp_path / "run")
+    result = carried_out("identifiability", file, "--initial", "--intervals", "none", settings=NO_REPORT).result
     assert result["status"] == "not_solved"
     assert {entry["value"] for entry in result["parameters"].values()} == {100.0}
 
@@ -106,19 +95,15 @@ def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, m
     done = cli("identifiability", repository / "configs" / "springs_series_ends.yaml", "--out", tmp_path / "run")
     assert done.code == 1
     assert "failed: the rollout failed; there is no point at which to judge" in done.out
-    assert read(tmp_path / "run")["parameters"] == {}
+    assert json.loads((tmp_path / "run" / "result.json").read_text())["parameters"] == {}
     assert "there is no point at which to judge" in (tmp_path / "run" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("named", ["pendulum", "springs_torsion", "springs_series_joint"])
-def test_no_two_commands_give_two_verdicts_for_one_parameter(cli, repository, pendulum, tmp_path, named):
+def test_no_two_commands_give_two_verdicts_for_one_parameter(carried_out, repository, pendulum, named):
     file = pendulum if named == "pendulum" else repository / "configs" / f"{named}.yaml"
-    quick = ("--set", "output.write_report=false")
-    methods = ("--set", "compare.methods={gauss_newton: {}, single_shooting: {}}")
-    for command, more in (("solve", ()), ("identifiability", ()), ("compare", methods)):
-        done = cli(command, file, "--out", tmp_path / command, *quick, *more)
-        assert done.code == 0, done.err
-    solved, judged, compared = (read(tmp_path / command) for command in ("solve", "identifiability", "compare"))
+    settings = (*NO_REPORT, "compare.methods={gauss_newton: {}, single_shooting: {}}")
+    solved, judged, compared = (carried_out(name, file, settings=settings, out=name).result for name in COMMANDS)
     reference = compared["methods"][compared["reference"]]["parameters"]
     free = [name for name, entry in solved["parameters"].items() if entry["free"]]
     assert free
@@ -131,19 +116,17 @@ def test_no_two_commands_give_two_verdicts_for_one_parameter(cli, repository, pe
             assert judged["parameters"][name]["std"] == pytest.approx(alone, rel=0.05)
 
 
-def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(cli, pendulum, tmp_path):
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(carried_out, pendulum, command):
     """The same pendulum with its noise stated ten times too small."""
-    quick = ("--set", "output.write_report=false", "--set", "sensors={joints.effort: {std: 0.001}}")
-    methods = ("--set", "compare.methods={gauss_newton: {}}")
-    for command, more in (("solve", ()), ("identifiability", ()), ("compare", methods)):
-        done = cli(command, pendulum, "--out", tmp_path / command, *quick, *more)
-        assert done.code == 0, done.err
-        first = done.out.strip().splitlines()[0]
-        assert first.startswith("the model does not explain the recordings (chi2 per degree of freedom is "), command
-        assert first.endswith("run `yid-ocp diagnose`")
-        assert "not to be trusted" in done.out
-        result = read(tmp_path / command)
-        own = result["methods"]["gauss_newton"] if command == "compare" else result
-        assert own["fit"]["explains"] is False
-        verdicts = {entry["verdict"] for entry in own["parameters"].values()} - {"fixed"}
-        assert verdicts == {"not_trusted"}
+    settings = (*NO_REPORT, "sensors={joints.effort: {std: 0.001}}", "compare.methods={gauss_newton: {}}")
+    done = carried_out(command, pendulum, settings=settings)
+    first = done.out.strip().splitlines()[0]
+    assert first.startswith("the model does not explain the recordings (chi2 per degree of freedom is "), command
+    assert first.endswith("run `yid-ocp diagnose`")
+    assert "not to be trusted" in done.out
+    result = done.result
+    own = result["methods"]["gauss_newton"] if command == "compare" else result
+    assert own["fit"]["explains"] is False
+    verdicts = {entry["verdict"] for entry in own["parameters"].values()} - {"fixed"}
+    assert verdicts == {"not_trusted"}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 from made_cross import TRUTH, configuration, record
 
@@ -33,18 +31,17 @@ def judged(result, links):
     return found
 
 
-def test_too_few_links_are_told_and_counted(folder, tmp_path, cli):
+def test_too_few_links_are_told_and_counted(folder, carried_out):
     """A branch of twelve links estimated with four: a quarter too stiff, known from the data to half a percent."""
-    done = cli("solve", configuration(folder, 4, ["north"], 1.5), "--out", tmp_path / "run")
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
-    error, alone, counted, entry = judged(result, 4)["north.bend"]
+    done = carried_out("solve", configuration(folder, 4, ["north"], 1.5))
+    error, alone, counted, entry = judged(done.result, 4)["north.bend"]
     assert error > 0.15
     assert alone < 0.02
     assert error < 2 * counted
     # the data show it as well: the model does not explain them
     assert entry["verdict"] == "not_trusted"
     # with twice the links it is nearer to the truth by what is said
-    moved = result["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
+    moved = done.result["discretisation"]["north.bend"]["links"] / TRUTH["north.bend"]
     assert -error < moved < -0.4 * error
     assert "with twice the links these move by more than the data's" in done.out
 
@@ -58,13 +55,13 @@ def test_settings_say_what_is_refined(folder, tmp_path, setting, tried):
     assert result["parameters"]["north.bend"]["verdict"] == "not_trusted"
 
 
-def test_check_says_it_before_anything_is_solved(folder, tmp_path, cli):
+def test_check_says_it_before_anything_is_solved(folder, carried_out):
     """At the truth the move is nearly the one at the estimate, whatever the data; a poor fit makes nothing unsure."""
-    found = []
-    for start in (2.0, 1.0):
-        cli("check", configuration(folder, 4, ["north"], start), "--out", tmp_path / f"{start}")
-        found.append(json.loads((tmp_path / f"{start}" / "result.json").read_text())["discretisation"]["north.bend"])
-    poor, moved = found
+    poor, moved = (
+        carried_out("check", configuration(folder, 4, ["north"], start), out=f"{start}").result["discretisation"]
+        for start in (2.0, 1.0)
+    )
+    poor, moved = poor["north.bend"], moved["north.bend"]
     assert 1 < poor["std"] / moved["std"] < 10
     assert -0.3 < moved["links"] / TRUTH["north.bend"] < -0.08
     assert abs(moved["time_step"]) < 0.02 * TRUTH["north.bend"]

@@ -162,15 +162,12 @@ def test_what_cannot_be_said_is_left_out_and_listed(tmp_path, exported) -> None:
     assert text == (tmp_path / "less.xml").read_text()
 
 
-def test_a_configuration_that_starts_at_the_estimates(cli, pendulum, tmp_path) -> None:
-    config = pendulum.read_text() + "output: {write_report: false, discretisation_check: none}\n"
-    pendulum.write_text(config)
-    assert cli("solve", pendulum, "--out", "first").code == 0
-    first = json.loads((tmp_path / "first" / "result.json").read_text())
+def test_a_configuration_that_starts_at_the_estimates(cli, carried_out, pendulum) -> None:
+    settings = ["output={write_report: false, discretisation_check: none}"]
+    first = carried_out("solve", pendulum, settings=settings, out="first").result
     done = cli("export", "first", "--format", "yaml", "--out", "again.yaml", "--quiet")
     assert (done.code, done.out) == (0, "again.yaml\n")
-    assert cli("solve", "again.yaml", "--out", "second").code == 0
-    second = json.loads((tmp_path / "second" / "result.json").read_text())
+    second = carried_out("solve", "again.yaml", out="second").result
     assert second["iterations"] <= 1 < first["iterations"]
     for name, entry in second["parameters"].items():
         if entry["free"]:

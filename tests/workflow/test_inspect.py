@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import h5py
@@ -32,16 +31,14 @@ output: {{write_report: false}}
 """
 
 
-def test_a_recording_whose_start_is_fitted(cli, written, tmp_path):
+def test_a_recording_whose_start_is_fitted(carried_out, written, tmp_path):
     """A rod of two links under the ceiling, an eighth of a radian aside; the ends of both are seen."""
     aside = 0.3 * np.array([math.sin(0.125), 0.0, -math.cos(0.125)])
     place = np.stack([aside, 2 * aside]) + 1e-4 * np.random.default_rng(1).standard_normal((len(TIMES), 2, 3))
     camera = PointGroup("points_camera", ["T1_0_tip", "w_T1"], TIMES, place, 1e-3, sensor="camera", pose=np.eye(4))
     write_recording(Recording(None, (camera,)), tmp_path / "aside.h5")
     entries = ("--entry", "del[T1_0_y]", "--entry", "del[T1_0_y], T1.bend")
-    done = cli("inspect", written(HANGING), "--out", tmp_path / "run", *entries)
-    assert done.code == 0, done.err
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    result = carried_out("inspect", written(HANGING), *entries).result
     assert result["linearisation"]["at"] == "the start that was fitted to the first points of aside"
     with h5py.File(tmp_path / "run" / "linearisation.h5") as file:
         assert abs(file["state"][1]) == pytest.approx(0.125, abs=0.01)

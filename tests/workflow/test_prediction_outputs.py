@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -154,9 +153,7 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
     ]
     many = {f"run {i}": {"s0": offset(0.1)} for i in range(6)}
     assert torque_offset_table_rows({"torque_offsets": many})[-1][0] == "2 more recordings are in result.json"
-    assert len(torque_offset_table_rows({"torque_offsets": {}})) == len(torque_offset_table_rows({})) == 1, (
-        "a head alone"
-    )
+    assert len(torque_offset_table_rows({"torque_offsets": {}})) == len(torque_offset_table_rows({})) == 1
 
 
 def simulated(problem, seeds):
@@ -233,18 +230,16 @@ def test_the_best_guess_counts():
 
 
 @pytest.mark.parametrize(("factor", "believed"), [(1.0, True), (0.4, False)])
-def test_a_recording_held_out_that_a_guess_predicts_better_withholds_trust(
-    cli, pendulum_data, tmp_path, factor, believed
+def test_a_held_out_recording_that_a_guess_predicts_better_withholds_trust(
+    carried_out, pendulum_data, tmp_path, factor, believed
 ):
     recording = read_recording(pendulum_data.folder / "held_out.h5")
     less = replace(recording, joints=replace(recording.joints, effort=factor * recording.joints.effort))
     write_recording(less, tmp_path / "held_out.h5")
-    (tmp_path / "run.yaml").write_text(
-        pendulum_data.text.replace(str(pendulum_data.folder / "held_out.h5"), "held_out.h5")
-    )
-    done = cli("solve", tmp_path / "run.yaml", "--out", tmp_path / "run", "--set", "output.write_report=false")
-    assert done.code == 0, done.err
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    (tmp_path / "run.yaml").write_text(pendulum_data.text)
+    settings = [f"recordings.held_out=[{tmp_path / 'held_out.h5'}]", "output.write_report=false"]
+    done = carried_out("solve", tmp_path / "run.yaml", settings=settings)
+    result = done.result
     assert result["fit"]["believed"] is believed
     assert [doubt["cause"] for doubt in result["doubts"]] == ([] if believed else ["worse_than_guess"])
     verdict = result["parameters"]["shoulder.stiffness"]["verdict"]

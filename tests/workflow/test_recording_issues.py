@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +20,7 @@ from yid_ocp.workflow.build_problem import _is_modelled, build_problem, single_r
 def damaged(pendulum_data, tmp_path):
     """Write the pendulum's recording after a change, and its configuration; returns the configuration's file."""
 
-    def write(change=lambda recording: recording, **files):
+    def write(change=lambda recording: recording):
         recording = change(read_recording(pendulum_data.folder / "estimate.h5"))
         write_recording(recording, tmp_path / "damaged.h5")
         text = pendulum_data.text.replace(str(pendulum_data.folder / "estimate.h5"), "damaged.h5")
@@ -56,28 +55,18 @@ def without(begin, end):
     return change
 
 
-@pytest.fixture
-def solved(cli, tmp_path):
-    """solved(file, flags): what the command printed, and its result."""
-
-    def run(file, *flags):
-        done = cli("solve", file, "--out", tmp_path / "run", *flags)
-        assert done.code == 0, done.err
-        return done, json.loads((tmp_path / "run" / "result.json").read_text())
-
-    return run
-
-
-def test_a_run_on_good_recordings_says_nothing(damaged, solved):
-    done, result = solved(damaged(), "--strict", "--set", "output.write_report=false")
+def test_a_run_on_good_recordings_says_nothing(damaged, carried_out):
+    done = carried_out("solve", damaged(), "--strict", settings=["output.write_report=false"])
     assert "in doubt" not in done.out
+    result = done.result
     assert result["doubts"] == []
     assert result["fit"]["believed"]
     assert result["parameters"]["shoulder.stiffness"]["verdict"] == "identifiable"
 
 
-def test_no_number_from_a_recording_in_grave_doubt_is_found(damaged, solved, tmp_path):
-    done, result = solved(damaged(noisy))
+def test_no_number_from_a_recording_in_grave_doubt_is_found(damaged, carried_out):
+    done = carried_out("solve", damaged(noisy))
+    result = done.result
     assert {doubt["cause"] for doubt in result["doubts"]} == {"noise"}
     assert not result["fit"]["believed"]
     free = [entry for entry in result["parameters"].values() if entry["free"]]
@@ -85,7 +74,7 @@ def test_no_number_from_a_recording_in_grave_doubt_is_found(damaged, solved, tmp
     assert any(line.split("  ")[0] == "in doubt" for line in done.out.splitlines()[:6])
     for words in ("no number is said to be found while a recording", "sensors.joints.effort.std: 0.1"):
         assert words in done.out
-    page = (tmp_path / "run" / "report.html").read_text()
+    page = (done.folder / "report.html").read_text()
     assert "<h3>In doubt</h3>" in page
     assert "more noise than stated" in page
 
@@ -113,9 +102,8 @@ def test_strict_stops_a_run_in_doubt(cli, damaged, tmp_path, left_nothing, comma
     left_nothing(file)
 
 
-def test_check_lists_what_is_in_doubt(cli, damaged, tmp_path):
-    done = cli("check", damaged(noisy), "--out", tmp_path / "run")
-    assert done.code == 0
+def test_check_lists_what_is_in_doubt(carried_out, damaged):
+    done = carried_out("check", damaged(noisy))
     assert "more noise than stated" in done.out
     assert done.out.splitlines()[-2] == "a run is possible; see what is in doubt"
 
@@ -129,8 +117,9 @@ def test_times_that_are_not_seconds_stop_a_run_at_once(cli, damaged, tmp_path, l
     left_nothing(file)
 
 
-def test_gaps_are_cut_out_and_said(damaged, solved):
-    _, result = solved(damaged(without(0.55, 0.66)), "--set", "output.write_report=false")
+def test_gaps_are_cut_out_and_said(damaged, carried_out):
+    file = damaged(without(0.55, 0.66))
+    result = carried_out("solve", file, settings=["output.write_report=false"]).result
     assert [doubt["cause"] for doubt in result["doubts"]] == ["gap"]
     assert "2 parts of it, 1.07 s, are used" in result["doubts"][0]["what"]
     assert result["fit"]["believed"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from importlib import metadata
@@ -120,15 +119,13 @@ def replace_dist(entry, dist):
     return entry._for(dist)
 
 
-def test_a_diagnosis_names_it_and_its_command_repeats_the_result(kinds, rubbing, tmp_path, cli) -> None:
+def test_a_diagnosis_names_it_and_its_command_repeats_the_result(kinds, rubbing, tmp_path, carried_out) -> None:
     (tmp_path / "own.py").write_text(EFFECT.format(kind="constant"))
     text = re.sub(r"candidates: \[.*?\]", "candidates: [constant]", rubbing.read_text())
     (tmp_path / "pushed.yaml").write_text(f"plugins: [own.py]\n{text}")
     command, results = ["diagnose", tmp_path / "pushed.yaml", "--set", "output.write_report=false"], []
     for name in ("first", "second"):
-        done = cli(*command, "--out", tmp_path / name)
-        assert done.code == 0, done.err
-        results.append(json.loads((tmp_path / name / "result.json").read_text()))
+        results.append(carried_out(*command, out=name).result)
         command = shlex.split(results[-1]["command"])[1:]
     assert results[0]["inputs"][str(tmp_path / "own.py")] == file_sha256(tmp_path / "own.py")
     assert [entry["kind"] for entry in results[0]["which"]] == ["constant", "constant"]
