@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from operator import delitem, setitem
 
 import h5py
 import numpy as np
 import pytest
-
-from yid_ocp.data import read_recording
 
 
 def assert_refused(done, *words):
@@ -57,21 +54,10 @@ def edited(file, old, new):
     ("old", "new", "words"),
     [
         ("held_out:", "heldout:", ("there is no key 'heldout'", "recordings.heldout", "did you mean 'held_out'?")),
-        ("solver:", "sovler:", ("there is no key 'sovler'", "did you mean 'solver'?")),
-        ("path_cutoff: .inf", "path_cutof: 5", ("did you mean 'path_cutoff'?", "problem")),
         ("{free: true}", "{fre: true}", ("did you mean 'free'?", "parameters.shoulder.damping.fre")),
         ("path_cutoff: .inf", "path_cutoff: 5 Hz", ("path_cutoff", "[Hz]", "write the number alone, in Hz")),
         ("path_cutoff: .inf", "time_step: 10 ms", ("time_step", "[s]", "convert it from ms")),
-        ("path_cutoff: .inf", "time_step: 10", ("time_step = 10", "up to 0.1 [s]")),
-        ("path_cutoff: .inf", "time_step: -0.01", ("above 0",)),
         ("path_cutoff: .inf", "time_step: .nan", ("time_step",)),
-        ("name: gauss_newton", "max_iterations: many", ("solver.max_iterations", "a whole number")),
-        ("name: gauss_newton", "name: gaus_newton", ("there is no solver", "gauss_newton")),
-        ("path_cutoff: .inf", "feedback: lqg", ("none, proportional, lqr",)),
-        ("mode: prescribed", "mode: perscribed", ("driven, prescribed, servo, passive",)),
-        ("compiler: false", "compiler: no", ("true or false",)),
-        ("stiffness: 1.0", "stiffness: -1.0", ("from 0", "N m/rad")),
-        ("bounds: [0.0, 100.0]", "bounds: [0.0]", ("a list of 2",)),
         ("bounds: [0.0, 100.0]", "bounds: [-5.0, 100.0]", ("bounds", "within 0 to inf N m/rad")),
         ("bounds: [0.0, 100.0]", "bounds: [0.0, 0.5]", ("outside its bounds", "0 to 0.5 N m/rad")),
         ("bounds: [0.0, 100.0]", "initial: 200, bounds: [0.0, 100.0]", ("outside its bounds", "0 to 100 N m/rad")),
@@ -84,7 +70,6 @@ def edited(file, old, new):
         ("recordings:", "sensors: {points: {std: 1}}\nrecordings:", ("no recording has a group 'points'",)),
         ("  held_out:", "  held_out: [nothing.h5]\n  held_out:", ("is duplicated", "held_out")),
         ("recordings:", "recordings: [", ("not valid YAML",)),
-        ("description: A", "description: [A", ("not valid YAML",)),
     ],
 )  # fmt: skip
 def test_configuration(cli, pendulum, left_nothing, old, new, words):
@@ -205,4 +190,3 @@ def test_two_recordings_of_one_name_are_told_apart(cli, pendulum, pendulum_data,
     copy.write_bytes((pendulum_data.folder / "estimate.h5").read_bytes())
     both = f"recordings.estimate=[{pendulum_data.folder / 'estimate.h5'}, {copy}]"
     assert cli("solve", pendulum, "--set", both, "--out", "two").code == 0
-    assert replace(read_recording(copy), name="x").name == "x"

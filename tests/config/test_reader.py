@@ -48,11 +48,6 @@ def test_numbers_as_in_yaml_1_2(written):
     assert run.description == "yes"
 
 
-def test_a_solver_has_the_settings_of_its_method(written):
-    run = load_config(written("solver: {name: steepest_descent, max_iterations: 7, backtracking_factor: 0.3}\n"))
-    assert run.solver == SteepestDescent(max_iterations=7, backtracking_factor=0.3)
-
-
 def test_paths_are_relative_to_the_file(written, tmp_path):
     run = load_config(
         written(
@@ -83,10 +78,7 @@ def test_paths_are_relative_to_the_file(written, tmp_path):
         ("model.damping=0.1", ("model", "damping", 0.1)),
         ("model.springs.left_s1={stiffness: 20}", ("model", "springs", "left_s1", "stiffness", 20.0)),
         ("parameters.T1.bend={initial: 5, free: false}", ("parameters", "T1.bend", "free", False)),
-        (
-            "diagnosis.candidates=[density, kelvin_voigt@T3]",
-            ("diagnosis", "candidates", ("density", "kelvin_voigt@T3")),
-        ),
+        ("diagnosis.candidates=[density, gain@T3]", ("diagnosis", "candidates", ("density", "gain@T3"))),
     ],
 )
 def test_settings_over_the_file(setting, value):
@@ -102,6 +94,8 @@ def test_settings_over_the_file_keep_what_they_do_not_touch():
     assert len(run.parameters) == 6
     assert run.describe_location("parameters", "T1.bend", "initial").startswith("--set parameters.T1.bend.initial")
     assert "line" in run.describe_location("parameters", "T2.bend", "free")
+    made = load_config(None, ["parameters.T9.bend.free=true"])
+    assert made.describe_location("parameters", "T9.bend") == "--set parameters.T9.bend.free: parameters.T9.bend"
 
 
 METHOD = "compare.methods.multiple_shooting"
@@ -131,6 +125,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
             "solver: {name: steepest_descent, step_tolerance: 1}",
             ["'step_tolerance' is a key of `solver` with name: gauss_newton, multiple_shooting"],
         ),
+        ("solver: {time_step: 1}", ["there is no key 'time_step' in solver", "'time_step' is a key of `problem`"]),
         ("solver: {held_out: []}", [f"'held_out' is a key of `recordings`; {RENAMED}"]),
         ("solver: {parameters: {}}", [f"'parameters' is a key of the file itself; {RENAMED}"]),
         ("solver: {name: gauss_newton, backtracking_factor: 0.3}", ["there is no key 'backtracking_factor'"]),
@@ -142,9 +137,6 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("name: a", ["there is no key"]),
         # compared methods are typed like the solver
         (METHODS.replace("VALUE", "max_iterations: abc"), [f"{METHOD}.max_iterations", "number from 1", "line 5"]),
-        (METHODS.replace("VALUE", "max_iterations: -3"), [f"{METHOD}.max_iterations = -3", "number from 1", "line 5"]),
-        (METHODS.replace("VALUE", "max_iterations: 3.0"), ["a whole number from 1"]),
-        (METHODS.replace("VALUE", "step_tolerance: 0"), ["a number above 0"]),
         (METHODS.replace("VALUE", "max_iteration: 3"), [f"'max_iteration' in {METHOD}", "mean 'max_iterations'?"]),
         (METHODS.replace("VALUE", "first_trial_step: last"), ["no key 'first_trial_step'", "node_interval", "line 5"]),
         (METHODS.replace("VALUE", "name: multiple_shooting"), ["there is no key 'name'"]),
@@ -158,14 +150,9 @@ def test_refusals(written, text, words):
         assert word in str(caught.value)
 
 
-@pytest.mark.parametrize("key", ["time_step", "use_compiler", "initial_state", "weighting"])
-def test_misplaced_keys_are_told_their_section(written, key):
-    with pytest.raises(ConfigError, match=f"there is no key '{key}' in solver") as caught:
-        load_config(written(f"solver: {{{key}: 1}}\n"))
-    assert f"'{key}' is a key of `problem`" in caught.value.hint
-
-
-def test_compared_methods(written):
+def test_the_solver_and_compared_methods(written):
+    run = load_config(written("solver: {name: steepest_descent, max_iterations: 7, backtracking_factor: 0.3}\n"))
+    assert run.solver == SteepestDescent(max_iterations=7, backtracking_factor=0.3)
     run = load_config(written(METHODS.replace("VALUE", "max_iterations: 7")))
     assert list(run.compare.methods) == ["gauss_newton", "multiple_shooting"]
     chosen = run.compare.methods["multiple_shooting"]
@@ -218,12 +205,7 @@ def test_set_replaces_lists_other_kinds_and_what_is_emptied_first(written):
         ("sensors={points: {sdt: 3}}", ["there is no key 'sdt' in sensors.points", "'std'?"]),
         ("parameters.T2.bend.free=maybe", ["true or false"]),
         ("compare.methods.gauss_newton.max_iterations=abc", ["a whole number from 1"]),
-        ("compare.methods.gauss_newton.max_iterations=0", ["a whole number from 1"]),
-        ("compare.methods.gauss_newton.max_iteration=3", ["did you mean 'max_iterations'?"]),
-        ("compare.methods.newton.max_iterations=3", ["did you mean 'gauss_newton'?"]),
-        ("solver.max_iterations=-3", ["a whole number from 1"]),
         ("solver.time_step=0.01", ["'time_step' is a key of `problem`"]),
-        ("problem.time_stp=0.01", ["did you mean 'time_step'?"]),
         ("problem.time_step=fast", ["a number"]),
         ("parameters.shoulder.stiffness.initail=3", ["did you mean 'parameters.shoulder.stiffness.initial'?"]),
         ("problem.time_step.deeper=1", ["no keys below 'deeper'"]),
@@ -236,11 +218,6 @@ def test_what_is_set_wrong_is_told_with_the_nearest_key(written, setting, words)
         load_config(written(SET), [setting])
     for word in (*words, f"--set {setting.split('=')[0]}"):
         assert word in str(caught.value)
-
-
-def test_a_section_that_set_makes_says_where_it_comes_from(written):
-    run = load_config(written(SET), ["parameters.T9.bend.free=true"])
-    assert run.describe_location("parameters", "T9.bend") == "--set parameters.T9.bend.free: parameters.T9.bend"
 
 
 # Numbers that may have any value: places, angles, offsets.
@@ -350,17 +327,9 @@ ALIASES = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
         ('description: "a\\0b"', "NUL"),
         ("? [a, b]\n: 3", "no key"),
         ("a: 1\n---\nb: 2", "not valid YAML"),
+        ("problem:\n  <<: {time_step: 0.02}\n  use_compiler: 3\n", r"line 3: problem\.use_compiler"),
     ],
 )
-def test_odd_yaml_is_refused_at_once(tmp_path, text, said):
-    file = tmp_path / "odd.yaml"
-    file.write_text(text, encoding="utf-8")
+def test_odd_yaml_is_refused_at_once(written, text, said):
     with pytest.raises(ConfigError, match=said):
-        load_config(file)
-
-
-def test_merged_sections_have_their_lines(tmp_path):
-    file = tmp_path / "merged.yaml"
-    file.write_text("problem:\n  <<: {time_step: 0.02}\n  use_compiler: 3\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"line 3: problem\.use_compiler"):
-        load_config(file)
+        load_config(written(text))

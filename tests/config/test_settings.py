@@ -72,18 +72,13 @@ def test_the_schema_accepts_every_configuration(repository, rules):
     ("data", "valid"),
     [
         ({"sovler": {}}, False),
-        ({"problem": {"time_step": "fast"}}, False),
         ({"problem": {"known_initial_states": {}}}, False),
         ({"model": {"object": {"kind": "cube"}}}, False),
-        ({"model": {"object": {"links": 4}}}, False),
         ({"model": {"effects": [{"kind": "density"}]}}, False),
         ({"solver": {"max_iterations": -3}}, False),
-        ({"solver": {"backtracking_factor": 0.3}}, False),
         ({"solver": {"name": "multiple_shooting", "first_trial_step": "last"}}, False),
-        ({"compare": {"methods": {"gauss_newton": {"max_iterations": "abc"}}}}, False),
         ({"compare": {"methods": {"newton": {}}}}, False),
         ({"solver": {"name": "steepest_descent", "backtracking_factor": 0.3}}, True),
-        ({"solver": {"max_iterations": 3}}, True),
         ({"compare": {"methods": {"gauss_newton": {"max_iterations": 3}, "multiple_shooting": {}}}}, True),
         ({"model": {"object": None}}, True),
     ],
@@ -136,6 +131,4 @@ def test_no_section_repeats_the_options_of_another_package():
 
 def test_an_empty_file_is_all_defaults(written):
     run = load_config(written(""))
-    assert run.model.object is None
-    assert run.model.damping == 0.05
-    assert run.solver == GaussNewton()
+    assert (run.model.object, run.model.damping, run.solver) == (None, 0.05, GaussNewton())

@@ -23,6 +23,7 @@ from yid_ocp.model import System
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.progress import Progress
 from yid_ocp.workflow.diagnose import JsonRefitStore, _with_noise_only_stds, run_diagnose
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
@@ -54,15 +55,11 @@ def counting(patch):
     return calls
 
 
-class Interrupting:
+class Interrupting(Progress):
     """Progress that presses Ctrl-C after so many refits."""
 
     def __init__(self, after: int) -> None:
         self.left = after
-
-    def begin_stage(self, text: str) -> None: ...
-
-    def report_iterate(self, entry) -> None: ...
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         self.left -= text.startswith("refitted")

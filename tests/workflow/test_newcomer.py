@@ -1,20 +1,167 @@
-"""A new user: a bag of an arm with something flexible in its hand, commands in order, no edit of what they write."""
+"""A new user: a bag of an arm with something flexible in its hand, commands in order, no edit of what they write.
+
+The bag comes from MuJoCo, its chain finer than any model's.
+"""
 
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from made_newcomer import PANDA, SERVO, SERVOS, UR5, write_mcap
 
 from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
-from yid_ocp.virtual.joint_motion import MultisineOptions
+from yid_ocp.data.recording import PointGroup, Recording
+from yid_ocp.virtual.experiment import ArmSensorNoise, PointCamera, VirtualExperiment, run_virtual_experiment
+from yid_ocp.virtual.joint_motion import MultisineOptions, random_multisine_motion
+from yid_ocp.virtual.mujoco_simulation import SimulationOptions
+from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import load_problem
+
+START = 1_700_000_000 * 10**9
+CURVED = "stiffness_per_curvature: true, clamped_at_base: true"
+
+MODEL = """\
+model:
+  robot: {robot}
+  arms: {arms}
+  object:
+    kind: segments
+    mount: {{parent_frame: {frame}}}
+    segments:
+{segments}
+  damping: {damping}
+  points: [{points}]
+  effects: [{effects}]
+parameters: {{{parameters}}}
+"""
+
+
+@dataclass(frozen=True)
+class Newcomer:
+    """A robot with something flexible in its hand, as it is in truth."""
+
+    links: int
+    settings: Mapping[str, str]  # of `MODEL` but for the segments
+    parameters: Mapping[str, float]
+    segments: Mapping[str, str]  # settings of each, without the number of links
+    posture: Mapping[str, float]
+    points: Mapping[str, str]  # what the user calls them, by frame
+    truth: Mapping[str, float]
+
+    def text(self, links: int) -> str:
+        shapes = (f"      {n}: {{{s}, links: {links or self.links}, joint_axes: xy}}" for n, s in self.segments.items())
+        values = ", ".join(f'"{name}": {{initial: {value}}}' for name, value in self.parameters.items())
+        named = {"points": ", ".join(f'"{name}"' for name in self.points), "effects": "", "segments": "\n".join(shapes)}
+        return MODEL.format(**named | dict(self.settings), parameters=values)
+
+    def simulate(
+        self, folder: Path, seed: int, duration: float, excitation: MultisineOptions | None = None, links: int = 0
+    ) -> Recording:
+        """Joints at 100 Hz without efforts, points at 50 Hz to half a millimetre under names of their own."""
+        file = folder / "truth.yaml"
+        file.write_text(self.text(links))
+        system = build_system(load_config(file))
+        excitation = excitation or MultisineOptions(max_joint_speed=1.0, duration=duration, frequency_band=(0.3, 1.5))
+        start = {"initial_joint_angles": self.posture, "seed": seed}
+        seen = {"point_std": 5e-4, "frame_rate": 50.0, "has_dropouts": False, "hidden_probability": 0.0}
+        experiment = VirtualExperiment(
+            motion=random_multisine_motion(system, None, excitation=excitation, **start),
+            simulation=SimulationOptions(duration, time_step=2e-4),
+            arm_noise=ArmSensorNoise(position_std=1e-4),
+            camera=PointCamera(pose=np.eye(4), **seen),
+            **start,
+        )
+        made = run_virtual_experiment(system, None, experiment)
+        [group] = made.points
+        names = tuple(self.points[name] for name in group.names)
+        points = (PointGroup("points", names, group.t, group.position, None, "mocap"),)
+        return Recording(made.joints, points, name="run")
+
+
+UR5 = Newcomer(
+    16,
+    {"robot": "package:ur5", "arms": "{mode: driven}", "frame": "tool0",
+     "damping": "{shoulder_pan_joint: 0.1, object: 5.0e-4}"},
+    {"cable.bend": 0.03},
+    {"cable": f"length: 1.0, mass: 0.1, radius: 0.005, {CURVED}"},
+    {"shoulder_pan_joint": 0.3, "shoulder_lift_joint": -1.2, "elbow_joint": 1.6, "wrist_1_joint": -1.9708,
+     "wrist_2_joint": -1.5708, "wrist_3_joint": 0.0},
+    {"w_cable": "tip", "cable:50%": "middle"},
+    {"cable.bend": 0.03, "cable.damping": 5e-4},
+)  # fmt: skip
+PANDA_JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
+PANDA_TRUTH = {"b1.bend": 0.10, "b2.bend": 0.15, "b3.bend": 0.20, "b4.bend": 0.25}
+PANDA = Newcomer(
+    10,
+    {"robot": "package:panda", "frame": "panda_link8", "damping": "{panda_joint1: 0.1, object: 2.0e-3}",
+     "arms": f"{{mode: driven, joints: [{', '.join(PANDA_JOINTS)}], exclude_links: [panda_hand]}}"},
+    PANDA_TRUTH,
+    {f"b{i + 1}": f"length: 0.4, mass: 0.03, radius: 0.004, {CURVED}, rpy: [0.0, 1.5707963, {round(1.5707963 * i, 7)}]"
+     for i in range(4)},
+    dict(zip(PANDA_JOINTS, (0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8), strict=True)),
+    {f"w_b{i}": f"marker_{i}" for i in range(1, 5)},
+    PANDA_TRUTH,
+)  # fmt: skip
+SERVO_POSTURE = {"pan": 0.0, "lift": 0.4, "elbow": 1.0, "wrist_flex": 0.3, "wrist_roll": 0.0}
+SERVO_VALUES = {"gain": 45.0, "damping": 2.0, "delay": 0.03}
+SERVO = Newcomer(
+    12,
+    {"robot": "default:servo_arm.urdf", "arms": "{mode: servo}", "frame": "gripper",
+     "damping": "{pan: 0.05, object: 4.0e-4}",
+     "effects": ", ".join(f"{{kind: rotor_inertia, location: {joint}, values: {{armature: 0.01}}}}"
+                          for joint in SERVO_POSTURE)},
+    {"rod.bend": 0.03, **{f"*.servo_{name}": value for name, value in SERVO_VALUES.items()}},
+    {"rod": f"length: 0.4, mass: 0.04, radius: 0.003, {CURVED}"},
+    SERVO_POSTURE,
+    {"w_rod": "tip", "rod:50%": "middle"},
+    {"cable.bend": 0.03, "cable.damping": 4e-4},
+)  # fmt: skip
+SERVOS = {
+    f"{joint}.servo_{name}": value for joint in ("lift", "elbow", "wrist_flex") for name, value in SERVO_VALUES.items()
+}
+
+
+def write_mcap(recording: Recording, folder: Path) -> Path:
+    """A bag with the joints on one topic, their commands on another, every point on its own, and one nobody needs."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types: Any = store.types
+    joints = recording.joints
+    assert joints is not None
+
+    def header(t: float, frame: str) -> Any:
+        stamp = types["builtin_interfaces/msg/Time"](*divmod(START + round(1e9 * t), 10**9))
+        return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
+
+    messages: list[tuple[float, str, str, Any]] = []
+    none = np.zeros(0)
+    for topic, rows in (("/joint_states", joints.position), ("/joint_commands", joints.position_command)):
+        for t, row in zip(joints.t, () if rows is None else rows, strict=False):
+            state = types["sensor_msgs/msg/JointState"](header(t, ""), list(joints.names), row, none, none)
+            messages.append((t, topic, "sensor_msgs/msg/JointState", state))
+    for group in recording.points:
+        for t, row in zip(group.t, group.position, strict=True):
+            for name, place in zip(group.names, row, strict=True):
+                point = types["geometry_msgs/msg/Point"](*place)
+                stamped = types["geometry_msgs/msg/PointStamped"](header(t, "world"), point)
+                messages.append((t, f"/mocap/{name}", "geometry_msgs/msg/PointStamped", stamped))
+    messages.append((0.0, "/note", "std_msgs/msg/String", types["std_msgs/msg/String"]("hello")))
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for t, topic, kind, message in sorted(messages, key=lambda entry: entry[0]):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], START + round(1e9 * t), store.serialize_cdr(message, kind))
+    return folder / f"{folder.name}.mcap"
+
 
 UR5_NUMBERS = ("--object", "cable", "--length", "1", "--mass", "0.1", "--radius", "0.005")
 ROD_NUMBERS = ("--object", "cable", "--length", "0.4", "--mass", "0.04", "--radius", "0.003", "--links", "12")
@@ -30,10 +177,8 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def carried_out(name: str, *words: str) -> dict[str, Any]:
-    """Run a command into the folder `name`; contents of its result, and how long it took."""
-    begun = time.process_time()
+    """Run a command into the folder `name`; contents of its result."""
     assert main([*words, "--out", name]) == 0
-    print(f"{words[0]}: {time.process_time() - begun:.1f} s of CPU")
     file = Path(name) / "result.json"
     return json.loads(file.read_text()) if file.is_file() else {}
 
@@ -72,8 +217,7 @@ def test_a_cable_on_a_ur5(desk: Path) -> None:
     carried_out("run.h5", "import", str(bag), "--sensor", "mocap")
     carried_out("cable.yaml", "init", "package:ur5", "run.h5", *UR5_NUMBERS)
     checked = carried_out("checked", "check", "cable.yaml")
-    assert not checked["warnings"]
-    assert not checked["doubts"]
+    assert not checked["warnings"] + checked["doubts"]
     check_truth(carried_out("solved", "solve", "cable.yaml"), UR5.truth)
 
 
@@ -83,8 +227,7 @@ def test_a_cross_on_a_panda(desk: Path) -> None:
     bag = write_mcap(PANDA.simulate(desk, 3, 2.5), desk / "run")
     carried_out("cross.yaml", "init", "package:panda", str(bag), *CROSS_NUMBERS, "--holder", "panda_link8")
     checked = carried_out("checked", "check", "cross.yaml")
-    assert not checked["warnings"]
-    assert not checked["doubts"]
+    assert not checked["warnings"] + checked["doubts"]
     check_truth(carried_out("solved", "solve", "cross.yaml"), PANDA.truth)
 
 

@@ -40,7 +40,9 @@ def test_a_folder_appears_when_the_block_ends_and_not_when_it_is_left_by_an_erro
 def test_begin_and_finish_say_what_a_result_was_made_from(settings, pendulum_data, tmp_path):
     with atomic_run_folder(settings, tmp_path / "run") as folder:
         folder.record_run_start(settings, "test")
+        many = folder.write_result({name: {"std": math.inf} for name in "abcd"} | {"z": {"std": math.nan}})
         written = folder.write_result({"format": "x", "value": math.inf, "deep": {"list": [1.0, math.nan]}})
+    assert many["notes"] == ["std is infinite (4 times)", "z.std is not known"]
     assert load_config(tmp_path / "run" / "config.yaml").solver == settings.solver
     assert json.loads((tmp_path / "run" / "result.json").read_text(), parse_constant=pytest.fail) == written
     assert written["value"] is None
@@ -51,12 +53,6 @@ def test_begin_and_finish_say_what_a_result_was_made_from(settings, pendulum_dat
     assert "numpy" in written["versions"]
     (line,) = (json.loads(text) for text in (tmp_path / "run" / "log.jsonl").read_text().splitlines())
     assert (line["event"], line["command"], line["inputs"]) == ("start", "test", written["inputs"])
-
-
-def test_many_notes_on_one_key_are_one(settings, tmp_path):
-    with atomic_run_folder(settings, tmp_path / "run") as folder:
-        written = folder.write_result({name: {"std": math.inf} for name in "abcd"} | {"z": {"std": math.nan}})
-    assert written["notes"] == ["std is infinite (4 times)", "z.std is not known"]
 
 
 def test_messages_of_the_library_are_logged_while_the_folder_is_made(settings, tmp_path):
