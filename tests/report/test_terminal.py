@@ -224,8 +224,5 @@ def test_a_diagnosis_writes_a_vanishing_p_value_as_a_bound():
     assert "tau unknown" in line_of(refitted, "kelvin_voigt@T1")
     assert not any("yid-ocp plan" in line for line in lines)
     section = {"goal": "information", "discriminate": ["density@T3", "point_mass@w_T3"], "parameter_run": "runs/mine"}
-    said = told("yid-diagnosis/2", result | {"next_plan": section})
-    assert line_of([line.strip() for line in said], "yid-ocp plan").split() == [
-        "yid-ocp", "plan", "runs/mine/config.yaml", "--set", "plan.goal=information", "--set",
-        "'plan.discriminate=[density@T3,", "point_mass@w_T3]'", "--set", "plan.parameter_run=runs/mine",
-    ]  # fmt: skip
+    command = next(line for line in told("yid-diagnosis/2", result | {"next_plan": section}) if "yid-ocp plan" in line)
+    assert "'plan.discriminate=[density@T3, point_mass@w_T3]'" in command
