@@ -13,8 +13,6 @@ import pytest
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, _Overspeed
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
-from yid_ocp.report import figures
-from yid_ocp.report.figures import RankedCandidate, TimeHeatMapRow, TimePlotData, ValueBeforeAfter
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
 from yid_ocp.workflow.build_problem import load_problem
@@ -98,53 +96,6 @@ def test_a_result_alone_gives_words_and_tables(found, tmp_path):
     assert '<div class="plot"' not in page
 
 
-# -- figures ----------------------------------------------------------------------------------------------------------
-
-
-def test_changes_of_very_different_sizes_get_a_logarithmic_axis():
-    close = figures.values_before_after_figure(
-        {"a": ValueBeforeAfter(2.0, 1.0), "b": ValueBeforeAfter(3.0, None, reference=1.0)}, "x [m]", ("1", "2", "3")
-    )
-    far = figures.values_before_after_figure(
-        {"a": ValueBeforeAfter(20.0, 0.1), "b": ValueBeforeAfter(3.0, 1.0)}, "x [m]", ("1", "2", "3")
-    )
-    assert (close.layout.xaxis.type, far.layout.xaxis.type) == (None, "log")
-    assert [trace.name for trace in close.data[1:]] == ["1", "2", "3"]
-    # bars of what cannot be told do not widen the axis
-    unsure = {"a": ValueBeforeAfter(2.0, 1.0, float("inf"), 1e7)}
-    figure = figures.values_before_after_figure(unsure, "x", ("1", "2", ""))
-    assert figure.layout.xaxis.range[1] < 3.0
-    assert figure.data[1].error_x.array is None
-    assert figure.data[2].error_x.array == (2e7,)
-
-
-def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
-    values = np.array([1.0, np.nan, -4000.0])
-    rows = [TimeHeatMapRow(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
-    figure = figures.time_heat_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
-    heat = figure.data[0]
-    assert heat.z[0][1] is None
-    assert heat.zmax == -heat.zmin > 0
-    assert len(heat.x) == 4
-    assert "1000" in heat.colorbar.ticktext
-    assert [a.text for a in figure.layout.annotations] == ["color: deviations", "a", "b"]
-    assert len(figure.layout.shapes) == 1
-
-
-def test_a_ranking_says_what_lies_beyond_its_axis():
-    entries = [
-        RankedCandidate("good", (90.0, 80.0, 95.0), 88.0),
-        RankedCandidate("bad", (-900.0, -2000.0, -100.0), 1.0),
-    ]
-    figure = figures.candidate_ranking_figure(
-        [*entries, RankedCandidate("untried", None, 0.5)], "closed [%]", "promised [%]"
-    )
-    assert [a.text for a in figure.layout.annotations] == ["◀ -900"]
-    assert figure.layout.yaxis.categoryarray == ("untried", "bad", "good")
-    alone = figures.candidate_ranking_figure([RankedCandidate("untried", None, 0.5)], "closed", "promised")
-    assert [trace.type for trace in alone.data] == ["bar"]
-
-
 def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     t = np.linspace(0, 2, 21)
     pulse = DetectedForcePulse(0.5, 1.0, 0.7, False, 0.05, 1e-9)
@@ -160,10 +111,3 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     assert f"{pulse.impulse:.3g} ± {0.0125:.2g}" in text
     assert "From 1.5 s on nothing is judged in run" in text
     assert 'id="events"' not in page_of(found["no_gap"], tmp_path / "plain.html")
-
-
-def test_bands_and_spans_are_shaded():
-    t = np.linspace(0, 3, 31)
-    plots = [TimePlotData("a", {"line": (t, t)}, t, t, 0.2, [(1.0, 2.0)])]
-    band, span = figures.time_plots_figure(plots, "#000000", {"line": "blue"}).layout.shapes
-    assert (band.y0, band.y1, span.x0, span.x1) == (-0.2, 0.2, 1.0, 2.0)

@@ -10,12 +10,10 @@ import re
 import sys
 from dataclasses import replace
 
-import numpy as np
 import plotly.offline
 import pytest
 
 from yid_ocp.errors import OutputError
-from yid_ocp.report import figures
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData
 from yid_ocp.workflow.solve import solve_result
@@ -117,20 +115,3 @@ def test_without_the_extra_there_is_a_notice_and_no_report(solved_pendulum, tmp_
 def test_a_report_that_cannot_be_written(solved_pendulum, tmp_path):
     with pytest.raises(OutputError, match="does not exist"):
         write_report(tmp_path / "no" / "r.html", findings(solved_pendulum))
-
-
-def test_long_curves_are_thinned_and_gaps_stay():
-    t = np.linspace(0.0, 10.0, 50_000)
-    measured = np.sin(t)
-    measured[:10_000] = np.nan
-    figure = figures.time_plots_figure(
-        figures.prediction_and_residual_plots("x", "m", t, measured, 0 * t + 1e-3, {"predicted": np.sin(t)})
-    )
-    assert max(len(trace.x) for trace in figure.data) <= figures._MAX_CURVE_POINTS
-    assert np.isnan(figure.data[0].y[0])
-
-
-def test_cost_history_has_a_curve_for_each_horizon():
-    figure = figures.cost_history_figure([5.0, 3.0, 9.0, 2.0], ["first 1 s", "first 1 s", "", ""])
-    assert [trace.name for trace in figure.data] == ["first 1 s", "whole recordings"]
-    assert [list(trace.x) for trace in figure.data] == [[0, 1], [2, 3]]

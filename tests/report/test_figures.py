@@ -1,0 +1,251 @@
+"""Stick figures and what was measured beside them, sparsity patterns, and figures of a page."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
+from yid_ocp.data import JointGroup, PointGroup, Recording
+from yid_ocp.effects import make_effect
+from yid_ocp.errors import OutputError
+from yid_ocp.model.flexible import Segment, flexible_object
+from yid_ocp.model.kinematics import forward_kinematics
+from yid_ocp.model.system import System
+from yid_ocp.report import figures
+from yid_ocp.report.animation import ModelTrajectory, make_animation, recording_animation
+from yid_ocp.report.figures import RankedCandidate, TimeHeatMapRow, TimePlotData, ValueBeforeAfter
+from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
+
+# -- in motion ---------------------------------------------------------------------------------------------------------
+
+
+def point(system: System, name: str, q: np.ndarray) -> np.ndarray:
+    symbols = ca.SX.sym("q", system.n_coordinates)
+    place = forward_kinematics(system.mechanism, symbols).frame_position(name)
+    found = ca.Function("place", [symbols, system.parameters.symbols], [place])
+    return np.array(found(q, system.parameters.vector())).ravel()
+
+
+def animated(system: System, q: np.ndarray):
+    told = ModelTrajectory("predicted", system, system.parameters.vector(), np.arange(len(q)), q)
+    return make_animation("a", [told]).motions[0]
+
+
+def test_places_are_those_of_the_model_and_sticks_its_links(single_arm):
+    postures = np.random.default_rng(0).uniform(-0.5, 0.5, size=(3, single_arm.n_coordinates))
+    motion = animated(single_arm, postures)
+    assert set(motion.point_indices) == set(single_arm.point_frames)
+    for name, k in motion.point_indices.items():
+        for q, now in zip(postures, motion.positions, strict=True):
+            np.testing.assert_allclose(now[k], point(single_arm, name, q), atol=1e-12)
+    is_object = np.array([stick.is_object_part for stick in motion.sticks])
+    a, b = np.transpose([stick.end_indices for stick in motion.sticks])
+    lengths = np.linalg.norm(motion.positions[:, a] - motion.positions[:, b], axis=2)
+    links = sorted(4 * [0.813 / 4] + 4 * [0.610 / 4] + 4 * [0.737 / 4])
+    np.testing.assert_allclose(sorted(lengths[0, is_object]), links, atol=1e-9)
+    radii = {stick.radius for stick in motion.sticks if stick.is_object_part}
+    assert sorted(radii) == pytest.approx([0.019, 0.025, 0.032])
+    assert np.count_nonzero(~is_object) >= 6
+    assert np.ptp(lengths, axis=0).max() < 1e-9  # rigid, whatever the posture
+
+
+def test_what_an_effect_puts_under_the_object_is_no_arm():
+    bare = System.build(objects=[(flexible_object([Segment("rod", 0.4, 0.1, 0.01, links=2)]), None, None)])
+    system = bare.with_effects([make_effect("mount_compliance", "base", bare, {"stiffness": 12.0})])
+    assert any("@" in name for name in system.mechanism.joint_names)
+    sticks = animated(system, np.zeros((1, system.n_coordinates))).sticks
+    assert [stick.is_object_part for stick in sticks] == [True, True]
+
+
+def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
+    n, t = single_arm.n_coordinates, np.linspace(0.0, 2.0, 401)
+    q = 0.1 * np.sin(t)[:, None] * np.ones(n)
+    at = [single_arm.mechanism.joint_index(name) for name in single_arm.driven]
+    joints = JointGroup(tuple(single_arm.driven), t, q[:, at] + 0.01)
+    seldom = np.array([0.5, 1.0, 1.5])
+    seen = np.arange(9.0).reshape(3, 1, 3)
+    seen[1] = np.nan
+    recording = Recording(joints, (PointGroup("camera", ("w_T1",), seldom, seen),), name="a")
+    told = ModelTrajectory("predicted", single_arm, single_arm.parameters.vector(), t, q)
+    made = make_animation("a", [told], recording)
+    assert [motion.name for motion in made.motions] == ["predicted", "measured"]
+    assert len(made.t) == 150
+    predicted, measured = made.motions
+    assert measured.sticks
+    assert not any(stick.is_object_part for stick in measured.sticks), "an object's shape is not measured"
+    k = measured.point_indices["w_T1"]
+    shown = np.isfinite(measured.positions[:, k]).all(axis=1)
+    # half a period about every frame in which it was seen
+    near = np.minimum(np.abs(made.t - 0.5), np.abs(made.t - 1.5))
+    sure = np.abs(near - 0.25) > 1e-3
+    np.testing.assert_array_equal(shown[sure], near[sure] <= 0.25)
+    # it is a measurement of one moment alone
+    np.testing.assert_array_equal(measured.is_new_measurement[:, 0], near <= 0.5 * np.median(np.diff(made.t)))
+    np.testing.assert_array_equal(measured.positions[np.argmin(abs(made.t - 0.5)), k], seen[0, 0])
+    arm, recorded = measured.sticks[0].end_indices[1], np.where(np.isin(np.arange(n), at), q[:1] + 0.01, q[:1])
+    moved = animated(single_arm, recorded).positions
+    np.testing.assert_allclose(measured.positions[0, arm], moved[0, arm], atol=1e-9)
+    page = made.to_dict()
+    assert page["motions"][1]["places"][0][3 * k] is None
+    first = np.array(page["motions"][0]["places"][0]).reshape(-1, 3) / page["scale"]
+    np.testing.assert_allclose(first, predicted.positions[0], atol=0.51 / page["scale"])
+
+
+def test_a_recording_alone_is_a_scene_where_it_has_places(single_arm):
+    t = np.array([0.0, 0.1, 0.2])
+    points = PointGroup("camera", ("w_T1",), t, np.ones((3, 1, 3)))
+    theta = single_arm.parameters.vector()
+    alone = recording_animation("a", single_arm, theta, Recording(None, (points,), name="a"))
+    assert [motion.name for motion in alone.motions] == ["measured"]
+    other = JointGroup(("elsewhere",), t, np.zeros((3, 1)))
+    assert recording_animation("a", single_arm, theta, Recording(other, (), name="a")) is None
+
+
+# -- sparsity patterns -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Figures that were saved."""
+    figures, save = [], Figure.savefig
+
+    def keep(self, *arguments, **settings):
+        figures.append(self)
+        return save(self, *arguments, **settings)
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return figures
+
+
+def pattern(height=6, width=8, **more):
+    mask = np.random.default_rng(0).random((height, width)) < 0.4
+    ends = {"del": (0, height - 2), "internal": (height - 2, height - 2), "constraint": (height - 2, height)}
+    rows = tuple(NamedIndexRange(name, *own) for name, own in ends.items())
+    columns = (NamedIndexRange("q1", 0, width - 3), NamedIndexRange("lam", width - 3, width))
+    row_labels = (*(f"T{1 + i // 3}_{i % 3}_x" for i in range(height - 2)), "left.x", "left.y")
+    column_labels = (*(f"T{1 + i // 3}_{i % 3}_x" for i in range(width - 3)), "left.x", "left.y", "left.z")
+    return SparsityPattern("dR_dy", "a step", mask, rows, columns, row_labels, column_labels, **more)
+
+
+def shown(axes):
+    return np.array(axes.images[0].get_array())
+
+
+def test_a_picture_shows_the_pattern_with_its_names(drawn, tmp_path):
+    entry = pattern()
+    marked = np.arange(6)[:, None] < 2
+    other = pattern(marked_mask=np.broadcast_to(marked, entry.nonzero_mask.shape), mark_label="not zero at the rest")
+    draw_sparsity_patterns(tmp_path / "p.png", [[entry, other]])
+    assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
+    axes, beside = drawn[0].get_axes()
+    np.testing.assert_array_equal(shown(axes) > 0, entry.nonzero_mask)
+    assert [label.get_text() for label in axes.get_xticklabels()] == list(entry.column_labels)
+    assert [label.get_text() for label in axes.get_yticklabels()] == list(entry.row_labels)
+    np.testing.assert_array_equal(axes.get_yticks(), np.arange(6))
+    lines = [line.get_xydata() for line in axes.lines]
+    across = [float(line[0, 1]) for line in lines if line[0, 1] == line[1, 1]]
+    along = [float(line[0, 0]) for line in lines if line[0, 0] == line[1, 0]]
+    # an empty block has no line of its own
+    assert (across, along) == ([3.5], [4.5])
+    top, right = axes.child_axes
+    assert [label.get_text() for label in top.get_xticklabels()] == ["q1", "lam"]
+    assert list(top.get_xticks()) == [2.0, 6.0]
+    assert [label.get_text() for label in right.get_yticklabels()] == ["del", "constraint"]
+    assert axes.get_title() == f"a step\n6 x 8, {entry.n_nonzeros} entries can differ from zero"
+    np.testing.assert_array_equal(shown(beside) == 2, entry.nonzero_mask & marked)
+    np.testing.assert_array_equal(shown(beside) > 0, entry.nonzero_mask)
+    assert beside.get_title().endswith(f"dark: {np.count_nonzero(entry.nonzero_mask & marked)} not zero at the rest")
+
+
+def test_many_rows_share_the_label_of_their_owner(drawn, tmp_path):
+    height = _MAX_SINGLE_LABELS + 9
+    draw_sparsity_patterns(tmp_path / "p.png", [[pattern(height)]])
+    (axes,) = drawn[0].get_axes()
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    owners = [f"T{1 + i // 3}" for i in range(height - 2)]
+    assert labels == [*dict.fromkeys(owners), "left"]
+    # three rows of T1, then of T2, ...: in the middle of each
+    assert list(axes.get_yticks())[:2] == [1.0, 4.0]
+    assert axes.get_yticks()[-1] == height - 1.5
+
+
+def test_patterns_stand_beside_each_other_and_empty_ones_are_left_out(drawn, tmp_path):
+    empty = pattern()
+    empty = SparsityPattern("B_u", "no torque", np.zeros((6, 0), bool), empty.row_blocks, (), empty.row_labels, ())
+    draw_sparsity_patterns(tmp_path / "p.png", [[pattern(), pattern(6, 12)], [empty], [pattern(9, 5), empty]])
+    assert [shown(axes).shape for axes in drawn[0].get_axes()] == [(6, 8), (6, 12), (9, 5)]
+
+
+def test_a_picture_that_cannot_be_written_is_said(tmp_path):
+    with pytest.raises(OutputError, match="cannot be written") as caught:
+        draw_sparsity_patterns(tmp_path / "nowhere" / "p.png", [[pattern()]])
+    assert str(tmp_path / "nowhere") in str(caught.value.where)
+
+
+# -- of a page ---------------------------------------------------------------------------------------------------------
+
+
+def test_changes_of_very_different_sizes_get_a_logarithmic_axis():
+    def drawn(**rows):
+        return figures.values_before_after_figure(rows, "x [m]", ("1", "2", "3"))
+
+    close = drawn(a=ValueBeforeAfter(2.0, 1.0), b=ValueBeforeAfter(3.0, None, reference=1.0))
+    far = drawn(a=ValueBeforeAfter(20.0, 0.1), b=ValueBeforeAfter(3.0, 1.0))
+    assert (close.layout.xaxis.type, far.layout.xaxis.type) == (None, "log")
+    assert [trace.name for trace in close.data[1:]] == ["1", "2", "3"]
+    # bars of what cannot be told do not widen the axis
+    figure = drawn(a=ValueBeforeAfter(2.0, 1.0, float("inf"), 1e7))
+    assert figure.layout.xaxis.range[1] < 3.0
+    assert figure.data[1].error_x.array is None
+    assert figure.data[2].error_x.array == (2e7,)
+
+
+def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
+    values = np.array([1.0, np.nan, -4000.0])
+    rows = [TimeHeatMapRow(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
+    figure = figures.time_heat_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
+    heat = figure.data[0]
+    assert heat.z[0][1] is None
+    assert heat.zmax == -heat.zmin > 0
+    assert len(heat.x) == 4
+    assert "1000" in heat.colorbar.ticktext
+    assert [a.text for a in figure.layout.annotations] == ["color: deviations", "a", "b"]
+    assert len(figure.layout.shapes) == 1
+
+
+def test_a_ranking_says_what_lies_beyond_its_axis():
+    tried = {"good": (90.0, 80.0, 95.0), "bad": (-900.0, -2000.0, -100.0)}
+    untried = RankedCandidate("untried", None, 0.5)
+    entries = [*(RankedCandidate(name, closed, 1.0) for name, closed in tried.items()), untried]
+    figure = figures.candidate_ranking_figure(entries, "closed [%]", "promised [%]")
+    assert [a.text for a in figure.layout.annotations] == ["◀ -900"]
+    assert figure.layout.yaxis.categoryarray == ("untried", "bad", "good")
+    alone = figures.candidate_ranking_figure([untried], "closed", "promised")
+    assert [trace.type for trace in alone.data] == ["bar"]
+
+
+def test_bands_and_spans_are_shaded():
+    t = np.linspace(0, 3, 31)
+    plots = [TimePlotData("a", {"line": (t, t)}, t, t, 0.2, [(1.0, 2.0)])]
+    band, span = figures.time_plots_figure(plots, "#000000", {"line": "blue"}).layout.shapes
+    assert (band.y0, band.y1, span.x0, span.x1) == (-0.2, 0.2, 1.0, 2.0)
+
+
+def test_long_curves_are_thinned_and_gaps_stay():
+    t = np.linspace(0.0, 10.0, 50_000)
+    measured = np.sin(t)
+    measured[:10_000] = np.nan
+    figure = figures.time_plots_figure(
+        figures.prediction_and_residual_plots("x", "m", t, measured, 0 * t + 1e-3, {"predicted": np.sin(t)})
+    )
+    assert max(len(trace.x) for trace in figure.data) <= figures._MAX_CURVE_POINTS
+    assert np.isnan(figure.data[0].y[0])
+
+
+def test_cost_history_has_a_curve_for_each_horizon():
+    figure = figures.cost_history_figure([5.0, 3.0, 9.0, 2.0], ["first 1 s", "first 1 s", "", ""])
+    assert [trace.name for trace in figure.data] == ["first 1 s", "whole recordings"]
+    assert [list(trace.x) for trace in figure.data] == [[0, 1], [2, 3]]
