@@ -16,7 +16,7 @@ from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.report import figures
 from yid_ocp.report.animation import ModelTrajectory, make_animation, recording_animation
-from yid_ocp.report.figures import RankedCandidate, TimeHeatMapRow, TimePlotData, ValueBeforeAfter
+from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
 
 # -- in motion ---------------------------------------------------------------------------------------------------------
@@ -217,13 +217,12 @@ def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
 
 
 def test_a_ranking_says_what_lies_beyond_its_axis():
-    tried = {"good": (90.0, 80.0, 95.0), "bad": (-900.0, -2000.0, -100.0)}
-    untried = RankedCandidate("untried", None, 0.5)
-    entries = [*(RankedCandidate(name, closed, 1.0) for name, closed in tried.items()), untried]
+    untried = {"untried": (None, 0.5)}
+    entries = {"good": ((90.0, 80.0, 95.0), 88.0), "bad": ((-900.0, -2000.0, -100.0), 1.0)} | untried
     figure = figures.candidate_ranking_figure(entries, "closed [%]", "promised [%]")
     assert [a.text for a in figure.layout.annotations] == ["◀ -900"]
     assert figure.layout.yaxis.categoryarray == ("untried", "bad", "good")
-    alone = figures.candidate_ranking_figure([untried], "closed", "promised")
+    alone = figures.candidate_ranking_figure(untried, "closed", "promised")
     assert [trace.type for trace in alone.data] == ["bar"]
 
 

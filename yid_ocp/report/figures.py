@@ -482,28 +482,21 @@ def _even(value: Any) -> Any:
     return np.arcsinh(np.asarray(value, float) / 2)
 
 
-@dataclass(frozen=True)
-class RankedCandidate:
-    """A candidate effect in a ranking."""
-
-    name: str
-    closure_interval_percent: tuple[float, float, float] | None  # what it was found to close, and its interval [%]
-    predicted_decrease: float
-
-
-def candidate_ranking_figure(entries: Sequence[RankedCandidate], closed: str, promised: str) -> Figure:
-    """Figure that ranks candidates by refitted closure (where refitted) and by first-order predicted decrease.
+def candidate_ranking_figure(
+    entries: Mapping[str, tuple[tuple[float, float, float] | None, float]], closed: str, promised: str
+) -> Figure:
+    """Figure that ranks candidates by refitted closure with its interval [%] (or None), and by predicted decrease.
 
     `closed` and `promised` are the titles of the two axes.
     """
     from plotly.subplots import make_subplots
 
-    done = {entry.name: entry.closure_interval_percent for entry in entries if entry.closure_interval_percent}
+    done = {name: closure for name, (closure, _) in entries.items() if closure}
     last = 2 if done else 1
     figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.08)
     figure = _styled_figure(100 + 28 * len(entries), "", "", base=figure)
     figure.add_bar(
-        x=[entry.predicted_decrease for entry in entries], y=[entry.name for entry in entries], orientation="h",
+        x=[decrease for _, decrease in entries.values()], y=list(entries), orientation="h",
         width=0.55, marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last,
     )  # fmt: skip
     figure.update_xaxes(title_text=promised, rangemode="tozero", row=1, col=last)
@@ -521,5 +514,5 @@ def candidate_ranking_figure(entries: Sequence[RankedCandidate], closed: str, pr
             if value < left:
                 text = f"◀ {value:.0f}"
                 figure.add_annotation(x=left, y=name, text=text, showarrow=False, xanchor="left", row=1, col=1)
-    names, ends = [entry.name for entry in entries][::-1], [-0.6, len(entries) - 0.4]
+    names, ends = list(entries)[::-1], [-0.6, len(entries) - 0.4]
     return figure.update_yaxes(type="category", categoryarray=names, categoryorder="array", automargin=True, range=ends)

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-_LegendPlace = Literal["lower right", "upper left"]
-
-
 def blind_calibration_rates(result: Mapping[str, Any]) -> dict[str, dict[float, Mapping[str, float]]]:
     """Rates by promised level of a blind validation: of intervals of effects' parameters, and of p-values."""
     labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
@@ -99,7 +96,9 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
 
 
 def _draw_rates(
-    axes: Axes, curves: Mapping[str, Mapping[float, Mapping[str, float]]], legend_place: _LegendPlace
+    axes: Axes,
+    curves: Mapping[str, Mapping[float, Mapping[str, float]]],
+    legend_place: Literal["lower right", "upper left"],
 ) -> None:
     for label, known in curves.items():
         if known:

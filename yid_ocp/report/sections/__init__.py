@@ -1,7 +1,6 @@
 """Report sections: their input data, registration and rendering; each file of this folder registers some.
 
-A section's function turns `ReportData` into what its template needs, or into None where it has nothing to say. A file
-outside the package does as well, once it is imported; its template `NAME.html` stands beside it.
+A file outside the package does as well, once it is imported; its template `NAME.html` stands beside it.
 """
 
 from __future__ import annotations
@@ -24,16 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ReportData:
-    """Input data of a report: result, problem, solution and further objects of one run.
+    """Input data of a report: `result` as in result.json, and problem, solution and further objects of one run.
 
-    Attributes
-    ----------
-    result : mapping
-        Contents of result.json; `format` says of which command.
-    animations : sequence of Animation
-        What moves, where it does not follow from `problem`, `solution` and `held_out`.
-    section_data : mapping
-        Whatever else a command's own sections need.
+    `animations` are what moves where that does not follow from `problem`, `solution` and `held_out`; `section_data` is
+    whatever else a command's own sections need.
     """
 
     name: str
@@ -47,7 +40,7 @@ class ReportData:
 
 
 _Row = TypeVar("_Row")
-_PrepareContext = Callable[[ReportData], Mapping[str, Any] | None]
+_PrepareContext = Callable[[ReportData], Mapping[str, Any] | Iterable[tuple[str, Any]] | None]
 
 
 @dataclass(frozen=True)
@@ -65,7 +58,8 @@ REPORT_SECTIONS: Registry[_ReportSection] = Registry("report section")
 def register_report_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
     """Decorator that registers a function as the section `name`, lower orders first.
 
-    What it returns is rendered by `NAME.html`, or by `figures.html` (pairs of title and figure) where there is none.
+    It returns what the template `NAME.html` needs, or pairs of title and figure, which need none; None, or no pair,
+    where it has nothing to say.
     """
 
     def enter(prepare: _PrepareContext) -> _PrepareContext:
@@ -91,6 +85,9 @@ def render_sections(findings: ReportData, environment: jinja2.Environment) -> li
     sections = {name: REPORT_SECTIONS[name] for name in REPORT_SECTIONS}
     for name, section in sorted(sections.items(), key=lambda entry: entry[1].order):
         context = section.prepare_context(findings)
+        if not isinstance(context, Mapping):
+            figures = [*(context or ())]
+            context = {"figures": figures} if figures else None
         if context is not None:
             html = environment.select_template([f"{name}.html", "figures.html"]).render(context)
             result.append({"name": name, "title": section.title, "html": html})

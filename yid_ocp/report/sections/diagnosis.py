@@ -16,7 +16,7 @@ from yid_ocp.inference.null_test import residual_channel_samples
 from yid_ocp.inference.smoother import SmootherResult
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
-from yid_ocp.report.figures import RankedCandidate, TimeHeatMapRow, TimePlotData, ValueBeforeAfter
+from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
 from yid_ocp.report.terminal import display_scale_and_unit, format_error_value_and_unit
 
@@ -27,8 +27,7 @@ _NOMINAL_LABEL, _EXTENDED_LABEL = "nominal model", "with the effects"
 _MODEL_COLORS = {_NOMINAL_LABEL: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
 _EVENT_COLORS = {
     "event": figures.AFTER_COLOR,
-    "allowed": figures.MEASURED_COLOR,
-    "allowed, other side": figures.MEASURED_COLOR,
+    **dict.fromkeys(("allowed", "allowed, other side"), figures.MEASURED_COLOR),
 }
 
 
@@ -238,20 +237,26 @@ def _recording_figures(
 
 
 def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
-    promised, percent = _promised(finding)
-    entries, done = [], []
+    # promised decrease of r'r: in per cent of its excess over noise, or as it is where there is hardly an excess
+    fit = finding.nominal_model
+    rows = np.concatenate([series.residual_indices for series in residual_channel_samples(fit.problem)])
+    excess = float(np.sum(fit.evaluation.residual[rows] ** 2)) - (len(rows) - len(fit.values))
+    percent = finding.verdict != "no_gap" and excess > 0
+    factor = 100 / excess if percent else 1.0
+    promised = {own.effect.label: factor * own.predicted_chi2_decrease for own in finding.candidate_scores}
+    entries: dict[str, tuple[tuple[float, float, float] | None, float]] = {}
     for entry in result["which"][:_MAX_CANDIDATES]:
         name, closed = f"{entry['kind']}@{entry['location']}", None
         if entry["closure"] is not None and None not in entry["closure_ci"]:
-            closed = tuple(100 * value for value in (entry["closure"], *entry["closure_ci"]))
-            done.append((name, closed))
-        entries.append(RankedCandidate(name, closed, promised.get(name, 0.0)))
+            low, high = entry["closure_ci"]
+            closed = (100 * entry["closure"], 100 * low, 100 * high)
+        entries[name] = (closed, promised.get(name, 0.0))
     if not entries:
         return None
     unit = "as a part of the excess over noise" if percent else "as a fall of the sum of squares; 7 is chance at 1 %"
     promise = f"hat each promises to first order where the model was fitted, {unit}."
     sentences = [f"W{promise}", "No candidate promised enough to be refitted."]
-    if done:
+    if done := [(name, closed) for name, (closed, _) in entries.items() if closed is not None]:
         best = sorted(done, key=lambda entry: -entry[1][0])[:3]
         said = ", ".join(f"{name} {closed:.3g} % ({low:.3g} to {high:.3g} %)" for name, (closed, low, high) in best)
         sentences = [
@@ -263,16 +268,6 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
     return _Chapter(title, sentences, [("", figures.candidate_ranking_figure(entries, *axes))])
-
-
-def _promised(finding: DiagnosisResult) -> tuple[dict[str, float], bool]:
-    """Promised decrease of r'r: in per cent of its excess over noise, or as it is where there is hardly an excess."""
-    fit = finding.nominal_model
-    rows = np.concatenate([series.residual_indices for series in residual_channel_samples(fit.problem)])
-    excess = float(np.sum(fit.evaluation.residual[rows] ** 2)) - (len(rows) - len(fit.values))
-    percent = finding.verdict != "no_gap" and excess > 0
-    factor = 100 / excess if percent else 1.0
-    return {score.effect.label: factor * score.predicted_chi2_decrease for score in finding.candidate_scores}, percent
 
 
 def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:

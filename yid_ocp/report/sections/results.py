@@ -67,7 +67,7 @@ def _result_blocks(findings: ReportData) -> tuple[list[str], list[SummaryBlock],
 
 
 @register_report_section("estimates", 10, "Estimates")
-def _estimates(findings: ReportData) -> Mapping[str, Any] | None:
+def _estimates(findings: ReportData) -> list[tuple[str, Any]]:
     """Free parameters ± 2 std, untrusted ones marked; one figure per unit."""
     result, lost = findings.result, ("not_identifiable", "not_trusted")
     rows = []
@@ -75,7 +75,7 @@ def _estimates(findings: ReportData) -> Mapping[str, Any] | None:
         if entry.get("free") and "initial" in entry:
             found = entry["verdict"] not in lost and result["status"] != "failed"
             rows.append((name, entry["unit"], (entry["value"], entry["std"], entry["initial"], found)))
-    return {"figures": figures_by_unit(rows, figures.estimates_figure)} if rows else None
+    return figures_by_unit(rows, figures.estimates_figure)
 
 
 @register_report_section("search", 40, "How it was found")
@@ -105,60 +105,57 @@ def _image_files(findings: ReportData) -> Mapping[str, Any] | None:
 
 
 @register_report_section("days", 10, "From run to run")
-def _parameter_history(findings: ReportData) -> Mapping[str, Any] | None:
+def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
     """Parameter values ± 2 std per run, of a history or a batch of one model."""
     result = findings.result if findings.result.get("format") == "yid-history/1" else findings.result.get("history")
-    if not result or result.get("format") != "yid-history/1":
-        return None
     rows = []
-    for name, entry in result["parameters"].items():
-        rows.append((name, entry["unit"], {run: (own["value"], own["std"]) for run, own in entry["values"].items()}))
-    return {"figures": figures_by_unit(rows, figures.parameter_values_by_source_figure)}
+    if result and result.get("format") == "yid-history/1":
+        for name, entry in result["parameters"].items():
+            values = {run: (own["value"], own["std"]) for run, own in entry["values"].items()}
+            rows.append((name, entry["unit"], values))
+    return figures_by_unit(rows, figures.parameter_values_by_source_figure)
 
 
 @register_report_section("methods", 10, "Methods")
-def _method_comparison(findings: ReportData) -> Mapping[str, Any] | None:
+def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
     """Estimates of every method and its cost over time."""
     comparison: MethodComparison | None = findings.section_data.get("comparison")
     if comparison is None:
-        return None
+        return
     rows = []
     for name, entry in findings.result["judged"]["parameters"].items():
         if entry["free"]:
             own = {method: e["parameters"][name] for method, e in findings.result["methods"].items()}
             rows.append((name, entry["unit"], {method: (e["value"], e["std"]) for method, e in own.items()}))
+    for _, figure in figures_by_unit(rows, figures.parameter_values_by_source_figure):
+        yield "Estimates", figure
     costs = {}
     for run in comparison.method_results:
         history = [entry for entry in run.solution.history if math.isfinite(entry.cost) and not entry.note]
         costs[run.method] = ([entry.seconds for entry in history], [entry.cost for entry in history])
-    estimates = figures_by_unit(rows, figures.parameter_values_by_source_figure)
-    shown = [("Estimates", figure) for _, figure in estimates]
-    return {"figures": [*shown, ("Cost over time", figures.excess_cost_over_time_figure(costs))]}
+    yield "Cost over time", figures.excess_cost_over_time_figure(costs)
 
 
 @register_report_section("proof", 10, "What was seen and named")
-def _blind_validation(findings: ReportData) -> Mapping[str, Any] | None:
+def _blind_validation(findings: ReportData) -> Iterator[tuple[str, Any]]:
     """Detection rate by effect size, confusion matrix and calibration."""
     result = findings.result
     if result.get("format") != "yid-blind/1":
-        return None
-    shown = []
+        return
     if result["detection"]:
         intervals = {float(size): own for size, own in result["detection_intervals"].items()}
         labels = {"gap": "gap seen", "right": "named right"}
         sizes = {label: {size: own[key] for size, own in intervals.items()} for key, label in labels.items()}
         figure = figures.rate_intervals_figure(sizes, "size over the detectable size", "part of the cases", False)
-        shown.append(("Detection by size, with binomial 95 % intervals", figure))
+        yield "Detection by size, with binomial 95 % intervals", figure
     said = result["confusion"]
     counts = np.array(said["counts"], float).reshape(len(said["true"]), len(said["said"]))
     if counts.size:
-        figure = figures.confusion_matrix_figure(said["true"], said["said"], counts)
-        shown.append(("What was said of what", figure))
+        yield "What was said of what", figures.confusion_matrix_figure(said["true"], said["said"], counts)
     kept = blind_calibration_rates(result)
     if any(kept.values()):
         figure = figures.rate_intervals_figure(kept, "promised", "kept", True)
-        shown.append(("What is promised, and what is kept", figure))
-    return {"figures": shown} if shown else None
+        yield "What is promised, and what is kept", figure
 
 
 @register_report_section("identifiability", 10, "What can be told")
@@ -179,44 +176,39 @@ def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
 
 
 @register_report_section("friction", 10, "Friction torque of the data and of the law")
-def _friction_torque(findings: ReportData) -> Mapping[str, Any] | None:
+def _friction_torque(findings: ReportData) -> Iterator[tuple[str, Any]]:
     """Friction torque over speed and over the load, from the measured motion and from the fitted law."""
-    shown = []
     for cloud in findings.section_data.get("friction_clouds", ()):
         for words, along in (("speed [rad/s]", cloud.speed), ("torque through the gear [N m]", cloud.load)):
-            figure = figures.scatter_figure(
-                {"data": (along, cloud.measured), "law": (along, cloud.predicted)}, words, "friction [N m]"
-            )
-            shown.append((cloud.joint, figure))
-    return {"figures": shown} if shown else None
+            points = {"data": (along, cloud.measured), "law": (along, cloud.predicted)}
+            yield cloud.joint, figures.scatter_figure(points, words, "friction [N m]")
 
 
 @register_report_section("information", 10, "The motion that tells most")
-def _informative_motion(findings: ReportData) -> Mapping[str, Any] | None:
+def _informative_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
     return _motion_figures(findings, "information")
 
 
 @register_report_section("plan", 10, "The planned motion")
-def _planned_motion(findings: ReportData) -> Mapping[str, Any] | None:
+def _planned_motion(findings: ReportData) -> Iterator[tuple[str, Any]]:
     return _motion_figures(findings, "plan")
 
 
-def _motion_figures(findings: ReportData, key: str) -> Mapping[str, Any] | None:
+def _motion_figures(findings: ReportData, key: str) -> Iterator[tuple[str, Any]]:
     """Distance of a plan's point from its target; joint positions, velocities and efforts over time."""
     found = findings.section_data.get(key)
     if found is None:
-        return None
+        return
     system, names = found.simulator.step.system, found.joint_names
-    curves = []
     if key == "plan" and (where := found.point_trajectories.get(findings.result["point"])) is not None:
-        lines = _lines(found.t, "xyz", 1e3 * (where - found.target_position))
-        curves.append(TimePlotData("from the place [mm]", lines, band_half_height=1e3 * findings.result["tolerance"]))
+        lines, tolerance = _lines(found.t, "xyz", 1e3 * (where - found.target_position)), findings.result["tolerance"]
+        curve = TimePlotData("from the place [mm]", lines, band_half_height=1e3 * tolerance)
+        yield "", lines_over_time_figure(curve)
     courses = [("joints, from the start", "position", found.joint_positions - found.joint_positions[0])]
     courses += [("velocity", "velocity", found.joint_velocities)] if key == "information" else []
     for words, channel, values in (*courses, ("effort", "effort", found.joint_efforts)):
         title = f"{words} [{_joint_channel_unit(system, names, channel)}]"
-        curves.append(TimePlotData(title, _lines(found.t, names, values)))
-    return {"figures": [("", lines_over_time_figure(curve)) for curve in curves]}
+        yield "", lines_over_time_figure(TimePlotData(title, _lines(found.t, names, values)))
 
 
 def _lines(t: Array, names: Sequence[str], values: Array) -> dict[str, tuple[Array, Array]]:
@@ -242,10 +234,6 @@ class _PredictedEpisode(NamedTuple):
     episode: Episode
     prediction: EpisodePrediction
 
-    @property
-    def title(self) -> str:
-        return f"{self.episode.name} ({self.role})"
-
 
 def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
     """Every recording with a prediction, those fitted first."""
@@ -269,7 +257,7 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
             system, grid = own.problem.system, own.episode.grid
             q = own.prediction.rollout.state[:, : system.n_coordinates]
             told = ModelTrajectory("predicted", system, own.theta, grid.node_times, q)
-            scenes.append(make_animation(own.title, [told], own.episode.recording))
+            scenes.append(make_animation(f"{own.episode.name} ({own.role})", [told], own.episode.recording))
     scenes = [entry for entry in scenes if len(entry.t) > 1]
     text = json.dumps([entry.to_dict() for entry in scenes[:_MAX_ANIMATIONS]], separators=(",", ":"))
     names = [[motion.name for motion in entry.motions] for entry in scenes]
@@ -283,7 +271,8 @@ def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
     found = []
     whitened: dict[str, list[Array]] = {}
     for own in _predicted_episodes(findings):
-        found += [(f"{name} in {own.title}", curves) for name, curves in _fitted_curves(own)]
+        where = f"{own.episode.name} ({own.role})"
+        found += [(f"{name} in {where}", curves) for name, curves in _fitted_curves(own)]
         for samples, predicted in zip(own.episode.measurements, own.prediction.predicted_outputs, strict=True):
             if own.role == _ESTIMATED:
                 ratio = (predicted - samples.value) / samples.std
@@ -321,15 +310,11 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
 
 
 @register_report_section("recorded", 30, "What was recorded")
-def _recorded_signals(findings: ReportData) -> Mapping[str, Any] | None:
+def _recorded_signals(findings: ReportData) -> Iterator[tuple[str, Any]]:
     """Recorded joint channels and points over time."""
-    system: System | None = findings.section_data.get("system")
-    shown = [
-        (f"{title} of {recording.name}", lines_over_time_figure(curve))
-        for recording in findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]
-        for title, curve in _recorded_curves(recording, system)
-    ]
-    return {"figures": shown} if shown else None
+    for recording in findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]:
+        for title, curve in _recorded_curves(recording, findings.section_data.get("system")):
+            yield f"{title} of {recording.name}", lines_over_time_figure(curve)
 
 
 def _recorded_curves(recording: Recording, system: System | None) -> Iterator[tuple[str, TimePlotData]]:
