@@ -170,32 +170,27 @@ def test_an_amplitude_far_out_of_its_range_comes_last():
     assert labels(_near_best_models(fits, Thresholds(prior_range_margin=2.0))) == ["small@x", "large@x"]
 
 
-@cases(
-    "odd, plain, expected",
-    {
-        "another comes near": ((1.0, 1.0), (1.04, 1.04), ["small@x"]),
-        "nothing comes near": ((1.0, 1.0), (1.2, 1.2), ["wide@x"]),
-        "near as a part of it": ((10.0, 10.0), (10.4, 10.4), ["small@x"]),
-        "another is better": ((1.0, 1.0), (0.9, 0.9), ["small@x"]),
-    },
-)
-def test_an_unlikely_shape_counts_only_where_no_other_comes_near(odd, plain, expected):
-    fits = [there(WIDE, *odd, s=9.0), there(SMALL, *plain)]
-    assert labels(_near_best_models(fits)) == expected
+ODD, UNSURE, SURE = {"s": 9.0}, {"a": 0.019, "b": 0.0}, {"a": 0.021, "b": 0.0}
 
 
 @cases(
-    "unsure, sure, expected",
+    "of, values, own, plain, expected",
     {
-        "another comes near": ((1.0, 1.0), (1.04, 1.04), ["small@x"]),
-        "nothing comes near": ((1.0, 1.0), (1.2, 1.2), ["large@x"]),
-        "near as a part of it": ((10.0, 10.0), (10.4, 10.4), ["small@x"]),
+        "an unlikely shape, another comes near": (WIDE, ODD, 1.0, 1.04, "small@x"),
+        "an unlikely shape, nothing comes near": (WIDE, ODD, 1.0, 1.2, "wide@x"),
+        "an unlikely shape, near as a part of it": (WIDE, ODD, 10.0, 10.4, "small@x"),
+        "an unlikely shape, another is better": (WIDE, ODD, 1.0, 0.9, "small@x"),
+        "hardly there, another comes near": (LARGE, UNSURE, 1.0, 1.04, "small@x"),
+        "hardly there, nothing comes near": (LARGE, UNSURE, 1.0, 1.2, "large@x"),
+        "hardly there, near as a part of it": (LARGE, UNSURE, 10.0, 10.4, "small@x"),
+        "there, another comes near": (LARGE, SURE, 1.0, 1.04, "large@x"),
+        "there, nothing comes near": (LARGE, SURE, 1.0, 1.2, "large@x"),
+        "there, near as a part of it": (LARGE, SURE, 10.0, 10.4, "large@x"),
     },
 )
-def test_one_that_is_not_sure_to_be_there_counts_only_where_no_other_comes_near(unsure, sure, expected):
-    fits = [there(LARGE, *unsure, a=0.019, b=0.0), there(SMALL, *sure)]
-    assert labels(_near_best_models(fits)) == expected
-    assert labels(_near_best_models([there(LARGE, *unsure, a=0.021, b=0.0), there(SMALL, *sure)])) == ["large@x"]
+def test_an_unlikely_shape_or_unsure_amplitude_counts_only_where_no_other_comes_near(of, values, own, plain, expected):
+    fits = [there(of, own, own, **values), there(SMALL, plain, plain)]
+    assert labels(_near_best_models(fits)) == [expected]
 
 
 @pytest.mark.parametrize(
@@ -291,19 +286,17 @@ def test_the_best_of_every_place_of_the_gap_is_refitted():
 
 # -- one effect after the other ---------------------------------------------------------------------------------------
 
-A, B, C = (effect(f"{name}@x", amplitude()) for name in "abc")
+A, B, C = EFFECTS = [effect(f"{name}@x", amplitude()) for name in "abc"]
 
 
 class Rounds:
     """Refits whose held-out losses are given by the effects' kinds, screened as wanted; remembers what was asked."""
 
-    def __init__(
-        self, monkeypatch, losses, p_values=(1e-9,) * 3, fails=(), absent=(), before=None, pairs=(), left=None
-    ):
-        self.losses, self.fails, self.refits, self.screens, self.heard = losses, fails, [], [], Heard()
-        self.absent, self.before, self.ranked_pairs, self.left = absent, before, pairs, left
-        kinds = [score(of, p=p, decrease=9.0 - i) for i, (of, p) in enumerate(zip((A, B, C), p_values, strict=True))]
-        self.scores = tuple(kinds)
+    def __init__(self, monkeypatch, losses, p_values=(1e-9,) * 3, **how):
+        self.losses, self.refits, self.screens, self.heard = losses, [], [], Heard()
+        usual = {"fails": (), "absent": (), "before": None, "pairs": (), "left": None}
+        vars(self).update(usual | how)
+        self.scores = tuple(map(lambda of, p, best: score(of, p=p, decrease=best), EFFECTS, p_values, (9.0, 8.0, 7.0)))
         monkeypatch.setattr(select, "refit_with_each_effect", self.refit_all)
         monkeypatch.setattr(select, "refit_with_effects", self.refit)
         monkeypatch.setattr(select, "screen_candidates", self.screen)
@@ -322,8 +315,8 @@ class Rounds:
         return ScreeningResult((), left, table, SimpleNamespace(ranked_pairs=self.promised))
 
     def promised(self, among):
-        kinds = {of.kind: of for of in (A, B, C) if of.label in among}
-        pairs = [(one, other) for one, other in self.ranked_pairs if {one, other} <= set(kinds)]
+        kinds = {of.kind: of for of in EFFECTS if of.label in among}
+        pairs = [(one, other) for one, other in self.pairs if {one, other} <= set(kinds)]
         return [((kinds[one], kinds[other]), {}, 7.0) for one, other in pairs]
 
     def screen(self, problem, base, values, limits):
@@ -340,10 +333,10 @@ class Rounds:
         self.refits.append(([of.kind for of in base], [of.kind for (of,), _ in tried], values.get("k")))
         known = [(*base, of) for (of,), _ in tried]
         if where:
-            lost = {of.kind: self.before.get(of.kind, (9.0, 9.2)) for (of,), _ in tried}
-            pairs = [(of, loss(*lost[of.kind])) for (of,), _ in tried]
-            there = [(of, own, 0.5 if of.kind in self.before else 2.0) for of, own in pairs]
-            return [fit([of], own, cost, {"k": 7.0, f"{of.label}.a": 1.0}) for of, own, cost in there]
+            lost = [
+                (of, self.before.get(of.kind, (9.0, 9.2)), 0.5 if of.kind in self.before else 2.0) for (of,) in known
+            ]
+            return [fit([of], loss(*own), cost, {"k": 7.0, f"{of.label}.a": 1.0}) for of, own, cost in lost]
         return [self.fit(effects) for effects in known if "".join(sorted(e.kind for e in effects)) in self.losses]
 
     def refit(self, problem, effects, start, store, name, limits):
@@ -381,16 +374,8 @@ def test_where_a_fit_has_left_an_earlier_run_candidates_are_tried_from_there_too
     assert Rounds(monkeypatch, losses).compose(moved=True)[1] == ["a"]
 
 
-GROWING = {
-    "": (5.0, 5.2),
-    "a": (3.0, 3.2),
-    "b": (4.0, 4.2),
-    "c": (4.5, 4.7),
-    "ab": (2.0, 2.2),
-    "ac": (2.5, 2.7),
-    "abc": (1.5, 1.7),
-    "bc": (3.5, 3.7),
-}
+GROWING = {"": 5.0, "a": 3.0, "b": 4.0, "c": 4.5, "ab": 2.0, "ac": 2.5, "abc": 1.5, "bc": 3.5}
+GROWING = {kinds: (chi2, chi2 + 0.2) for kinds, chi2 in GROWING.items()}
 
 
 def test_effects_are_added_while_the_gap_closes(monkeypatch):
@@ -400,9 +385,8 @@ def test_effects_are_added_while_the_gap_closes(monkeypatch):
     assert rounds.refits[:3] == [([], ["a", "b", "c"], 0.0), (["a"], ["b", "c"], 1.0), (["a", "b"], ["c"], 2.0)]
     assert [screened[:2] for screened in rounds.screens[:2]] == [(["a"], 1.0), (["a", "b"], 2.0)]
     assert rounds.screens[0][3] == Thresholds()
-    assert [entry.cumulative_closure.fraction for entry in added] == pytest.approx(
-        [1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1]
-    )
+    closed = [entry.cumulative_closure.fraction for entry in added]
+    assert closed == pytest.approx([1 - 2.1 / 4.1, 1 - 1.1 / 4.1, 1 - 0.6 / 4.1])
     assert [len(entry.refitted_model.effects) for entry in added] == [1, 2, 3]
     assert "scoring what is left beside a@x, b@x" in rounds.heard.stages
 
@@ -425,23 +409,28 @@ def test_what_is_added_to_others_is_of_a_size_to_be_expected(monkeypatch):
     assert alone.compose()[1] == ["b"]
 
 
-def test_a_rest_below_the_smallest_gap_is_left(monkeypatch):
-    losses = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
-    assert Rounds(monkeypatch, losses, left=1e-3).compose()[1] == ["a"]
-    assert Rounds(monkeypatch, losses, left=1e-3).compose(min_excess_chi2=0.05)[1] == ["a", "b"]
-    # at the smallest gap another one is tried
-    assert Rounds(monkeypatch, losses, left=1e-3).compose(min_excess_chi2=0.09)[1] == ["a", "b"]
+LITTLE = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
 
 
-def test_a_rest_that_shows_along_a_candidate_is_not_left(monkeypatch):
-    """It has to be surer than a rest that the residual as a whole shows, and only odds convince of it."""
-    losses = {"": (3.0, 3.2), "a": (1.04, 1.14), "b": (2.0, 2.2), "c": (2.5, 2.7), "ab": (1.0, 1.0), "ac": (1.0, 1.0)}
-    assert Rounds(monkeypatch, losses, left=4e-5).compose()[1] == ["a", "b"]
-    # counted as the best of two
-    assert Rounds(monkeypatch, losses, left=6e-5).compose()[1] == ["a"]
-    assert Rounds(monkeypatch, losses, left=6e-5).compose(candidate_significance_level=2e-4)[1] == ["a", "b"]
-    # all of the rest is closed surely, and r'r falls by 9, not by twice the log odds
-    less = losses | {"ab": (0.995, 1.095), "ac": (1.03, 1.13)}
+@cases(
+    "left, limits, chosen",
+    {
+        "below the smallest gap": (1e-3, {}, ["a"]),
+        "above it": (1e-3, {"min_excess_chi2": 0.05}, ["a", "b"]),
+        "at it": (1e-3, {"min_excess_chi2": 0.09}, ["a", "b"]),
+        # surer than a rest that the residual as a whole shows, counted as the best of two
+        "along a candidate": (4e-5, {}, ["a", "b"]),
+        "hardly along one": (6e-5, {}, ["a"]),
+        "along one by another level": (6e-5, {"candidate_significance_level": 2e-4}, ["a", "b"]),
+    },
+)
+def test_a_rest_is_left_unless_it_is_large_or_shows_along_a_candidate(monkeypatch, left, limits, chosen):
+    assert Rounds(monkeypatch, LITTLE, left=left).compose(**limits)[1] == chosen
+
+
+def test_only_odds_convince_of_a_rest_that_shows_along_a_candidate(monkeypatch):
+    """All of the rest is closed surely, and r'r falls by 9, not by twice the log odds."""
+    less = LITTLE | {"ab": (0.995, 1.095), "ac": (1.03, 1.13)}
     assert Rounds(monkeypatch, less, left=1e-9).compose()[1] == ["a"]
     assert Rounds(monkeypatch, less, left=1e-9).compose(min_log_bayes_factor=4.0)[1] == ["a", "b"]
 
@@ -483,24 +472,21 @@ def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(b
 
 
 def test_all_recordings_tell_which_effects_are_within_reach():
-    one = fit([effect("one@elbow")], loss(0.99, 1.0), cost=100.0)
+    one, other = fit([effect("one@elbow")], loss(0.99, 1.0), cost=100.0), fit([effect("other@elbow")], loss(1.01, 1.0))
     # 2 more in held-out squares, and twice the cost: 12 in all, where 10 are worth a word
-    assert _near_best_models([one, fit([effect("other@elbow")], loss(1.01, 1.0), cost=105.0)]) == [one]
-    assert len(_near_best_models([one, fit([effect("other@elbow")], loss(1.01, 1.0), cost=103.9)])) == 2
+    assert _near_best_models([one, replace(other, cost=105.0)]) == [one]
+    assert len(_near_best_models([one, replace(other, cost=103.9)])) == 2
     # a parameter more is worth one by chance
     two = fit([effect("two@elbow", amplitude("a"), amplitude("b"))], loss(0.99, 1.0), cost=100.0)
-    assert len(_near_best_models([two, fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4)])) == 2
-    assert penalized_chi2_difference(fit([effect("other@elbow")], loss(1.01, 1.0), cost=104.4), two) == pytest.approx(
-        9.8
-    )
+    assert len(_near_best_models([two, replace(other, cost=104.4)])) == 2
+    assert penalized_chi2_difference(replace(other, cost=104.4), two) == pytest.approx(9.8)
     # chance lets another be the best on what is held out, by less than a standard error
     ahead, true = fit([effect("ahead@elbow")], loss(0.9, 1.0), cost=130.0), fit([effect("true@elbow")], loss(1.0, 0.95))
     assert _near_best_models([ahead, replace(true, cost=100.0)]) == [replace(true, cost=100.0)]
-    both = _near_best_models([ahead, replace(true, cost=127.0)])
-    assert [entry.effects[0].kind for entry in both] == ["true", "ahead"], "the likelier first"
+    assert labels(_near_best_models([ahead, replace(true, cost=127.0)])) == ["true@elbow", "ahead@elbow"]
     # where more than noise is left, squares are errors of the model
-    rough = fit([effect("one@elbow")], loss(1.19, 1.2), cost=100.0)
-    assert len(_near_best_models([rough, fit([effect("other@elbow")], loss(1.2, 1.2), cost=130.0)])) == 2
+    rough = replace(one, held_out_loss=loss(1.19, 1.2))
+    assert len(_near_best_models([rough, replace(other, held_out_loss=loss(1.2, 1.2), cost=130.0)])) == 2
 
 
 def test_what_all_recordings_say_is_within_reach_beyond_a_standard_error_on_those_held_out():
@@ -509,13 +495,13 @@ def test_what_all_recordings_say_is_within_reach_beyond_a_standard_error_on_thos
     offset = fit([effect("offset@elbow")], loss(1.01, 1.01), cost=102.0)
     assert held_out_improvement(offset.held_out_loss, spring.held_out_loss) == pytest.approx((0.01, 0.0))
     assert penalized_chi2_difference(offset, spring) == pytest.approx(-1.0)
-    assert [entry.effects[0].kind for entry in _near_best_models([spring, offset])] == ["offset", "spring"]
+    assert labels(_near_best_models([spring, offset])) == ["offset@elbow", "spring@elbow"]
     # 3.84 is what a 95 % interval is worth
     assert len(_near_best_models([spring, replace(offset, cost=104.4)])) == 2
     assert _near_best_models([spring, replace(offset, cost=104.5)]) == [spring]
     # where more than noise is left, squares are errors of the model
-    rough = [replace(spring, held_out_loss=loss(1.2, 1.2)), replace(offset, held_out_loss=loss(1.21, 1.21))]
-    assert _near_best_models(rough) == [rough[0]]
+    rough = replace(spring, held_out_loss=loss(1.2, 1.2))
+    assert _near_best_models([rough, replace(offset, held_out_loss=loss(1.21, 1.21))]) == [rough]
 
 
 def test_an_effect_that_others_make_superfluous_is_left_out_again(monkeypatch):
