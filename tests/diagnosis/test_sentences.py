@@ -31,7 +31,7 @@ from factories import (
     visible,
 )
 
-from yid_ocp.diagnosis.diagnosis_messages import (
+from yid_ocp.diagnosis.diagnosis_result import (
     _event_sentences,
     _separating_experiment,
     diagnosis_summary_text,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.diagnosis_messages import diagnosis_summary_text
+from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.verdict import is_chance_excess
 from yid_ocp.effects import make_effect

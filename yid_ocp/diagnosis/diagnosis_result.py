@@ -1,16 +1,16 @@
-"""The result of a diagnosis, as a dataclass and as `yid-diagnosis/2`."""
+"""The result of a diagnosis: a dataclass, `yid-diagnosis/2`, and what is said of it and of the next experiment."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from yid_ocp.diagnosis.baseline import BaselineComparison, CounterfactualTest
-from yid_ocp.diagnosis.events import NO_EVENTS, EventSet
+from yid_ocp.diagnosis.events import NO_EVENTS, DisturbanceEvent, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
-from yid_ocp.diagnosis.localise import GapLocation
+from yid_ocp.diagnosis.localise import GapLocation, main_gap_locations
 from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
     CandidateDetectability,
@@ -32,9 +32,11 @@ from yid_ocp.diagnosis.verdict import (
     UnknownVerdictReason,
     failed_transfer_checks,
     independent_assumption_count,
+    required_explained_fraction,
 )
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.effects import EffectBase
+from yid_ocp.effects.base import EXCITATION_DESCRIPTIONS
 from yid_ocp.files import attributes_to_json, to_json_types
 from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult, min_bonferroni_p_value
 from yid_ocp.inference.smoother import SmootherResult
@@ -103,9 +105,8 @@ class DiagnosisResult(ReprMixin):
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
         """Effects accepted by the verdict, in the order they were added; empty unless effect or confusable."""
-        return (
-            tuple(entry.effect for entry in self.selected_effects) if self.verdict in ("effect", "confusable") else ()
-        )
+        named = self.verdict in ("effect", "confusable")
+        return tuple(entry.effect for entry in self.selected_effects) if named else ()
 
     @property
     def final_model(self) -> RefittedModel:
@@ -166,7 +167,7 @@ class DiagnosisResult(ReprMixin):
             "noise": {
                 f.channel: attributes_to_json(f, "std=noise_std unit samples=n_samples") for f in self.noise_floor
             },
-            "baseline": None if since is None else _since(since),
+            "baseline": None if since is None else _baseline_to_json(since),
             "counterfactual": None if self.counterfactual is None else self.counterfactual.to_dict(),
             "seconds": dict(self.stage_seconds),
         }
@@ -175,27 +176,19 @@ class DiagnosisResult(ReprMixin):
 def statistics_compared_with_thresholds(finding: DiagnosisResult) -> dict[str, Any]:
     """Return the statistics compared with `Thresholds`, JSON-compatible, from which these are calibrated.
 
-    None where a step was not come to.
-
-    Returns
-    -------
-    dict
-        `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the
-        worst channel), `candidate` (p-value of the best, as the best of so many), `evidence` (what unknown forces,
-        offsets and biases raise the log evidence by; not where noise that drives the motion is among them), `closure`
-        and `closure_low` (held out, of all that was added, accepted or not), `fall` (part of the held-out error that
-        they take away), `explained` (over what the smoother explains), `assumptions` (how many), `carried` (standard
-        deviations between the values found and those on the held-out recordings, at most), `behind` (of every effect
-        that was refitted alone, the held-out chi2/n that it leaves and how far it is behind the first: in held-out
-        chi2/n with its standard error, and in r'r of all recordings).
+    `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the worst
+    channel), `candidate` (p-value of the best, as the best of so many), `evidence` (rise of the log evidence by unknown
+    forces, offsets and biases; not where noise drives the motion), `closure` and `closure_low` (held out, of all that
+    was added, accepted or not), `fall` (part of the held-out error that they take away), `explained` (over what the
+    smoother explains), `assumptions` (how many), `carried` (standard deviations between the values found and those on
+    the held-out recordings, at most), `behind` (of every effect refitted alone, the held-out chi2/n that it leaves and
+    how far it is behind the first: in held-out chi2/n with its standard error, and in r'r of all recordings). None
+    where a step was not come to.
     """
     tests = (finding.nominal_test, finding.nominal_held_out_test)
     added, seen, before = finding.selected_effects, finding.smoother_result, finding.nominal_model
-    apart = [
-        distance / std
-        for distance, std in (entry.estimate_difference_and_std for entry in finding.transfer_checks)
-        if std > 0
-    ]
+    differences = (entry.estimate_difference_and_std for entry in finding.transfer_checks)
+    apart, alone = [distance / std for distance, std in differences if std > 0], finding.single_effect_models
     of_effects: dict[str, Any] = dict.fromkeys(("closure", "closure_low", "fall", "explained"))
     if added:
         fall = relative_rmse_reduction(before.held_out_loss, added[-1].refitted_model.held_out_loss)
@@ -210,9 +203,7 @@ def statistics_compared_with_thresholds(finding: DiagnosisResult) -> dict[str, A
         **of_effects,
         "assumptions": independent_assumption_count(added),
         "carried": max(apart, default=None),
-        "behind": {
-            fit.effects[-1].label: _behind(fit, finding.single_effect_models[0]) for fit in finding.single_effect_models
-        },
+        "behind": {fit.effects[-1].label: _behind(fit, alone[0]) for fit in alone},
     }
     return {name: to_json_types(value) for name, value in found.items()}
 
@@ -225,11 +216,7 @@ def _behind(fit: RefittedModel, first: RefittedModel) -> dict[str, float]:
 
 
 def final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
-    """Return `model` of result.json: parameters and covariance of the final model.
-
-    Parameters are all of the model and of its own effects: value, std, unit, whether free. The covariance is that of
-    the shared free parameters; those not known at all are left out.
-    """
+    """Return `model` of result.json: parameters of the final model and its effects, and the free ones' covariance."""
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.detectability} - {effect.label for effect in fit.effects}
@@ -249,7 +236,7 @@ _EFFECT = "kind location"
 _PLACE = "location share=gap_share observable=is_observable windows=time_windows indistinguishable_from"
 
 
-def _since(found: BaselineComparison) -> dict[str, Any]:
+def _baseline_to_json(found: BaselineComparison) -> dict[str, Any]:
     runs = "runs=baseline_runs explains=is_baseline_explained effects=baseline_effects chi2=between_runs_chi2"
     shift = "before=baseline_value before_std=baseline_std now=current_value now_std=current_std unit score=z_score"
     parameters = {e.name: attributes_to_json(e, f"{shift} p_value changed=has_changed") for e in found.parameter_shifts}
@@ -282,10 +269,7 @@ def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
 def _closure(closed: GapClosure | None) -> dict[str, Any]:
     if closed is None:
         return {"closure": None, "closure_ci": None}
-    return {
-        "closure": to_json_types(closed.fraction),
-        "closure_ci": to_json_types([closed.ci_low, closed.ci_high]),
-    }
+    return to_json_types({"closure": closed.fraction, "closure_ci": [closed.ci_low, closed.ci_high]})
 
 
 def _ranked_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
@@ -313,3 +297,282 @@ def _ranked_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
             **_closure(None if own is None else held_out_gap_closure(before, own.held_out_loss)),
         }
     return list(listed.values())
+
+
+# -- what is said of it ------------------------------------------------------------------------------------------------
+
+_MIN_RELATIVE_CHANGE = 0.1  # relative change from which a nominal parameter is named
+_PRIOR_RANGE_TOLERANCE = 0.25  # part of its range by which an amplitude may leave it unnoticed
+_GAP_ORIGIN_PHRASES = {
+    "plant": ", in the mechanics rather than in what sensors read",
+    "sensor": ", in what sensors read",
+    "either": ", in the mechanics or in what the effort sensor reads, which efforts alone do not tell apart",
+}
+_RUNS_DIFFER_LEVEL = 0.01  # significance below which several runs of a baseline differ
+_MAX_EVENTS_LISTED = 8  # maximum number of events listed one by one
+_IMMOVABLE_LOCATIONS = ("world", "clock", "camera", "object", "base")  # locations that cannot be moved by themselves
+_NEXT_EXPERIMENT_TEXTS = {
+    "insufficient_data": "Record longer and larger motions; more of the object has to be seen.",
+    "separate": "Vary {aspects} independently of each other, over a wide range, in one recording.",
+    "places": "Move so that {places} work one at a time, or measure a point between them.",
+    "vary": "Vary {aspects} over a wider range.",
+    "other": "Record other motions, faster and larger.",
+    "unknown": "Move {place} alone, slowly and fast, and hold it still in several postures.",
+    "unseen": "None is needed; these motions could not have shown {unseen}.",
+    "no_gap": "None is needed.",
+    "effect": "Repeat with other motions to see whether the effect's parameters stay.",
+}
+"""Texts of the recommended next experiment, by situation."""
+_UNKNOWN_REASON_TEXTS = {
+    "nothing": "No known effect explains it.",
+    "none": "No known effect explains it (the best, {best}, is not sure to be there and to close a part).",
+    "unsure": "{names} close{s} {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
+    "asked.",
+    "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, and surely "
+    "close{s} {low:.3g} % on held-out motions; {enough:.3g} % {asked}.",
+    "stand_in": "{names} imitate{s} it (closing {closure:.3g} % on held-out motions) and {are} not its cause: {apart}.",
+}
+"""Sentences on why the verdict is unknown, by `verdict.UnknownVerdictReason`."""
+
+
+def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
+    """The experiment that separates indistinguishable effects, from what their equations depend on."""
+    said = dict.fromkeys(effect.required_excitation for effect in rivals if effect.required_excitation)
+    known = [aspect for aspect in EXCITATION_DESCRIPTIONS if aspect in said]
+    aspects = [*known, *(aspect for aspect in said if aspect not in known)]
+    places = list(dict.fromkeys(effect.location for effect in rivals))
+    case = "separate" if len(aspects) > 1 else "places" if len(places) > 1 else "vary" if aspects else "other"
+    return _NEXT_EXPERIMENT_TEXTS[case].format(aspects=" and ".join(aspects), places=" and ".join(places))
+
+
+def recommended_experiment_text(
+    verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], seen: Sequence[CandidateDetectability]
+) -> str:
+    """Return the recommended next recording as text."""
+    rivals = next((entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1), ())
+    if rivals and verdict != "insufficient_data":
+        return _separating_experiment(rivals)
+    unseen = [entry.effect.label for entry in seen if not entry.is_detectable]
+    place = where[0].location if where and where[0].gap_share > 0 else ""
+    case = verdict if verdict in _NEXT_EXPERIMENT_TEXTS else "effect"
+    if verdict == "unknown" and place in ("", *_IMMOVABLE_LOCATIONS):
+        case = "other"
+    if verdict == "no_gap" and unseen:
+        case = "unseen"
+    listed = ", ".join(unseen[:4]) + (", ..." if len(unseen) > 4 else "")
+    return _NEXT_EXPERIMENT_TEXTS[case].format(place=place, unseen=listed)
+
+
+def insufficient_data_message(
+    verdict: str, before: NullTestResult, unknowns: int, seen: Sequence[CandidateDetectability], limits: Thresholds
+) -> str:
+    """Return why the data are insufficient; empty if they suffice."""
+    if verdict != "insufficient_data":
+        return ""
+    if not any(entry.is_detectable for entry in seen):
+        return "no candidate of the size that one would expect would show in these recordings."
+    needed = f"at least {limits.min_samples_per_unknown * unknowns:.0f} are needed"
+    said = f"{before.degrees_of_freedom:.0f} effective samples for {unknowns} unknowns, {needed}"
+    return f"{said}; record longer or free fewer parameters."
+
+
+def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
+    """Return the sentence on how far the nominal model follows a held-out recording."""
+    if cut.kept_duration == 0:
+        return f"The nominal model cannot follow {cut.recording} at all, which is left out."
+    part = f"{cut.kept_duration:.3g} of {cut.full_duration:.3g} s"
+    return f"The nominal model follows {cut.recording} for {part} only; the rest is left out."
+
+
+def diagnosis_summary_text(finding: DiagnosisResult) -> str:
+    """Return the summary text of a diagnosis."""
+    text = [_gap(finding)]
+    if finding.verdict not in ("insufficient_data", "no_gap"):
+        text.append(_places(finding))
+    if finding.accepted_effects:
+        text += _effects(finding)
+    elif finding.verdict == "unknown":
+        text.append(_nameless(finding))
+    text += [held_out_truncation_message(cut) for cut in finding.truncated_recordings]
+    if finding.baseline_comparison is not None:
+        text += _since(finding.baseline_comparison, bool(finding.accepted_effects))
+    if finding.counterfactual is not None:
+        text += _counterfactual(finding.counterfactual)
+    if finding.is_split_in_blocks:
+        cut, whole = "No held-out recording is left", "Only one set of recordings was given"
+        why = cut if finding.truncated_recordings else whole
+        text.append(f"{why}: alternate blocks of what is estimated on were held out.")
+    text += [_event_sentences(finding.events), f"Next experiment: {finding.next_experiment}"]
+    return " ".join(filter(None, text))
+
+
+def _gap(finding: DiagnosisResult) -> str:
+    """Whether there is one."""
+    held, first = finding.nominal_held_out_test, finding.nominal_test
+    p = min(first.p_value, held.p_value)
+    if finding.verdict == "insufficient_data":
+        return f"The data do not suffice: {finding.message}"
+    if finding.verdict == "no_gap":
+        return (
+            f"There is no gap to speak of (chi2 per degree of freedom {first.chi2_per_dof:.3g}, held out "
+            f"{held.chi2_per_dof:.3g}; p = {p:.2g})."
+        )
+    best = min(finding.candidate_scores, key=lambda score: score.p_value, default=None)
+    along = ""
+    if p >= finding.thresholds.significance_level and best is not None:
+        p, along = min(1.0, best.p_value * len(finding.candidate_scores)), f" along what {best.effect.label} would do"
+    small = f"= {p:.2g}" if p > 1e-12 else "< 1e-12"
+    return f"The gap is real (held-out chi2 per degree of freedom {held.chi2_per_dof:.3g}, p {small}{along})."
+
+
+def _places(finding: DiagnosisResult) -> str:
+    """Where it lies, places that the data cannot tell apart together; empty where nothing says so."""
+    where = main_gap_locations(finding.gap_locations)
+    shares = [(" or ".join([p.location, *p.indistinguishable_from]), round(100 * p.gap_share)) for p in where]
+    named = " and ".join(f"{place} ({percent} %)" for place, percent in shares if percent)
+    side = "" if finding.smoother_result is None else _GAP_ORIGIN_PHRASES.get(finding.smoother_result.gap_origin, "")
+    silent = "These data do not tell where it lies." if shares else ""
+    return f"It lies in {named}{side}." if named else silent
+
+
+def _nameless(finding: DiagnosisResult) -> str:
+    """Why no effect is named, with the numbers that say so."""
+    added, tried, reason = finding.selected_effects, finding.single_effect_models, finding.unknown_reason
+    apart = [entry.disagreement_text for entry in failed_transfer_checks(finding.transfer_checks)]
+    count = independent_assumption_count(added)
+    return _UNKNOWN_REASON_TEXTS[reason if reason != "none" or tried else "nothing"].format(
+        best=tried[0].effects[0].label if tried else "",
+        names=" and ".join(entry.effect.label for entry in added),
+        s="s" if len(added) == 1 else "",
+        are="is" if len(added) == 1 else "are",
+        closure=100 * finding.gap_closure.fraction,
+        low=100 * finding.gap_closure.ci_low,
+        least=100 * finding.thresholds.min_gap_closed,
+        explained=100 * finding.explained_fraction,
+        asked=f"of the former are asked of {count} assumptions" if count > 1 else "of either are asked",
+        enough=100 * required_explained_fraction(added, finding.thresholds),
+        apart="; ".join(apart[:2]),
+    )
+
+
+def _effects(finding: DiagnosisResult) -> list[str]:
+    """What was added, what it closes, what it cannot be told from, and what remains."""
+    last, total, rest = finding.final_model, finding.gap_closure, finding.remaining_test
+    names = "; ".join(f"{e.label} with {_figures(e, last)}" for e in finding.accepted_effects)
+    verb = "closes" if len(finding.accepted_effects) == 1 else "together close"
+    odds = math.exp(finding.thresholds.min_log_bayes_factor)
+    text = [
+        f"{names} {verb} {100 * total.fraction:.3g} % of it on held-out motions "
+        f"(95 % interval {100 * total.ci_low:.3g} to {100 * total.ci_high:.3g} %)."
+        if total.ci_low > finding.thresholds.min_gap_closed
+        else f"With {names} the held-out motions are far more likely (more than {odds:.0f} times), although so little "
+        "of chi2 tells of it that no part of the gap can be given."
+    ]
+    for entry in finding.selected_effects:
+        others = [r.label for r in entry.equivalent_effects if r.label != entry.effect.label]
+        text += [f"Not separable from {entry.effect.label}: {', '.join(others)}."] if others else []
+    odd = [said for effect in finding.accepted_effects for said in _out_of_range(effect, last)]
+    if odd:
+        text.append(f"Beyond what one would expect, and so perhaps standing in for something else: {', '.join(odd)}.")
+    if rest.chi2_per_dof > 1 and rest.p_value < finding.thresholds.significance_level:
+        mostly = "".join(f", most of it in {place.location}" for place in finding.remaining_gap_locations[:1])
+        text.append(f"What remains: held-out chi2 per degree of freedom {rest.chi2_per_dof:.3g}{mostly}.")
+    else:
+        text.append("What remains is noise.")
+    moved = [
+        f"{a.name} goes from {a.value_before:.3g} to {a.value_after:.3g}"
+        for a in finding.nominal_changes
+        if abs(a.value_after - a.value_before) > _MIN_RELATIVE_CHANGE * max(abs(a.value_before), 1e-9)
+    ]
+    return [*text, f"With it {', '.join(moved[:6])}."] if moved else text
+
+
+def _figures(effect: EffectBase, fit: RefittedModel) -> str:
+    text = []
+    for name, r in fit.reported_parameters(effect).items():
+        known = f"= {r.value:.3g} ± {r.std:.2g} {r.unit}".strip().removesuffix(" 1")
+        text.append(f"{name} {known if math.isfinite(r.std) else 'unknown'}")
+    return ", ".join(text)
+
+
+def _out_of_range(effect: EffectBase, fit: RefittedModel) -> list[str]:
+    """Amplitudes beyond the range that an engineer would expect."""
+    found = []
+    for name in effect.amplitude_names:
+        (low, high), value = effect.prior_ranges[name], fit.values[name]
+        room = _PRIOR_RANGE_TOLERANCE * (high - low)
+        if not low - room <= value <= high + room and effect.neutral_values[name] != value:
+            found.append(f"{name} = {value:.3g} (range {low:.3g} to {high:.3g})")
+    return found
+
+
+def _since(found: BaselineComparison, effects: bool) -> list[str]:
+    """What has moved since the baseline, and what a baseline that explained little is worth."""
+    several, p_value = len(found.baseline_runs), found.between_runs_p_value
+    moved = [
+        f"{e.name} is {e.current_value:.3g} ± {e.current_std:.2g} {e.unit} where it was "
+        f"{e.baseline_value:.3g} ± {e.baseline_std:.2g}"
+        for e in found.changed_parameters[:4]
+    ]
+    seen = any(entry.z_score is not None for entry in found.parameter_shifts)
+    none = "no parameter has changed" if seen else "these recordings say nothing of the parameters"
+    what = f"{'even with that ' if effects else ''}{', '.join(moved)}" if moved else none
+    text = [f"Against the baseline{f' of {several} runs' if several > 1 else ''}, {what}."]
+    if several > 1 and p_value < _RUNS_DIFFER_LEVEL:
+        text.append(f"The runs of the baseline differ among themselves (p = {p_value:.2g}); their ± is wider for it.")
+    if not found.is_baseline_explained:
+        what = "The model did not explain the baseline's recordings"
+        text.append(f"{what}, so its ± counts that misfit and may be too small.")
+    return text
+
+
+_COUNTERFACTUAL_TEXTS = (
+    ("Taken away again, it predicts", "made without it", "as it was fitted without a diagnosis"),
+    ("Added to what was known without it, it predicts", "made with it", "without it"),
+)
+"""Beginning, how the recordings were made, and what the prediction is compared with: effects removed, and added."""
+
+
+def _counterfactual(found: CounterfactualTest) -> list[str]:
+    """Whether taking the effects away predicts the world without them, and adding them the world with them."""
+    text = []
+    both = (found.effects_removed, found.effects_added)
+    for part, (begin, made, rival) in zip(both, _COUNTERFACTUAL_TEXTS, strict=True):
+        if part.failure_message:
+            text.append(f"What was {made} could not be predicted ({part.failure_message}).")
+            continue
+        names = " and ".join(name.removesuffix(" (without)") for name in part.recordings[:2])
+        names += " and others" if len(part.recordings) > 2 else ""
+        plain, errors = (", ".join(f"{pair[i]:.2g} {unit}" for unit, pair in part.rmse_by_unit.items()) for i in (0, 1))
+        text.append(f"{begin} {names}, {made}, to {errors} (rms), where the model {rival} has {plain}.")
+        if not part.is_improved_by_counterfactual:
+            text.append("That is no better, so it may stand in for something else.")
+    return text
+
+
+def _event_sentences(events: EventSet) -> str:
+    """The sentences on all events: what, where, when; empty if there are none."""
+    text, count = [], len(events.disturbances)
+    if count:
+        told = "; ".join(_said(event) for event in events.disturbances[:_MAX_EVENTS_LISTED])
+        more = f"; and {count - _MAX_EVENTS_LISTED} more" if count > _MAX_EVENTS_LISTED else ""
+        first = "One event stands" if count == 1 else f"{count} events stand"
+        text.append(f"{first} beside all this, short and in one place: {told}{more}.")
+    return " ".join([*text, *joint_overspeed_messages(events)])
+
+
+def joint_overspeed_messages(events: EventSet) -> list[str]:
+    """Return one sentence for each recording whose end is ignored because a joint moves too fast."""
+    said, why = "s on nothing is judged in", "moves too fast for the model to follow."
+    return [f"From {e.start_time:.3g} {said} {e.recording}, where {e.joint} {why}" for e in events.overspeeds]
+
+
+def _said(event: DisturbanceEvent) -> str:
+    if event.kind == "sample":
+        when = f"at {0.5 * (event.start_time + event.end_time):.3f} s in {event.recording}"
+        return f"{event.channel} is off by {event.peak_value:+.3g} {event.unit} {when}"
+    return (
+        f"{event.channel} is pushed by up to {event.peak_value:+.2g} {event.unit} "
+        f"from {event.start_time:.2f} to {event.end_time:.2f} s in {event.recording} "
+        f"({event.impulse:+.2g} ± {event.impulse_std:.1g} {event.unit} s)"
+    )

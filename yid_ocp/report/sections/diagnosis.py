@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.diagnosis import DiagnosisResult
-from yid_ocp.diagnosis.diagnosis_messages import joint_overspeed_messages
+from yid_ocp.diagnosis.diagnosis_result import joint_overspeed_messages
 from yid_ocp.diagnosis.localise import smoothed_unknown_units, smoothed_unknown_z_scores
 from yid_ocp.inference.null_test import residual_channel_samples
 from yid_ocp.inference.smoother import SmootherResult
