@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 from made_series import series
 
-from yid_ocp.diagnosis import (
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
+from yid_ocp.diagnosis.refit import refit_with_effects
+from yid_ocp.diagnosis.screening import (
+    AllCandidatesLinearization,
+    _EffectSignature,
     candidate_detectability,
     confusability_matrix,
     linearize_candidates,
-    refit_with_effects,
     score_candidates,
     score_candidates_jointly,
 )
-from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
-from yid_ocp.diagnosis.screening import AllCandidatesLinearization, _EffectSignature
 from yid_ocp.diagnosis.select import _near_best_models
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.null_test import residual_channel_samples

@@ -40,15 +40,12 @@ _MIN_VISIBLE_MOTION = 1e-4  # of a point that a camera may see, for a change of 
 
 @dataclass(frozen=True)
 class _ParameterPrecision:
-    """Relative standard deviations of a parameter, from the existing recordings, from the planned one and from both.
-
-    Infinite without information. The verdict is that from the planned recording alone.
-    """
+    """Relative standard deviations of a parameter by the existing recordings, the planned one and both; or infinite."""
 
     std_recorded: float
     std_planned: float
     std_combined: float
-    verdict: str
+    verdict: str  # by the planned recording alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +77,6 @@ def plan_informative_motion(
     problem : EstimationProblem
         As configured: its sensors with their noise and rates are those of its first recording, its free parameters are
         those that a recording of the motion would be fitted by.
-    options : PlanOptions
-        Of goal `information`.
     values : mapping of str to float, optional
         Parameters at which to judge; the problem's when absent.
     effects : mapping of label to mapping of quantity to value, optional
@@ -89,10 +84,9 @@ def plan_informative_motion(
 
     Raises
     ------
-    ConfigError
-        Parameters or effects that do not exist, that no sensor sees in any motion, limits that leave no motion.
-    ModelError, DataError, SolverError
-        No rest to begin from; sensors without a noise level; a motion that its torques do not follow.
+    ConfigError, ModelError, DataError, SolverError
+        Parameters or effects that do not exist or that no sensor sees, limits that leave no motion; no rest to begin
+        from; sensors without a noise level; a motion that its torques do not follow.
     """
     check_option_bounds(options, "plan")
     known = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True)) | dict(values or {})
@@ -105,9 +99,7 @@ def plan_informative_motion(
         extra, step = [name for e in rivals for name in e.parameters.names], compile_step_like(problem.step, system)
         composed = EstimationProblem(step, recordings, problem.free, problem.options, known, (), extra)
     names = (*problem.free, *(name for effect in rivals for name in effect.amplitude_names))
-    shapes = {
-        entry.name: entry.value for e in rivals for entry in e.parameters if entry.name in e.shape_parameter_names
-    }
+    shapes = {name: e.parameters[name].value for e in rivals for name in e.shape_parameter_names}
     experiment = PlannedExperiment.from_options(composed, known | shapes, options, names)
     system, still = experiment.simulator.step.system, experiment.zero_coefficients
     points = FramePositionFunction(system, system.point_frames)
@@ -115,10 +107,8 @@ def plan_informative_motion(
     criterion = _criterion(experiment, chosen, rivals)
     search = InformativeMotionSearch(experiment, limits, criterion)
     _check_room(search, limits)
-    begins = [
-        _smooth(experiment, search.shrink_to_limits(_random(experiment, options.seed + i)))
-        for i in range(options.n_random_starts)
-    ]
+    seeds = range(options.seed, options.seed + options.n_random_starts)
+    begins = [_smooth(experiment, search.shrink_to_limits(_random(experiment, seed))) for seed in seeds]
     if not any(np.any(begin) for begin, _ in begins):
         raise ConfigError("the limits leave no motion", where="plan.limits", hint="widen plan.limits")
     unseen = _unseen(experiment, [rows for _, rows in begins])
@@ -147,11 +137,9 @@ def _chosen(
             hint = nearest_name_hint(name, problem.system.parameters.names)
             raise ConfigError(f"there is no parameter '{name}'", where="plan.identify", hint=hint)
         if name not in problem.free:
-            what, hint = (
-                f"'{name}' is not free: a recording would say nothing of it",
-                f"set parameters.{name}.free: true",
-            )
-            raise ConfigError(what, where="plan.identify", allowed=", ".join(problem.free), hint=hint)
+            what = f"'{name}' is not free: a recording would say nothing of it"
+            hint, allowed = f"set parameters.{name}.free: true", ", ".join(problem.free)
+            raise ConfigError(what, where="plan.identify", allowed=allowed, hint=hint)
     return wanted, ()
 
 
@@ -222,14 +210,13 @@ def _random(experiment: PlannedExperiment, seed: int) -> Array:
 
 def _smooth(experiment: PlannedExperiment, w: Array) -> tuple[Array, Array | None]:
     """The motion, made smaller until what it tells changes smoothly with it, and its sensitivities."""
-    rows = experiment.search_problem_sensitivities(w)
     for _ in range(10):
+        rows = experiment.search_problem_sensitivities(w)
         there = None if rows is None else experiment.search_problem_sensitivities((1.0 + 1e-4) * w)
         if rows is not None and there is not None and _is_near(there, rows):
-            break
+            return w, rows
         w = 0.5 * w
-        rows = experiment.search_problem_sensitivities(w)
-    return w, rows
+    return w, experiment.search_problem_sensitivities(w)
 
 
 def _is_near(there: Array, rows: Array) -> bool:
@@ -253,13 +240,10 @@ def _check_seen(
     lost = [name for name in chosen if name in unseen]
     if chosen and len(lost) == len(chosen):
         worst = max(unseen[name] for name in lost)
-        raise ConfigError(
-            f"no motion informs {', '.join(lost)}: no sensor sees it to first order, a change by its whole value moves "
-            f"all readings together by {worst:.1g} standard deviations",
-            where="plan.identify",
-            allowed="a parameter that a sensor sees",
-            hint="; ".join(_would_see(experiment, name, _random(experiment, 0)) for name in lost),
-        )
+        what = f"no motion informs {', '.join(lost)}: no sensor sees it to first order, a change by its whole value "
+        what += f"moves all readings together by {worst:.1g} standard deviations"
+        hint = "; ".join(_would_see(experiment, name, _random(experiment, 0)) for name in lost)
+        raise ConfigError(what, where="plan.identify", allowed="a parameter that a sensor sees", hint=hint)
     for effect in rivals:
         if all(name in unseen for name in effect.amplitude_names):
             what = f"no motion tells {effect.label} from anything: no sensor sees it to first order"
@@ -284,10 +268,8 @@ def _would_see(experiment: PlannedExperiment, name: str, w: Array) -> str:
     moved_by = f"{1e3 * farthest[best]:.2g} mm in {motion}"
     if farthest[best] > _MIN_VISIBLE_MOTION:
         return f"let a camera see {seen[best].description}: it moves by {moved_by}"
-    return (
-        f"no point of the object moves by more than {moved_by}: take another grasp, which loads it "
-        "(`identifiability --what-if` tries some), or fix it"
-    )
+    grasp = "take another grasp, which loads it (`identifiability --what-if` tries some), or fix it"
+    return f"no point of the object moves by more than {moved_by}: {grasp}"
 
 
 def _plan(
@@ -332,9 +314,9 @@ def _plan(
 def _judged(experiment: PlannedExperiment, criterion: OptimalityCriterion, found: MotionSearchResult) -> float:
     try:
         rows = experiment.configured_problem_sensitivities(found.w)
-        return criterion.value_and_gradient_by_sensitivities(rows, False)[0]
     except SolverError:
         return -math.inf
+    return criterion.value_and_gradient_by_sensitivities(rows, False)[0]
 
 
 def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, _ParameterPrecision], tuple[str, ...]]:

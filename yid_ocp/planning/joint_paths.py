@@ -155,35 +155,24 @@ class SplinePath:
     duration: float  # [s]
     n_coefficients: int  # K, coefficients of each joint; the last one is its displacement at the end
 
-    @property
-    def knots(self) -> Array:
-        """Knot vector of the spline [s]."""
-        inner = np.linspace(0.0, self.duration, self._controls - _SPLINE_DEGREE + 1)
-        return np.concatenate([np.zeros(_SPLINE_DEGREE), inner, np.full(_SPLINE_DEGREE, self.duration)])
-
-    @property
-    def _controls(self) -> int:
-        return 2 * _N_REST_CONTROL_POINTS + self.n_coefficients - 1
+    def _splines(self, order: int) -> BSpline:
+        """One spline for each coefficient, or a derivative of it."""
+        ends, free = _N_REST_CONTROL_POINTS, self.n_coefficients - 1
+        controls = np.zeros((2 * ends + free, self.n_coefficients))
+        controls[ends : ends + free, :-1] = np.eye(free)
+        controls[-ends:, -1] = 1.0
+        inner = np.linspace(0.0, self.duration, len(controls) - _SPLINE_DEGREE + 1)
+        knots = np.concatenate([np.zeros(_SPLINE_DEGREE), inner, np.full(_SPLINE_DEGREE, self.duration)])
+        return BSpline(knots, controls, _SPLINE_DEGREE).derivative(order)
 
     def coefficients_to_control_points_matrix(self, order: int = 0) -> Array:
         """Matrix that maps coefficients to control points of the spline or of a derivative, shape (..., K)."""
-        spread = np.zeros((self._controls, self.n_coefficients))
-        ends, free = _N_REST_CONTROL_POINTS, self.n_coefficients - 1
-        spread[ends : ends + free, :-1] = np.eye(free)
-        spread[-ends:, -1] = 1.0
-        knots = self.knots
-        for i in range(order):
-            degree = _SPLINE_DEGREE - i
-            width = knots[degree + 1 + i : len(knots) - 1 - i] - knots[1 + i : len(knots) - degree - 1 - i]
-            spread = degree * np.diff(spread, axis=0) / width[:, None]
-        return spread
+        splines = self._splines(order)
+        return np.asarray(splines.c[: len(splines.t) - splines.k - 1])
 
     def basis_values(self, t: Array, order: int = 0) -> Array:
         """Values of the basis functions, or of a derivative of them, at times, shape (N, K)."""
-        knots = self.knots
-        own = knots[order : len(knots) - order]
-        inside = np.minimum(np.asarray(t, float), self.duration)
-        values = BSpline(own, self.coefficients_to_control_points_matrix(order), _SPLINE_DEGREE - order)(inside)
+        values = self._splines(order)(np.minimum(np.asarray(t, float), self.duration))
         return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
 
     def straight_line_coefficients(self, change: Array) -> Array:
@@ -217,10 +206,8 @@ class PathSimulator:
 
     def coefficient_bounds(self) -> tuple[Array, Array]:
         """Lowest and highest coefficients that keep the joints' position limits, shape (K, nc) each."""
-        shape = (self.path.n_coefficients, 1)
-        lower, upper = (
-            np.tile(side - self.moved_joint_start_positions, shape) for side in _position_limits(self.step.system)
-        )
+        shape, limits = (self.path.n_coefficients, 1), _position_limits(self.step.system)
+        lower, upper = (np.tile(side - self.moved_joint_start_positions, shape) for side in limits)
         return lower, upper
 
     @cached_property
@@ -320,15 +307,14 @@ class PlannedMotion:
     @cached_property
     def point_trajectories(self) -> dict[str, Array]:
         """Trajectories of the system's points and of the one with a target by name, each of shape (N + 1, 3) [m]."""
-        names = self._point_names
-        places = self.simulator.trajectories(
-            FramePositionFunction(self.simulator.step.system, names), self.rollout.state
-        )
+        system = self.simulator.step.system
+        names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
+        places = self.simulator.trajectories(FramePositionFunction(system, names), self.rollout.state)
         return {name: places[:, i] for i, name in enumerate(names)}
 
     @property
-    def _point_names(self) -> tuple[str, ...]:
-        return self.simulator.step.system.point_frames
+    def _further_points(self) -> tuple[str, ...]:
+        return ()
 
 
 def _position_limits(system: System) -> tuple[Array, Array]:
@@ -365,13 +351,9 @@ def solve_start_equilibrium(step: Step, theta: Array, posture: Array, guess: Arr
     """
     rest = EquilibriumSolver(step).solve(posture, theta, guess=guess)
     if not rest.is_converged:
-        raise ModelError(
-            f"the motion cannot begin: {rest.message}",
-            where="plan.start_joint_positions",
-            allowed="a posture at which every grasp holds the object at rest",
-            hint="give plan.start_joint_positions or a recording, which begins where the object is held; or correct "
-            "model.grasp",
-        )
+        allowed, where = "a posture at which every grasp holds the object at rest", "plan.start_joint_positions"
+        hint = f"give {where} or a recording, which begins where the object is held; or correct model.grasp"
+        raise ModelError(f"the motion cannot begin: {rest.message}", where=where, allowed=allowed, hint=hint)
     return rest
 
 
@@ -387,12 +369,9 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
     for i, which, unit, value, limit in rows:
         if not abs(value) <= limit * (1 + 1e-9):
             over = f"{value:.4g} {unit}, {abs(value) - limit:.3g} beyond its limit"
-            raise ConfigError(
-                f"{joints[i].name} at rest {when} takes {over}",
-                where=f"plan.limits.{which}",
-                allowed=f"up to {limit:.4g} {unit}",
-                hint=f"raise plan.limits.{which} where the machine allows it, or take another posture or place",
-            )
+            what, where = f"{joints[i].name} at rest {when} takes {over}", f"plan.limits.{which}"
+            hint = f"raise {where} where the machine allows it, or take another posture or place"
+            raise ConfigError(what, where=where, allowed=f"up to {limit:.4g} {unit}", hint=hint)
 
 
 def solve_end_equilibrium(
@@ -436,13 +415,10 @@ def solve_end_equilibrium(
         near = (found.x - lower < 1e-3) | (upper - found.x < 1e-3)
         names = ", ".join(name for name, one in zip(system.prescribed, near, strict=True) if one)
         limits = f", with {names} at the joint's limit" if names else ""
-        raise ConfigError(
-            f"the goal is out of reach: '{point.names[0]}' comes to rest {off}{limits}",
-            where=f"plan.target_position ({', '.join(f'{x:.4g}' for x in place)} m in the world)",
-            allowed="a place at which the point can rest",
-            hint="take a nearer place, a smaller plan.target_offset, or another plan.start_joint_positions to begin "
-            "with",
-        )
+        what = f"the goal is out of reach: '{point.names[0]}' comes to rest {off}{limits}"
+        where = f"plan.target_position ({', '.join(f'{x:.4g}' for x in place)} m in the world)"
+        hint = "take a nearer place, a smaller plan.target_offset, or another plan.start_joint_positions to begin with"
+        raise ConfigError(what, where=where, allowed="a place at which the point can rest", hint=hint)
     return rest
 
 

@@ -58,8 +58,8 @@ class TargetMotionPlan(PlannedMotion):
     n_evaluations: int
 
     @property
-    def _point_names(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys((*self.simulator.step.system.point_frames, self.target_point)))
+    def _further_points(self) -> tuple[str, ...]:
+        return (self.target_point,)
 
 
 def plan_motion_to_target(
@@ -161,19 +161,16 @@ def _check_box(options: PlanOptions, inside: FramePositionFunction, at: Array, p
         over = np.maximum(low - where, where - high)
         if np.any(over > 0):
             row = int(np.argmax(over))
-            raise ConfigError(
-                f"'{name}' {when} {1e3 * over[row]:.3g} mm outside the box along {'xyz'[row]}",
-                where="plan.box",
-                allowed=f"{low[row]:.4g} to {high[row]:.4g} m, it is at {where[row]:.4g} m",
-                hint="enlarge the box, or name the frames to keep in it under plan.frames_in_box",
-            )
+            what = f"'{name}' {when} {1e3 * over[row]:.3g} mm outside the box along {'xyz'[row]}"
+            allowed = f"{low[row]:.4g} to {high[row]:.4g} m, it is at {where[row]:.4g} m"
+            hint = "enlarge the box, or name the frames to keep in it under plan.frames_in_box"
+            raise ConfigError(what, where="plan.box", allowed=allowed, hint=hint)
 
 
 def _attempt(rows: PlanResidualsAndLimits, known: ParameterCovariance) -> TargetMotionPlan:
     """The best motion of one duration: found with the step's time step, sharpened with shorter ones.
 
-    What swings in the end is a small difference of large motions: a step that is fine enough for them leaves out part
-    of it.
+    What swings in the end is a small difference of large motions, and a part of it is lost by too coarse a step.
     """
     options, mover, guess, evaluations = rows.options, rows.simulator, rows.quasi_static_coefficients, 0
     lower, upper = mover.coefficient_bounds()
@@ -199,10 +196,8 @@ def _at_rest(mover: PathSimulator, step: Step, theta: Array) -> PathSimulator:
 
 def _steady(rows: PlanResidualsAndLimits, finer: PathSimulator, w: Array) -> bool:
     """Whether half the time step moves the point neither from where it arrives nor from rest."""
-    own, other = (
-        mover.trajectories(rows.point, mover.simulate_path(w).state[::every])
-        for mover, every in ((rows.simulator, 1), (finer, 2))
-    )
+    pairs = ((rows.simulator, 1), (finer, 2))
+    own, other = (mover.trajectories(rows.point, mover.simulate_path(w).state[::n]) for mover, n in pairs)
     change = (other - own)[rows.simulator.standstill_node_indices]
     place = np.linalg.norm(change[:, 0], axis=1).max()
     speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / rows.simulator.step.time_step

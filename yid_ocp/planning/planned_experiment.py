@@ -61,10 +61,7 @@ class PlannedExperiment:
     ) -> PlannedExperiment:
         """The experiment described by a plan's options, at values of some parameters, with some of them free.
 
-        Raises
-        ------
-        ConfigError, ModelError
-            No joint moves, or clamps follow measured points; there is no rest to begin from.
+        `ConfigError` or `ModelError`: no joint moves, or clamps follow measured points; there is no rest to begin from.
         """
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_paths or not (system.driven or system.prescribed):
@@ -179,10 +176,7 @@ class PlannedExperiment:
         return problem.with_free_subset(self.free_parameters)
 
     def configured_problem_sensitivities(self, w: Array) -> Array:
-        """Whitened sensitivities of the planned recording to relative changes of the configured problem's unknowns.
-
-        `SolverError` where the motion cannot be followed by its torques.
-        """
+        """As `existing_recording_sensitivities`, of the planned one; `SolverError` if its torques do not follow it."""
         return self._weighted(self.planned_estimation_problem(w))
 
     @property
@@ -199,10 +193,7 @@ class PlannedExperiment:
         return self._relative(problem, evaluation)
 
     def _relative(self, problem: EstimationProblem, evaluation: Evaluation) -> Array:
-        """Sensitivities to relative changes, without what is known beforehand of the parameters themselves.
-
-        That is not something that a sensor sees.
-        """
+        """Sensitivities to relative changes, without what is known of the parameters beforehand: no sensor sees it."""
         jacobian = linearization_without_weak_priors(problem, evaluation)[1] * _sizes(problem)
         own = np.array([name.split("[")[0] in self.free_parameters for name in problem.unknown_names])
         jacobian[problem.residual_rows.stated_priors] *= ~own
@@ -253,17 +244,12 @@ class PlannedExperiment:
                 continue
             joint = np.broadcast_to(np.arange(samples.value.shape[1]), samples.value.shape)[samples.used_output_mask]
             for i, (name, size) in enumerate(std.items()):
-                own = joint == samples.sensor.effort_joints.index(name)
-                found[rows, i] = samples.decorrelate(
-                    np.where(own, size * samples.weight[samples.used_output_mask], 0.0)
-                )
+                own = np.where(joint == samples.sensor.effort_joints.index(name), size, 0.0)
+                found[rows, i] = samples.decorrelate(own * samples.weight[samples.used_output_mask])
         return np.vstack([found, np.eye(len(std))])
 
     def search_problem_sensitivities(self, w: Array) -> Array | None:
-        """Whitened sensitivities of all measurements to relative changes of the unknowns, (nr, columns).
-
-        With rows for the priors of nuisances; None where the motion cannot be simulated.
-        """
+        """Whitened sensitivities (nr, columns) of all measurements and nuisance priors to relative changes, or None."""
         moved, evaluation = self._evaluated(np.asarray(self.simulator.joint_positions(w)))
         if not evaluation.ok:
             return None
