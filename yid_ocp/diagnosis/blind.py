@@ -79,11 +79,10 @@ def plan_blind_cases(
     kept = kept or {max(weights, key=lambda name: weights[name]): 1.0}
     slots: list[tuple[str, float | None]] = []
     for category, number in _dealt(count, BLIND_CASE_CATEGORY_SHARES).items():
+        sizes = {_DETECTABLE_MULTIPLES[-1] if category in ("pair", "left_out") else None: number}
         if category == "single":
-            for size, times in _dealt(number, dict.fromkeys(_DETECTABLE_MULTIPLES, 1.0)).items():
-                slots += [(category, size)] * times
-        else:
-            slots += [(category, _DETECTABLE_MULTIPLES[-1] if category in ("pair", "left_out") else None)] * number
+            sizes = _dealt(number, dict.fromkeys(_DETECTABLE_MULTIPLES, 1.0))
+        slots += [(category, size) for size, times in sizes.items() for _ in range(times)]
     # the experiment that is furthest behind its part gets the next case, so that every sort is spread over all
     given = dict.fromkeys(kept, 0)
     cases = []
@@ -316,11 +315,8 @@ class BlindCaseGenerator:
             left_out = (injected[0].kind,) if wanted.category == "left_out" else self._other_kind(injected, rng)
             label = CaseGroundTruth(name, wanted.category, injected, multiple, truth, wanted.experiment)
             return BlindCase(name, tuple(estimate), held_out, left_out), label
-        raise ModelError(
-            f"none of {MAX_CASE_DRAWS} motions can be simulated",
-            where=f"{name} of {wanted.experiment}",
-            hint="take another --seed: a seed draws the same again",
-        )
+        what, where = f"none of {MAX_CASE_DRAWS} motions can be simulated", f"{name} of {wanted.experiment}"
+        raise ModelError(what, where=where, hint="take another --seed: a seed draws the same again")
 
     def _other_kind(self, injected: Sequence[InjectedEffect], rng: np.random.Generator) -> tuple[str, ...]:
         kinds = sorted({e.kind for e, *_ in self._detectable} - {effect.kind for effect in injected})
@@ -378,8 +374,7 @@ class BlindCaseGenerator:
             "segment": tuple(segment.name for segment in system.segment_layouts),
             "grasp": tuple(grasp.name for grasp in system.grasps),
         }
-        known = [kind for kind in OUT_OF_LIBRARY_EFFECTS if places[_OUT_OF_LIBRARY_SIZES[kind][0]]]
-        kind = str(rng.choice(known))
+        kind = str(rng.choice([kind for kind in OUT_OF_LIBRARY_EFFECTS if places[_OUT_OF_LIBRARY_SIZES[kind][0]]]))
         place, low, high, part_of = _OUT_OF_LIBRARY_SIZES[kind]
         location = str(rng.choice(places[place]))
         size = float(rng.uniform(low, high))
@@ -409,15 +404,11 @@ def simulate_random_motion(
     rng: np.random.Generator,
     conditions: SyntheticRecordingConditions,
 ) -> Recording:
-    """Simulate a random motion planned for the nominal system, from a configuration of the driven joints.
-
-    `truth` and `values` are the parameters of the nominal and of the simulated system.
-    """
+    """Simulate a random motion planned for the nominal system and `truth`; `values` are those of the simulated one."""
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
-    motion = random_multisine_motion(
-        nominal, truth, seed=int(rng.integers(2**31)), initial_joint_angles=posture, excitation=excitation
-    )
+    seed = int(rng.integers(2**31))
+    motion = random_multisine_motion(nominal, truth, seed=seed, initial_joint_angles=posture, excitation=excitation)
     experiment = VirtualExperiment(
         motion=motion,
         initial_joint_angles=posture,
@@ -441,10 +432,7 @@ def initial_driven_joint_positions(system: System, recording: Recording) -> dict
 
 
 def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters of the same tubes with more links: joint springs and dampers scaled by their number.
-
-    A segment whose links did not change, or whose stiffness is that of its cross section, keeps its values.
-    """
+    """Return the parameters of the same tubes with more links: joint springs and dampers scaled by their number."""
     start = dict(zip(nominal.parameters.names, map(float, nominal.parameters.vector()), strict=True))
     finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
     values = dict(truth)
@@ -483,13 +471,12 @@ def true_effects_gap_closure(
     nominal = fit_nominal_model(problem, composed)
     true = {entry.label: entry.values for entry in label.injected}
     chosen = [effect for effect in composed.candidate_effects if effect.label in true]
-    # reported values in the parameters' own unit
-    start = {
-        f"{effect.label}.{quantity.name}": quantity.to_internal(true[effect.label][quantity.reported_name_and_unit[0]])
-        for effect in chosen
-        for quantity in effect.definitions
-        if quantity.reported_name_and_unit[0] in true[effect.label]
-    }
+    start = {}  # reported values in the parameters' own unit
+    for effect in chosen:
+        for quantity in effect.definitions:
+            reported = true[effect.label].get(quantity.reported_name_and_unit[0])
+            if reported is not None:
+                start[f"{effect.label}.{quantity.name}"] = quantity.to_internal(reported)
     # under the weights of the nominal fit, as all that it is compared with
     fit = refit_with_effects(replace(composed, problem=nominal.problem), chosen, {**nominal.values, **start})
     if fit is None or len(chosen) < len(true):

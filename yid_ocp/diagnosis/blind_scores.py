@@ -134,10 +134,8 @@ def _found(true: Sequence[str], named: Sequence[str], groups: Sequence[tuple[str
     """Whether every true effect has one of its own among those named: itself, or one in a small set with it."""
     if not true:
         return True
-    sets = [
-        {name, *(label for group in groups if name in group and len(group) <= _MAX_CONFUSABLE_SET for label in group)}
-        for name in named
-    ]
+    small = [group for group in groups if len(group) <= _MAX_CONFUSABLE_SET]
+    sets = [{name, *(label for group in small if name in group for label in group)} for name in named]
     return any(true[0] in own and _found(true[1:], [*named[:i], *named[i + 1 :]], groups) for i, own in enumerate(sets))
 
 
@@ -177,6 +175,7 @@ def ensemble_success_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
         "interval_coverage": [inside for _, inside in errors],
     }
     intervals = {name: _binomial_proportion(hits) for name, hits in shares.items()}
+    experiments = dict.fromkeys(m.experiment for m in marks)
     detected = {}
     for size in sorted({m.multiple for m in singles if math.isfinite(m.multiple)}):
         own = [m for m in singles if m.multiple == size]
@@ -186,25 +185,23 @@ def ensemble_success_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     return {
         "format": _FORMAT,
         "cases": len(marks),
-        **{name: entry["rate"] for name, entry in intervals.items()},
+        **_rates(intervals),
         "intervals": intervals,
-        "detection": {
-            size: {"cases": own["gap"]["of"], **{name: entry["rate"] for name, entry in own.items()}}
-            for size, own in detected.items()
-        },
+        "detection": {size: {"cases": own["gap"]["of"], **_rates(own)} for size, own in detected.items()},
         "detection_intervals": detected,
         "set_size": mean([len(m.named_effect_labels) for m in named]),
         "closure_of_best": mean([m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]),
         "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
         "seconds": mean([m.seconds for m in marks if math.isfinite(m.seconds)]),
-        "experiments": {
-            name: _experiment_rates([m for m in marks if m.experiment == name])
-            for name in dict.fromkeys(m.experiment for m in marks)
-        },
+        "experiments": {name: _experiment_rates([m for m in marks if m.experiment == name]) for name in experiments},
         "confusion": _confusion_matrix(marks),
         "calibration": _calibration_rates(marks),
         "marks": [asdict(m) for m in marks],
     }
+
+
+def _rates(intervals: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    return {name: entry["rate"] for name, entry in intervals.items()}
 
 
 def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
@@ -243,10 +240,7 @@ _Statistic = Callable[[_Statistics, Thresholds, str], float]
 
 
 def permissive_thresholds(limits: Thresholds) -> Thresholds:
-    """Return thresholds by which any residual is a gap and the best candidate is always added.
-
-    A diagnosis of clean recordings with these shows how far chance alone goes.
-    """
+    """Return thresholds by which any residual is a gap and the best candidate is added, to see how far chance goes."""
     sure = 1.0 + 1e-9
     return replace(
         limits,
@@ -272,9 +266,8 @@ def _excess(said: _Statistics, limits: Thresholds, _: str) -> float:
 
 def _along(said: _Statistics, limits: Thresholds, _: str) -> float:
     """That of the worst channel, if any candidate is significant."""
-    return (
-        (said["largest_channel"] or 1.0) - 1 if said["candidate"] < limits.candidate_significance_level else -math.inf
-    )
+    is_sure = said["candidate"] < limits.candidate_significance_level
+    return (said["largest_channel"] or 1.0) - 1 if is_sure else -math.inf
 
 
 def _of(name: str) -> _Statistic:
@@ -283,11 +276,8 @@ def _of(name: str) -> _Statistic:
 
 def _rivals(said: _Statistics, limits: Thresholds, truth: str) -> Mapping[str, _Statistics]:
     """Effects refitted alone that leave little but noise, if the true one does: likelihood tells only these apart."""
-    found = {
-        label: own
-        for label, own in said["behind"].items()
-        if own["left"] is not None and own["left"] < 1 + limits.min_excess_chi2
-    }
+    most, behind = 1 + limits.min_excess_chi2, said["behind"].items()
+    found = {label: own for label, own in behind if own["left"] is not None and own["left"] < most}
     return found if truth in found else {}
 
 
@@ -370,28 +360,24 @@ def calibrate_thresholds(
     Labels, marks and answers are of the same cases. An answer is a `result` with its `statistics`, and those with open
     thresholds (`open`) where no gap was seen; `limits` are those by which it was given.
     """
-    cases = [
-        (label.category, mark, said, entry.get("open") or {})
-        for label, mark, entry in zip(labels, marks, answers, strict=True)
-        if (said := entry["result"].get("statistics")) is not None
-    ]
+    every = zip(labels, marks, answers, strict=True)
+    known = ((label, mark, entry["result"].get("statistics"), entry.get("open") or {}) for label, mark, entry in every)
+    cases = [(label.category, mark, said, wide) for label, mark, said, wide in known if said is not None]
     # where thresholds were opened for a clean recording, but for one that cannot be diagnosed so
     clean = [wide if "p_value" in wide else said for category, _, said, wide in cases if category == "null"]
     single = [(mark, said) for category, mark, said, _ in cases if category == "single"]
     outside = [said for category, _, said, _ in cases if category in _OUT_OF_LIBRARY_CATEGORIES]
     found = {}
     for name, rule in _CALIBRATION_RULES.items():
-        known = [(m, rule.statistic(said, limits, m.truth)) for m, said in single if m.right or rule.of != "named"]
-        sample = [value for _, value in known if value > -math.inf]
+        scored = [(m, rule.statistic(said, limits, m.truth)) for m, said in single if m.right or rule.of != "named"]
+        sample = [value for _, value in scored if value > -math.inf]
         if rule.of == "clean":
             sample = [rule.statistic(said, limits, "") for said in clean]
         value, attained = _conformal_quantile(sample, rule.side, coverage)
         # what chance brings more of is what small values tell of
         sign = -1.0 if rule.of == "clean" and rule.side == "least" else 1.0
-        beyond = {
-            size: [sign * x > sign * value for m, x in known if m.multiple == size]
-            for size in sorted({m.multiple for m, _ in known})
-        }
+        sizes = sorted({m.multiple for m, _ in scored})
+        beyond = {size: [sign * x > sign * value for m, x in scored if m.multiple == size] for size in sizes}
         strange = [sign * rule.statistic(said, limits, "") > sign * value for said in outside]
         found[name] = {
             "setting": rule.setting,

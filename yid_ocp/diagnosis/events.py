@@ -139,13 +139,11 @@ def find_disturbance_events(
     The problem is whitened by the sensors' noise and has all samples; `x` (nx,) is its fit, at which `evaluation` has a
     Jacobian where there is `smoothed`. Forces that move the model are sought where the smoother found some.
     """
-    runs: list[_RecordingRollout] = []
-    for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
-        runs.append((episode, result, problem.predictor.theta_with_episode_values(episode, problem.split(x, i)[0])))
+    fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
+    told = [(e, result, problem.split(x, i)[0]) for i, (e, result) in enumerate(fitted)]
     shared = problem.split(x, 0)[0]
-    for episode, outcome in problem.predict_held_out(x):
-        if not isinstance(outcome, str):
-            runs.append((episode, outcome, problem.predictor.theta_with_episode_values(episode, shared)))
+    told += [(e, found, shared) for e, found in problem.predict_held_out(x) if not isinstance(found, str)]
+    runs = [(e, result, problem.predictor.theta_with_episode_values(e, theta)) for e, result, theta in told]
     ends = EventSet((), tuple(fall for run in runs for fall in _overspeed(problem, run, limits)))
     wrong = [e for run in runs for e in _wrong_samples(problem, run) if e.end_time < ends._end_of(e.recording)]
     torques = InverseDynamicsModel(problem.step)
@@ -153,12 +151,8 @@ def find_disturbance_events(
     if smoothed is not None:
         histories += _driving_forces(problem, x, evaluation, runs, smoothed, torques, limits)
     cut = [entry for entry in (_before_overspeed(history, ends) for history in histories) if entry is not None]
-    found: list[tuple[ForceEstimate, DetectedForcePulse]] = []
-    tries = 0.0
-    for history in cut:
-        own, looked = detect_force_pulses(history, limits)
-        tries += looked
-        found += [(history, pulse) for pulse in own]
+    sought = [(history, *detect_force_pulses(history, limits)) for history in cut]
+    found, tries = [(history, pulse) for history, own, _ in sought for pulse in own], sum(n for *_, n in sought)
     real = benjamini_hochberg_mask([pulse.p_value for _, pulse in found], tries, limits.significance_level)
     forces = _one_each([entry for entry, sure in zip(found, real, strict=True) if sure], problem)
     times = {(e.recording, 0.5 * (e.start_time + e.end_time)) for e in wrong}
@@ -280,10 +274,9 @@ def _short(smoothed: SmootherResult, recording: int, limits: Thresholds) -> list
     """Unknown forces that are surely there, but for a small part of the time only."""
     trace, names = smoothed.smoothed_unknowns[recording], []
     for i, source in enumerate(trace.unknown_groups):
-        if source.kind != "force" or source.is_confounded_with_bias or not smoothed.group_variance[source]:
-            continue
         sure = is_significantly_nonzero(trace, [i], limits.location_z)
-        if np.any(sure) and np.mean(sure) <= MAX_EVENT_TIME_FRACTION:
+        is_force = source.kind == "force" and not source.is_confounded_with_bias and smoothed.group_variance[source]
+        if is_force and 0 < np.mean(sure) <= MAX_EVENT_TIME_FRACTION:
             names.append(trace.unknown_names[i])
     return names
 

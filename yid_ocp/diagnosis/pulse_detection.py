@@ -287,10 +287,7 @@ class _Rest:
         return np.asarray(np.sum(profiles * product, axis=0))
 
     def gains(self, profiles: _SparseMatrix, bare: Array | None = None) -> Array:
-        """By how much the evidence rises with each of some profiles (M, k) of its best size, shape (k,).
-
-        `bare` is what `information` says of them with nothing taken in, where that is known already.
-        """
+        """By how much the evidence rises with each profile (M, k) of its best size, (k,); `bare`: of `information`."""
         told, sure = self._sizes(profiles, bare)
         return np.where(sure > 0, 0.5 * told**2 / np.where(sure > 0, sure, 1.0), 0.0)
 

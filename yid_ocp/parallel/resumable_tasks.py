@@ -64,10 +64,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """The workers of a run: processes on this machine, or those of a Dask scheduler (address or scheduler file).
-
-    `ConfigError` where there is no process at all, or both are given.
-    """
+    """The workers of a run: processes here, or those of a Dask scheduler (address or file); `ConfigError` for both."""
 
     n_processes: int | None = None
     scheduler_address: str = ""
@@ -81,10 +78,7 @@ class WorkerConfig:
             raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
     def check_available(self) -> None:
-        """Check before long work that the workers are available.
-
-        `WorkerError` where Dask is not installed, no scheduler answers, or a worker is not fit for the work.
-        """
+        """Raise `WorkerError` before long work where no scheduler answers, or a worker is not fit for it."""
         if self.scheduler_address:
             with _dask_executor(self.scheduler_address):
                 pass
@@ -264,10 +258,7 @@ def _drain(
     finished: _TaskFinishedCallback,
     look: Callable[[], None] | None = None,
 ) -> tuple[list[_Job], list[_Job]]:
-    """Run jobs, at most `at_once` concurrently; returns jobs lost with a broken executor, and jobs never started.
-
-    `look` is called now and then while nothing happens.
-    """
+    """Run jobs, at most `at_once` concurrently; returns jobs lost with a broken executor, and jobs never started."""
     queue, running, lost = deque(jobs), dict[Future[str], _Job](), list[_Job]()
     try:
         while (queue and not lost) or running:
@@ -404,9 +395,9 @@ def _refuse_unfit(client: Any, function: _TaskFunction | None, folder: Path | No
     """
     for address, count in client.nthreads().items():
         if count > 1:
+            what = f"a worker would do {count} tasks at once in one process"
             allowed = "one task at a time in every process"
             hint = "start workers with --nthreads 1, and --nworkers for as many as the machine has processors"
-            what = f"a worker would do {count} tasks at once in one process"
             raise WorkerError(what, where=address, allowed=allowed, hint=hint)
     here = software_fingerprint()
     for address, entry in client.get_versions()["workers"].items():

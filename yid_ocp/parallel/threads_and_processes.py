@@ -45,10 +45,7 @@ def available_processor_count() -> int:
 
 
 def _max_threads() -> int:
-    """Number of threads that the caller may use: the process's limit, or its share within `map_in_threads`.
-
-    `ConfigError` where `YID_OCP_THREADS` is no number of threads.
-    """
+    """Number of threads that the caller may use: the process's limit, or its share within `map_in_threads`."""
     said = os.environ.get(_THREADS_VARIABLE, "")
     if said and not (said.isdecimal() and int(said)):
         raise ConfigError(f"{_THREADS_VARIABLE} is '{said}'", where="environment", allowed="a whole number from 1")
@@ -164,10 +161,7 @@ def _answer(requests: Sequence[_Request]) -> None:
 
 
 def batched_call(function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]) -> list[_Answer]:
-    """Results of a function of many arguments, in one call with those of other `map_with_batched_calls` items.
-
-    `function` answers any number of questions; equal functions are asked together.
-    """
+    """Answers of a function to questions, in one call with those of other `map_with_batched_calls` items."""
     march = getattr(_SHARE, "march", None)
     if march is None:
         return function(questions)
@@ -241,13 +235,12 @@ class InlineExecutor(Executor):
 
 
 def process_pool(workers: int | None = None) -> ProcessPoolExecutor:
-    """A pool of spawned processes, by default one per processor; they ignore interrupt signals.
+    """A pool of processes that ignore interrupt signals, by default one per processor.
 
-    They are started anew instead of forked: a fork copies the locks of threads that it does not copy. Together they use
-    as many threads as this process might.
+    Together they use as many threads as this process might.
     """
     count = workers or available_processor_count()
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("spawn")  # a fork copies the locks of threads that it does not copy
     each = max(1, _max_threads() // count)
     return ProcessPoolExecutor(count, mp_context=context, initializer=_begin_worker, initargs=(each,))
 

@@ -222,10 +222,7 @@ class PlanShootingProblem:
     def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> PlanShootingResult:
         """Optimise a motion from initial coefficients within bounds, all of shape (K, nc).
 
-        References
-        ----------
-        Rockafellar (1973), Math. Programming 5:354, doi:10.1007/BF01580138.
-        Branch, Coleman and Li (1999), SIAM J. Sci. Comput. 21(1):1, doi:10.1137/S1064827595289108.
+        Rockafellar (1973), doi:10.1007/BF01580138; Branch, Coleman and Li (1999), doi:10.1137/S1064827595289108.
         """
         low, high = lower.ravel(), upper.ravel()
         x = np.clip(start.ravel(), low + 1e-9, high - 1e-9)
@@ -282,11 +279,8 @@ def _prior(columns: int, bounded: Sequence[int]) -> Array:
 class DOptimalityCriterion:
     """Minus half the log determinant of the covariance of chosen parameters, all others and nuisances eliminated.
 
-    With all parameters chosen that is D-optimality, with some of them D_s-optimality, with one its standard deviation.
-
-    References
-    ----------
-    Atkinson, Donev and Tobias (2007), Optimum Experimental Designs, with SAS, sections 10.2 and 10.3.
+    D-optimality, with some of the parameters chosen D_s-optimality: Atkinson, Donev and Tobias (2007), Optimum
+    Experimental Designs, with SAS, sections 10.2 and 10.3.
     """
 
     chosen_columns: tuple[int, ...]
@@ -353,8 +347,7 @@ class EffectDiscriminationCriterion:
 
 OptimalityCriterion = DOptimalityCriterion | EffectDiscriminationCriterion
 
-_INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 0.05, 0.4  # of the trust region, for every unknown of the motion [rad or m]
-_MIN_TRUST_RADIUS = 1e-3
+_MIN_TRUST_RADIUS, _INITIAL_TRUST_RADIUS, _MAX_TRUST_RADIUS = 1e-3, 0.05, 0.4  # for every unknown [rad or m]
 _MIN_STEP = 1e-9  # step in the linear picture that counts as none [rad or m]
 _MAX_INNER_ITERATIONS = 100  # iterations of the inner search
 _LIMIT_SLACK = 1e-3  # by which the linear limits are tighter, in parts of the limits
@@ -473,9 +466,8 @@ class InformativeMotionSearch:
         low = np.maximum(-1.0, np.minimum(self.lower - w.ravel(), 0.0) / radius)
         high = np.minimum(1.0, np.maximum(self.upper - w.ravel(), 0.0) / radius)
         constraints = [{"type": "ineq", "fun": lambda x: normal @ x + room, "jac": lambda x: normal}]
-        found = minimize(
-            cost, np.zeros(w.size), jac=True, method="SLSQP", bounds=list(zip(low, high, strict=True)),
-            constraints=constraints if len(room) else (), options={"maxiter": _MAX_INNER_ITERATIONS, "ftol": 1e-4},
-        )  # fmt: skip
+        limits = {"bounds": list(zip(low, high, strict=True)), "constraints": constraints if len(room) else ()}
+        stop = {"maxiter": _MAX_INNER_ITERATIONS, "ftol": 1e-4}
+        found = minimize(cost, np.zeros(w.size), jac=True, method="SLSQP", options=stop, **limits)
         step = radius * np.clip(found.x, low, high)
         return step if np.all(np.isfinite(step)) else np.zeros_like(step)
