@@ -33,17 +33,13 @@ def _effort_joints(system: System) -> tuple[str, ...]:
     return tuple(name for name in _recorded_joints(system) if name not in system.servos)
 
 
-def _servo_joints(system: System) -> tuple[str, ...]:
-    return tuple(name for name in base.arm_joint_names(system) if name in system.servos)
-
-
 def _dc_motor_joints(system: System) -> tuple[str, ...]:
-    return tuple(name for name in _servo_joints(system) if system.servos[name].motor_kind == "dc")
+    return tuple(name for name in base.servo_joint_names(system) if system.servos[name].motor_kind == "dc")
 
 
 def _geared_joints(system: System) -> tuple[str, ...]:
     """Names of arm joints whose effort is known; of joints with a servo where there are none."""
-    return _effort_joints(system) or _servo_joints(system)
+    return _effort_joints(system) or base.servo_joint_names(system)
 
 
 def _effort_arms(system: System) -> tuple[str, ...]:
@@ -271,7 +267,7 @@ class _ServoChange(EffectBase):
 
     required_excitation = "how hard it accelerates"
     required_sensors = frozenset({"joints.position"})
-    possible_locations = _servo_joints
+    possible_locations = base.servo_joint_names
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         return {}

@@ -225,6 +225,11 @@ def arm_joint_names(system: System) -> tuple[str, ...]:
     return tuple(name for name in system.mechanism.joint_names if name not in other)
 
 
+def servo_joint_names(system: System) -> tuple[str, ...]:
+    """Names of the arms' joints with a servo."""
+    return tuple(name for name in arm_joint_names(system) if name in system.servos)
+
+
 def grasp_names(system: System) -> tuple[str, ...]:
     """Names of all grasps, those by clamps included."""
     return tuple(grasp.name for grasp in system.grasps)
@@ -329,9 +334,6 @@ def segment_name_of_frame(system: System, frame: str) -> str | None:
         return None
     name = system.mechanism.joints[index].name
     return next((s.name for s in system.segment_layouts if any(name in link for link in s.link_joints)), None)
-
-
-# -- helpers for the kinds --------------------------------------------------------------------------------------------
 
 
 def segment_elastic_joints(system: System, segment: str) -> tuple[ElasticJoint, ...]:

@@ -191,17 +191,14 @@ class Payload(EffectBase):
         joint, link = system.mechanism.joints[frame.joint_index], _carried_body(system, frame.joint_index)
         mass, centre = self["mass"], ca.SX(ca.DM(link.center_of_mass))
         moment = ca.vertcat(*(self[f"m{axis}"] for axis in "xyz"))
-        first = frame.placement.rotation @ (moment * _kept(mass, moment, link.mass)) + mass * (
-            frame.placement.translation - centre
-        )
+        first = frame.placement.rotation @ (moment * _kept(mass, moment, link.mass))
+        first += mass * (frame.placement.translation - centre)
         second = ca.densify(first @ first.T) * _spread(mass, first, link) - first @ first.T
         tensor = (second[0, 0] + second[1, 1] + second[2, 2]) * ca.SX.eye(3) - second
         # two bodies, of which one weighs 1 kg, so that nothing is divided by the mass
-        pair = (
-            Inertia(ca.SX(1), centre + first, ca.densify(tensor)),
-            Inertia(mass - 1, centre, ca.SX(ca.DM.zeros(3, 3))),
-        )
-        return base.with_changed_joint_bodies(system, [joint.name], lambda bodies: (*bodies, *pair))
+        one = Inertia(ca.SX(1), centre + first, ca.densify(tensor))
+        other = Inertia(mass - 1, centre, ca.SX(ca.DM.zeros(3, 3)))
+        return base.with_changed_joint_bodies(system, [joint.name], lambda bodies: (*bodies, one, other))
 
 
 def _kept(mass: ca.SX, moment: ca.SX, own: float) -> ca.SX:
@@ -337,9 +334,8 @@ class GravityScale(EffectBase):
             nominal = 1 if body.gravity_fraction is None else body.gravity_fraction
             return replace(body, gravity_fraction=nominal + self["fraction"])
 
-        return base.with_changed_joint_bodies(
-            system, base.object_joint_names(system), lambda bodies: map(scaled, bodies)
-        )
+        joints = base.object_joint_names(system)
+        return base.with_changed_joint_bodies(system, joints, lambda bodies: map(scaled, bodies))
 
 
 @EFFECTS.register("gravity_tilt")

@@ -30,11 +30,6 @@ FRICTION_LAWS: Mapping[FrictionLaw, tuple[str, ...]] = {
 """The ladder of friction laws, each with the effects that it has at a joint beside the viscous `JOINT.damping`."""
 
 
-def _servo_joints(system: System) -> tuple[str, ...]:
-    """Names of arm joints with a servo: recorded torques leave no room for what a gear takes of them."""
-    return tuple(name for name in base.arm_joint_names(system) if name in system.servos)
-
-
 class _JointFriction(EffectBase):
     """Friction of an arm joint as a function of its speed."""
 
@@ -95,15 +90,12 @@ class JointLoadFriction(_JointFriction):
     """Friction that grows with the torque through a gear: F = -share |motor torque - torque from outside| sgn(v).
 
     The torque from outside is that of weights and grasps beyond the joint. Both signs are rounded off: that of the
-    speed below `_LOAD_SIGN_SMOOTHING_SPEED`, that of the torque below `_SMOOTHING_TORQUE`.
-
-    References
-    ----------
-    Duclusaud et al. (2024), Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650.
+    speed below `_LOAD_SIGN_SMOOTHING_SPEED`, that of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al.
+    (2024), Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650.
     """
 
     equation = "F = -share |tau_motor - tau_outside| tanh(v/v_s)"
-    candidate_locations = _servo_joints
+    candidate_locations = base.servo_joint_names  # recorded torques leave no room for what a gear takes of them
     declared_parameters = (
         ParameterDefinition("share", "1", 0.0, 0.0, 2.0, (0.0, 0.5), "friction per torque through the gear"),
     )
@@ -127,7 +119,7 @@ class JointLoadFriction(_JointFriction):
 
 @EFFECTS.register("joint_presliding")
 class JointPresliding(EffectBase):
-    """Friction that also holds at rest (Dahl): F = -tau_c s, ds/dt = (v - |v| s) / yield_angle.
+    """Friction that also holds at rest: F = -tau_c s, ds/dt = (v - |v| s) / yield_angle.
 
     s follows the angle, not time: over a step of d = h v
 
@@ -138,11 +130,8 @@ class JointPresliding(EffectBase):
     yield angle. The |d| beside s_k is rounded off below `_ABS_SMOOTHING_ANGLE`. A loaded joint whose arm rings on the
     friction's own stiffness, tau_c/yield_angle, faster than the steps follow creeps a little instead of resting, as
     Dahl's law has it of anything that is shaken: shorter steps hold it. What s was before a recording begins is not
-    known: it is estimated with every recording.
-
-    References
-    ----------
-    Dahl (1968), A solid friction model, Aerospace Corporation TOR-158(3107-18).
+    known: it is estimated with every recording. From Dahl (1968), A solid friction model, Aerospace Corporation
+    TOR-158(3107-18).
     """
 
     equation = "F = -tau_c s, ds/dt = (v - |v| s) / yield_angle"

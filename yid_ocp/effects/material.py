@@ -111,11 +111,7 @@ class Hysteresis(_SegmentMemory):
     """A Dahl friction element parallel to every spring of a segment (bend and twist).
 
     F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `_ABS_SMOOTHING_SPEED`. At the start
-    of a recording z = 0: what came before is not known.
-
-    References
-    ----------
-    Dahl (1968), A solid friction model, Aerospace Corporation TOR-158(3107-18).
+    of a recording z = 0: what came before is not known. From Dahl (1968), as in `joint_presliding`.
     """
 
     equation = "F = -stiffness z, dz/dt = v - |v| z / yield_angle"

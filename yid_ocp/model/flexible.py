@@ -23,63 +23,48 @@ AXIS_UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0,
 
 @dataclass(frozen=True)
 class Segment:
-    """Description of one tube, branch or beam.
-
-    Attributes
-    ----------
-    length : float
-        [m]; ignored when `link_lengths` is given.
-    mass : float
-        Of the whole segment, spread along its length [kg].
-    radius, cross_section : float or (float, float)
-        [m]; one of the two: of the solid cylinder that gives each link's inertia, or the extents of a rectangular
-        section along the links' x and y axes.
-    links, link_lengths : int or sequence of float
-        Number of equal links, or unequal ones [m], base to tip.
-    parent, parent_link_index : str and int, optional
-        Segment on which it grows, None for the root, and the link of it at whose tip it leaves; the last when absent.
-    rest_rotation, link_rest_rotations : (3, 3) array_like and a sequence of such, optional
-        At rest, of its first link in the frame of the parent's link (of the root's frame for the root), and of every
-        later link in the frame of the one before (a measured undeformed shape).
-    bend, twist, damping, twist_damping : float
-        Of every joint [N m/rad], [N m s/rad]; with `stiffness_per_curvature` a rigidity [N m^2], [N m^2 s]. Twists
-        have the damping of the bends where `twist_damping` is None.
-    stiffness_per_curvature : bool
-        A joint between links of length a and b then has 2/(a + b) times the value, and the first joint of a clamped
-        segment 2/a.
-    clamped_at_base : bool
-        Whether the first joint turns about the tip of a rigid wall or clamp (only matters with
-        `stiffness_per_curvature`); otherwise it sits between the parent's link and the first one.
-    joint_axes : str
-        Axes of the turns at each joint, base to tip; about those left out the segment is rigid.
-    link_length_parameters : bool
-        Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`,
-        for markers that sit elsewhere in every recording; masses do not follow them.
-    clamped_edge_length : float, optional
-        Length of a flexible edge that a clamp keeps straight before a root segment; with `stiffness_per_curvature` its
-        first joint then counts half of it [m].
-    """
+    """Description of one tube, branch or beam."""
 
     name: str
     length: float
+    """[m]; ignored when `link_lengths` is given."""
     mass: float
+    """Of the whole segment, spread along its length [kg]."""
     radius: float | None = None
+    """Of the solid cylinder that gives each link's inertia [m]; this or `cross_section`."""
     links: int = 4
     link_lengths: Sequence[float] | None = None
+    """Unequal links, base to tip [m]."""
     parent: str | None = None
+    """Segment on which it grows, None for the root."""
     parent_link_index: int | None = None
+    """Link of the parent at whose tip it leaves; the last when absent."""
     rest_rotation: ArrayLike | None = None
+    """At rest, of its first link in the frame of the parent's link (the root's frame for the root), shape (3, 3)."""
     link_rest_rotations: Sequence[ArrayLike] | None = None
+    """At rest, of every later link in the frame of the one before (a measured undeformed shape)."""
     bend: float = 3.0
+    """Of every joint [N m/rad]; with `stiffness_per_curvature` rigidities [N m^2], [N m^2 s]."""
     twist: float = 3.0
     damping: float = 0.05
+    """Of every joint [N m s/rad]."""
     twist_damping: float | None = None
+    """Of the twists; that of the bends when absent."""
     stiffness_per_curvature: bool = False
+    """Whether a joint between links of length a and b has 2/(a + b) times the value, the first of a clamped one 2/a."""
     clamped_at_base: bool = False
+    """Whether the first joint turns about the tip of a rigid wall or clamp, not between the parent's link and the first
+    one (only matters with `stiffness_per_curvature`)."""
     joint_axes: str = "xyz"
+    """Axes of the turns at each joint, base to tip; about those left out the segment is rigid."""
     cross_section: tuple[float, float] | None = None
+    """Extents of a rectangular section along the links' x and y axes [m]."""
     link_length_parameters: bool = False
+    """Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`, for
+    markers that sit elsewhere in every recording; masses do not follow them."""
     clamped_edge_length: float | None = None
+    """Length of a flexible edge that a clamp keeps straight before a root segment; with `stiffness_per_curvature` its
+    first joint then counts half of it [m]."""
 
 
 @dataclass(frozen=True)
@@ -121,9 +106,8 @@ class FlexibleObject(ReprMixin):
 
     def _summary(self) -> ReprSummary:
         names, tree = ", ".join(segment.name for segment in self.segment_layouts), self.mechanism
-        return ReprSummary(
-            f"{names}, {count_with_noun(len(tree.joints), 'joint')}", tree.parameters._summary().table_rows
-        )
+        count = count_with_noun(len(tree.joints), "joint")
+        return ReprSummary(f"{names}, {count}", tree.parameters._summary().table_rows)
 
 
 def flexible_object(
@@ -134,6 +118,9 @@ def flexible_object(
 ) -> FlexibleObject:
     """A flexible object of rigid links with an elastic joint before each.
 
+    Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`), parameters `SEGMENT.length` (or `.length_0`, ...), `.mass`,
+    `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` where given).
+
     Parameters
     ----------
     segments : sequence of Segment
@@ -142,12 +129,6 @@ def flexible_object(
         Placement of the root; the origin when absent.
     gravity_fraction : float
         Part of its weight that the object has, its inertia unchanged; less than one where something else bears it.
-
-    Returns
-    -------
-    FlexibleObject
-        Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`), parameters `SEGMENT.length` (or `.length_0`, ...), `.mass`,
-        `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` where given).
 
     Raises
     ------

@@ -33,12 +33,10 @@ class Parameter:
         if not math.isfinite(self.value):
             raise ConfigError(f"{self.name} = {self.value} is not a finite number", where=f"parameter {self.name}")
         if not self.lower <= self.value <= self.upper:
-            raise ConfigError(
-                f"{self.name} = {self.value:g} {self.unit} lies outside its bounds",
-                where=f"parameter {self.name}",
-                allowed=f"{self.lower:g} to {self.upper:g} {self.unit}",
-                hint="change the value, or widen the bounds under `parameters`",
-            )
+            what, where = f"{self.name} = {self.value:g} {self.unit} lies outside its bounds", f"parameter {self.name}"
+            allowed = f"{self.lower:g} to {self.upper:g} {self.unit}"
+            hint = "change the value, or widen the bounds under `parameters`"
+            raise ConfigError(what, where=where, allowed=allowed, hint=hint)
 
 
 class Parameters(ReprMixin):
@@ -49,9 +47,8 @@ class Parameters(ReprMixin):
         self._index = {entry.name: i for i, entry in enumerate(self._entries)}
         if len(self._index) != len(self._entries):
             twice = sorted(name for name, count in Counter(self.names).items() if count > 1)
-            raise ConfigError(
-                f"parameter named twice: {', '.join(twice)}", hint="give each part of the model its own name"
-            )
+            hint = "give each part of the model its own name"
+            raise ConfigError(f"parameter named twice: {', '.join(twice)}", hint=hint)
 
     def _summary(self) -> ReprSummary:
         rows = [("parameter", "value", "unit", "lower", "upper")]

@@ -50,10 +50,8 @@ class MotorFrictionData:
 class DcMotorData:
     """Published figures of a geared direct-current servo, starting values of what is estimated.
 
-    References
-    ----------
-    Duclusaud et al. (2024), Extended friction models for the physics simulation of servo actuators, arXiv:2410.08650,
-    and the figures published with it (Rhoban/bam, Apache-2.0).
+    From Duclusaud et al. (2024), Extended friction models for the physics simulation of servo actuators,
+    arXiv:2410.08650, and the figures published with it (Rhoban/bam, Apache-2.0).
     """
 
     supply_voltage: float  # [V]
@@ -66,11 +64,9 @@ class DcMotorData:
     def servo_values(self, constants: MotorFrictionData) -> dict[str, float]:
         """Values of a servo's parameters by name: torque = kt/R (duty V - kt speed) [N m/rad, N m s/rad, N m]."""
         stall = constants.torque_constant * self.supply_voltage / constants.resistance
-        return {
-            "servo_gain": self.duty_per_gain * stall,
-            "servo_damping": constants.torque_constant**2 / constants.resistance,
-            "servo_torque_limit": self.duty_limit * stall,
-        }
+        drag = constants.torque_constant**2 / constants.resistance
+        gain, limit = self.duty_per_gain * stall, self.duty_limit * stall
+        return {"servo_gain": gain, "servo_damping": drag, "servo_torque_limit": limit}
 
 
 # supply, duty per gain, duty limit and armature; the two friction laws, each in the order of `MotorFrictionData`
@@ -122,10 +118,9 @@ class MotorOptions:
 
     def __post_init__(self) -> None:
         if self.preset is not None and self.kind != "dc":
-            allowed, hint = "preset with kind: dc", "set model.arms.servo.motor.kind: dc, or leave the preset out"
-            raise ConfigError(
-                f"the motor is {self.kind} and has the preset '{self.preset}'", allowed=allowed, hint=hint
-            )
+            what = f"the motor is {self.kind} and has the preset '{self.preset}'"
+            hint = "set model.arms.servo.motor.kind: dc, or leave the preset out"
+            raise ConfigError(what, allowed="preset with kind: dc", hint=hint)
 
 
 @dataclass(frozen=True)
@@ -226,9 +221,8 @@ def build_joint_servos(
             own.append(Parameter(f"{joint}.{SERVO_GAIN_FACTOR}", 1.0, "1", 0.0, math.inf, words))
             gain = gain * own[-1].symbol
         tightness = limit**-TORQUE_SATURATION_EXPONENT
-        servos[joint] = PositionServo(
-            gain, damping, delay, tightness, options.command_interpolation, options.motor.kind
-        )
+        how = options.command_interpolation, options.motor.kind
+        servos[joint] = PositionServo(gain, damping, delay, tightness, *how)
         entries += own
     return servos, entries
 

@@ -40,33 +40,24 @@ _GRASP_EQUATION_NAMES = {
 
 @dataclass(frozen=True)
 class Grasp:
-    """A holonomic constraint: the origins of a robot's (or a clamp's) frame and of an object's frame coincide.
-
-    Attributes
-    ----------
-    name : str
-        `left`, `right`, `gripper`, or a clamp's name.
-    kind : "point", "axis" or "weld"
-        3 equations (positions), 5 (and the direction of the z axes), 6 (and the orientation).
-    held_orientation : casadi.SX, shape (3, 3)
-        Orientation of `held_frame` in `holder_frame` for `axis` and `weld`.
-    holder_offset : casadi.SX, shape (3, 1)
-        Where the grasped point sits in the holder's frame [m].
-    axial_slip : casadi.SX
-        How far the grasped point has crept along the object's z axis [m].
-    compliance, relaxation_time : casadi.SX
-        C [m/N], zero when rigid, and T [s] in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h.
-    """
+    """A holonomic constraint: the origins of a robot's (or a clamp's) frame and of an object's frame coincide."""
 
     name: str
+    """`left`, `right`, `gripper`, or a clamp's name."""
     holder_frame: str
     held_frame: str
     kind: _GraspKind = "point"
+    """`point` has 3 equations (positions), `axis` 5 (direction of the z axes, too), `weld` 6 (orientation, too)."""
     held_orientation: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.eye(3)))
+    """Of `held_frame` in `holder_frame` for `axis` and `weld`, shape (3, 3)."""
     holder_offset: ca.SX = field(default_factory=lambda: ca.SX(ca.DM.zeros(3)))
+    """Where the grasped point sits in the holder's frame, shape (3, 1) [m]."""
     axial_slip: ca.SX = field(default_factory=lambda: ca.SX(0))
+    """How far the grasped point has crept along the object's z axis [m]."""
     compliance: ca.SX = field(default_factory=lambda: ca.SX(0))
+    """C, zero when rigid, in phi(q_{k+1}) + T (phi(q_{k+1}) - phi(q_k)) / h = C lam_k / h [m/N]."""
     relaxation_time: ca.SX | None = None
+    """T in the same [s]."""
 
     @property
     def n_constraint_equations(self) -> int:
@@ -236,47 +227,34 @@ class SystemOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, repr=False)
 class System(ReprMixin):
-    """A mechanism (arms first, left then right, then the object) with springs, dampers, grasps, inputs and effects.
-
-    Attributes
-    ----------
-    parameters : Parameters
-        Fixes the order of theta.
-    joint_damping : mapping of joint name to casadi.SX
-        Viscous coefficients of joints that are not elastic [N m s/rad].
-    driven, prescribed : tuple of str
-        Joints with an input, in the order of u (a motor torque, or what a servo is commanded), and those whose
-        coordinate is known, in the order of s.
-    servos : mapping of joint name to PositionServo
-        Of all driven joints, or of none.
-    gravity : casadi.SX, shape (3, 1)
-        [m/s^2], in the world frame.
-    recorded_time_scale : casadi.SX
-        Factor on the recorded time step.
-    joint_compliances : mapping of joint name to casadi.SX
-        Coordinates held by a spring of this compliance [rad/(N m)], zero meaning rigid; their equations and momentum
-        are multiplied by it so that they stay regular at zero.
-    joint_relaxation_times : mapping of joint name to float
-        Relaxation time T of some compliant coordinates [s]: q + T dq/dt = compliance x torque. A massless one needs it
-        to forget a start that does not fit its load.
-    point_frames : tuple of str
-        Frames that a sensor may see.
-    """
+    """A mechanism (arms first, left then right, then the object) with springs, dampers, grasps, inputs and effects."""
 
     mechanism: Mechanism
     parameters: Parameters
+    """Fixes the order of theta."""
     elastic_joints: tuple[ElasticJoint, ...] = ()
     joint_damping: Mapping[str, ca.SX] = field(default_factory=dict)
+    """Viscous coefficients of joints that are not elastic, by joint [N m s/rad]."""
     grasps: tuple[Grasp, ...] = ()
     driven: tuple[str, ...] = ()
+    """Joints with an input, in the order of u (a motor torque, or what a servo is commanded)."""
     servos: Mapping[str, PositionServo] = field(default_factory=dict)
+    """Of all driven joints, or of none, by joint."""
     prescribed: tuple[str, ...] = ()
+    """Joints whose coordinate is known, in the order of s."""
     gravity: ca.SX = field(default_factory=lambda: ca.SX(ca.DM([0.0, 0.0, -9.81])))
+    """In the world frame, shape (3, 1) [m/s^2]."""
     recorded_time_scale: ca.SX = field(default_factory=lambda: ca.SX(1))
+    """Factor on the recorded time step."""
     joint_compliances: Mapping[str, ca.SX] = field(default_factory=dict)
+    """Of coordinates held by a spring, by joint, zero meaning rigid [rad/(N m)]; their equations and momentum are
+    multiplied by it so that they stay regular at zero."""
     joint_relaxation_times: Mapping[str, float] = field(default_factory=dict)
+    """T of some compliant coordinates in q + T dq/dt = compliance x torque [s]: a massless one needs it to forget a
+    start that does not fit its load."""
     segment_layouts: tuple[SegmentLayout, ...] = ()
     point_frames: tuple[str, ...] = ()
+    """Frames that a sensor may see."""
     effects: tuple[Effect, ...] = ()
 
     @staticmethod
@@ -285,10 +263,7 @@ class System(ReprMixin):
     ) -> System:
         """A system from a robot (none for an object alone), effects, and what `SystemOptions` lists.
 
-        Raises
-        ------
-        ModelError
-            A name that does not exist or is used twice, no joint at all, a joint both driven and prescribed.
+        `ModelError` of a name that does not exist or is used twice, no joint, a joint both driven and prescribed.
         """
         gravity = np.asarray(options.get("gravity", (0.0, 0.0, -9.81)), float)
         if gravity.shape != (3,) or not np.all(np.isfinite(gravity)):
@@ -314,20 +289,11 @@ class System(ReprMixin):
         seen, grasps = options.get("point_frames"), tuple(options.get("grasps", ()))
         seen = tuple((name for name in tree.frames if name.startswith("w_")) if seen is None else seen)
         _check_names(tree, grasps, driven, prescribed, seen)
-        system = System(
-            tree,
-            tree.parameters.with_added(entries, own),
-            tuple(elastic),
-            {joint: parameter.symbol for joint, parameter in dampers.items()},
-            grasps,
-            driven,
-            moved,
-            prescribed,
-            ca.SX(ca.DM(gravity)),
-            segment_layouts=tuple(segments),
-            point_frames=seen,
-        )
-        return system.with_effects(effects)
+        parameters = tree.parameters.with_added(entries, own)
+        coefficients = {joint: parameter.symbol for joint, parameter in dampers.items()}
+        known = (grasps, driven, moved, prescribed, ca.SX(ca.DM(gravity)))
+        system = System(tree, parameters, tuple(elastic), coefficients, *known, point_frames=seen)
+        return replace(system, segment_layouts=tuple(segments)).with_effects(effects)
 
     def with_effects(self, effects: Sequence[Effect]) -> System:
         """This system with additional effects, whose parameters are appended to theta in the order given."""

@@ -192,10 +192,8 @@ def _check_numbers(robot: ElementTree.Element, where: str) -> None:
             value = 0.0 if mass is None else _numbers(mass.get("value", ""), 1, f"{name}: mass", where)[0]
             if mass is None or value < 0 or 0 < value < _MIN_MASS:
                 what = "an inertial without a mass" if mass is None else f"a mass of {value:g} kg"
-                allowed, hint = (
-                    f"a mass of zero, or of {_MIN_MASS:g} kg and more",
-                    "correct it, or leave the inertial out",
-                )
+                allowed = f"a mass of zero, or of {_MIN_MASS:g} kg and more"
+                hint = "correct it, or leave the inertial out"
                 raise ModelError(f"{name} has {what}", where=where, allowed=allowed, hint=hint)
             if tensor is not None:
                 for key in _TENSOR_KEYS:

@@ -286,9 +286,6 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     return ca.Function("sensor", inputs, ca.cse(outputs), names_in, ["y", *(f"by_{name}" for name in names_in)])
 
 
-# -- from a recording -------------------------------------------------------------------------------------------------
-
-
 class _SmoothingFilter(Protocol):
     """A zero-phase low-pass filter, as in `problem.signal_filters.LowPassFilter`."""
 

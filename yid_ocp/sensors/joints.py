@@ -197,11 +197,8 @@ def smoothed_effort_data(
 
 @SENSOR_READERS.register("motors.current")
 def _read_motor_currents(around: SensorReadingContext) -> list[SensorData]:
-    return [
-        found
-        for group in around.recording.channel_groups
-        if _CURRENT.is_in_group(group.name) and (found := _currents(around, group)) is not None
-    ]
+    groups = (group for group in around.recording.channel_groups if _CURRENT.is_in_group(group.name))
+    return [found for group in groups if (found := _currents(around, group)) is not None]
 
 
 def _currents(around: SensorReadingContext, group: RecordedChannelGroup) -> SensorData | None:

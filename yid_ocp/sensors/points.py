@@ -49,11 +49,8 @@ class PointSensor(Sensor):
 
 @SENSOR_READERS.register("points")
 def _read_point_groups(around: SensorReadingContext) -> list[SensorData]:
-    return [
-        _points(around, group, around.sensor_usage(group.name))
-        for group in around.recording.points
-        if around.sensor_usage(group.name).use is not False
-    ]
+    groups = ((group, around.sensor_usage(group.name)) for group in around.recording.points)
+    return [_points(around, group, choice) for group, choice in groups if choice.use is not False]
 
 
 def _points(around: SensorReadingContext, group: RecordedPointGroup, choice: SensorOptions) -> SensorData:
@@ -69,12 +66,9 @@ def _points(around: SensorReadingContext, group: RecordedPointGroup, choice: Sen
             hint = f"{nearest_name_hint(frames[point], mechanism.frames)} (see sensors.{group.name})"
             raise DataError(what, where=where, hint=hint)
     if not known:
-        what, allowed = (
-            f"none of the points of group '{group.name}' is a frame of the model",
-            around.system.point_frames,
-        )
+        what = f"none of the points of group '{group.name}' is a frame of the model"
         hint = f"name their frames (or T1:40%) under sensors.{group.name}.frames, or switch the group off"
-        raise DataError(what, where=where, allowed=", ".join(allowed), hint=hint)
+        raise DataError(what, where=where, allowed=", ".join(around.system.point_frames), hint=hint)
     for point in known:
         if point not in group.names:
             hint = nearest_name_hint(point, group.names)

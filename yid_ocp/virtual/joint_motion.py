@@ -129,9 +129,8 @@ def random_multisine_motion(
         motion = _scaled(motion, joints, np.full(len(joints), chosen.max_joint_speed / fastest))
     if chosen.shake_torque_rms == 0.0:
         return motion
-    rigid = rigid_body_lagrangian_derivatives(
-        kinematics, ca.SX(ca.DM.zeros(system.n_coordinates)), ca.SX(ca.DM.zeros(3))
-    )
+    rest = ca.SX(ca.DM.zeros(system.n_coordinates))
+    rigid = rigid_body_lagrangian_derivatives(kinematics, rest, ca.SX(ca.DM.zeros(3)))
     inertia = np.diag(np.array(ca.densify(ca.Function("M", [q], [mass_matrix(rigid, tree)])(q0))))
     return _shaken(motion, chosen, inertia[list(system.driven_coordinate_indices)], rng)
 
@@ -207,9 +206,8 @@ def grasping_joint_angles(
     value = ParameterEvaluator(system, values)
     posture = _undeformed(system, tree, value, {**_ELBOW_UP_ANGLES, **(start_angles or {})})
     elastic = {spring.joint_name for spring in system.elastic_joints}
-    holding = {
-        j for grasp in system.grasps for j in tree.ancestor_joint_indices(tree.frame(grasp.holder_frame).joint_index)
-    }
+    holders = (tree.frame(grasp.holder_frame).joint_index for grasp in system.grasps)
+    holding = {j for holder in holders for j in tree.ancestor_joint_indices(holder)}
     sought = [j for j, joint in enumerate(tree.joints) if j in holding and joint.name not in elastic]
     if sought:
         gap = _gap_function(system, tree, value, offsets or {}, sought)

@@ -281,8 +281,6 @@ def mujoco_xml(
     ModelError
         What MuJoCo cannot express: a moving body without mass, more than six massless joints at one place, a frame on
         one of them, a compliant grasp, a cubic spring beside a rest angle, an effect beyond `_NATIVE_ASPECTS`.
-    ConfigError
-        Unknown parameter, or `time_step` not positive.
     """
     if not time_step > 0:
         raise ConfigError(f"time_step = {time_step}", where="mujoco_xml", allowed="a positive number of seconds")

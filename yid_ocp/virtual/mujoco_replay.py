@@ -83,7 +83,11 @@ def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[st
     balance = settle_to_equilibrium(scene, np.array(model.dof_damping))
     noisy = joints.position_std is not None and bool(np.any(np.asarray(joints.position_std) > 0))
     path = _Path(moved, t, position, _SMOOTHED if noisy else 0.0)
-    played = _driven(scene, path, t, effort) if system.driven else _prescribed(scene, path, t, balance)
+    if system.driven:
+        return _errors(system, recording, joints, columns, _driven(scene, path, t, effort))
+    controller = TrackingController(scene, path, balance)
+    scene.data.qvel[scene.moved_joint_ids] = path.offset_and_derivatives(0.0)[1]  # a recording may begin in motion
+    played = _played(scene, t[-1], lambda k, now: controller.apply_input(now))
     return _errors(system, recording, joints, columns, played)
 
 
@@ -170,13 +174,6 @@ def _full_inertia(mujoco: Any, model: Any, data: Any, full: Array) -> None:
         mujoco.mj_fullM(model, data, full)
     except TypeError:
         mujoco.mj_fullM(model, full, data.qM)
-
-
-def _prescribed(scene: MujocoScene, path: _Path, t: Array, balance: Array) -> _Played:
-    controller = TrackingController(scene, path, balance)
-    # a recording may begin in motion
-    scene.data.qvel[scene.moved_joint_ids] = path.offset_and_derivatives(0.0)[1]
-    return _played(scene, t[-1], lambda k, now: controller.apply_input(now))
 
 
 def _errors(

@@ -143,8 +143,6 @@ def simulate_in_mujoco(
     ------
     ModelError
         The system cannot be expressed (`mujoco_xml`), has prescribed or no driven joints, does not rest, or diverges.
-    DataError
-        MuJoCo is not installed.
     """
     chosen = simulation or SimulationOptions()
     if tuple(motion.joints) != tuple(system.driven) or not system.driven or system.prescribed:
@@ -374,9 +372,7 @@ def _play(
     effort = np.array(torques[::periods])
     if simulation.effort_kind == "mean":
         effort[:-1] = np.array(torques[:-1]).reshape(steps, periods, -1).mean(1)
-    t, frame_times = (
-        np.arange(steps + 1) / simulation.sample_rate,
-        simulation.time_step * frames[: len(seen)].astype(float),
-    )
+    t = np.arange(steps + 1) / simulation.sample_rate
+    frame_times = simulation.time_step * frames[: len(seen)].astype(float)
     frame_points = np.array(seen).reshape(len(seen), len(scene.point_site_ids), 3)
     return SimulationResult(t, np.array(q), np.array(v), effort, np.array(points), frame_times, frame_points)

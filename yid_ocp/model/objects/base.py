@@ -182,9 +182,6 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
     return found
 
 
-# -- kinds ------------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, kw_only=True)
 class ObjectKind:
     """A kind of flexible object, whose fields are its settings; one class in one file, registered in `OBJECT_KINDS`.

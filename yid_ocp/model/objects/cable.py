@@ -41,7 +41,7 @@ from yid_ocp.model.mechanism import Frame, LinkChain, Mechanism, Placement
 from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectKind
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
-from yid_ocp.model.system import Grasp, System, floating_clamp
+from yid_ocp.model.system import Grasp, System, SystemOptions, floating_clamp
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
@@ -155,25 +155,19 @@ def cable_system(
         end_roll = Parameter(f"{END_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, text)
         clamps = replace(clamps, parameters=clamps.parameters.with_added([end_roll]))
         rotation = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], end_roll.symbol)
-    return System.build(
-        clamps,
-        objects=((_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None),),
-        grasps=(Grasp(END_CLAMP, END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp, rotation),),
-        prescribed=clamps.joint_names,
-        damping={},
-        gravity=options.gravity,
-        point_frames=cable.vertices,
-    )
+    hung = (_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None)
+    held = Grasp(END_CLAMP, END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp, rotation)
+    known: SystemOptions = {"objects": [hung], "grasps": [held], "prescribed": clamps.joint_names, "damping": {}}
+    known |= {"gravity": options.gravity, "point_frames": cable.vertices}
+    return System.build(clamps, **known)
 
 
 def _with_rest_angles(item: FlexibleObject) -> FlexibleObject:
     text = "rest angle beside the undeformed shape's"
     bends = (spring.joint_name for spring in item.elastic_joints if spring.deformation == "bend")
     rest = {name: Parameter(f"{name}.rest", 0.0, "rad", -np.pi, np.pi, text) for name in bends}
-    elastic = (
-        replace(s, rest_angle=s.rest_angle + (rest[s.joint_name].symbol if s.joint_name in rest else 0))
-        for s in item.elastic_joints
-    )
+    added = {name: parameter.symbol for name, parameter in rest.items()}
+    elastic = (replace(s, rest_angle=s.rest_angle + added.get(s.joint_name, 0)) for s in item.elastic_joints)
     return _with_parameters(item, rest.values(), elastic)
 
 
@@ -257,27 +251,22 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
         if not options.undeformed_rest_shape:
             own = [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
         edges = [lengths[edge] for edge in pairwise(chain)]
-        segments.append(
-            Segment(
-                name,
-                sum(edges),
-                branch.linear_density * sum(edges),
-                options.radius,
-                link_lengths=edges,
-                parent=None if at is None else cable.parent_segment,
-                parent_link_index=at,
-                rest_rotation=own[0],
-                link_rest_rotations=own[1:],
-                bend=branch.bend_rigidity,
-                twist=branch.twist_rigidity,
-                damping=branch.bend_damping,
-                twist_damping=branch.bend_damping if branch.separate_twist_damping else None,
-                stiffness_per_curvature=True,
-                clamped_at_base=options.rigid_first_edge and at is None,
-                clamped_edge_length=before,
-                link_length_parameters=options.lengths_per_recording,
-            )
+        segment = Segment(
+            name,
+            sum(edges),
+            branch.linear_density * sum(edges),
+            options.radius,
+            link_lengths=edges,
+            bend=branch.bend_rigidity,
+            twist=branch.twist_rigidity,
+            damping=branch.bend_damping,
+            twist_damping=branch.bend_damping if branch.separate_twist_damping else None,
+            stiffness_per_curvature=True,
+            link_length_parameters=options.lengths_per_recording,
         )
+        segment = replace(segment, parent=None if at is None else cable.parent_segment, parent_link_index=at)
+        segment = replace(segment, rest_rotation=own[0], link_rest_rotations=own[1:], clamped_edge_length=before)
+        segments.append(replace(segment, clamped_at_base=options.rigid_first_edge and at is None))
     return segments
 
 
@@ -321,9 +310,8 @@ model:
     ]
 
     def topology(self) -> CableTopology:
-        found = CableTopology(
-            self.parent_vertices, dict(self.child_vertices), read_vertex_positions(self.undeformed_shape_file)
-        )
+        undeformed = read_vertex_positions(self.undeformed_shape_file)
+        found = CableTopology(self.parent_vertices, dict(self.child_vertices), undeformed)
         for name in self.branches:
             if name not in found.branch_vertex_names:
                 hint = nearest_name_hint(name, found.branch_vertex_names)

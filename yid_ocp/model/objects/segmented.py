@@ -25,6 +25,7 @@ from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
+_NO_TURN = (0.0, 0.0, 0.0)
 _RIGIDITY_RATIO = {"cable": 0.01, "beam": 1.0, "tree": 0.1}
 _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT grows on the end of PARENT"
 
@@ -50,11 +51,7 @@ class SegmentSettings:
     parent_link_index: Annotated[
         int | None, Ge(0), OptionInfo("it leaves at the tip of this link of the parent; the last")
     ] = None
-    rpy: Annotated[_Vector3, OptionInfo("turn of its first link at rest against what carries it", "rad")] = (
-        0.0,
-        0.0,
-        0.0,
-    )
+    rpy: Annotated[_Vector3, OptionInfo("turn of its first link at rest against what carries it", "rad")] = _NO_TURN
     separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False
     stiffness_per_curvature: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
@@ -167,11 +164,8 @@ def _branch(text: str, links: int) -> tuple[str, SegmentSettings]:
     values = comma_separated_numbers(numbers, count, "--branch")
     if min(values[:3]) <= 0:
         raise ConfigError(f"'{text}' has a size that is not above 0", where="--branch", allowed=_BRANCH_SHAPE)
-    turn = (values[3], values[4], values[5]) if count == 6 else (0.0, 0.0, 0.0)
+    turn = (values[3], values[4], values[5]) if count == 6 else _NO_TURN
     return name, _init_segment(links, values[0], values[1], values[2], rpy=turn, parent=parent or None)
-
-
-# -- the kind ---------------------------------------------------------------------------------------------------------
 
 
 @OBJECT_KINDS.register("segments")
