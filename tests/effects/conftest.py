@@ -32,18 +32,10 @@ def arm() -> Mechanism:
     """Three joints, 0.3 m links of 1 kg, each turned from the one before."""
     along = Placement.from_matrix(homogeneous_transform(np.eye(3), [0.0, 0.0, 0.3]))
     axes = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
-    joints = tuple(
-        Joint(
-            f"left_{name}",
-            "revolute",
-            i - 1,
-            along if i else Placement.identity(),
-            axes[i],
-            (Inertia.from_values(1.0, [0.01, 0.02, 0.15], np.diag([8e-3, 7e-3, 2e-3])),),
-        )
-        for i, name in enumerate("abc")
-    )
-    return Mechanism("arm", joints, {"left_gripper": Frame(2, along)})
+    body = Inertia.from_values(1.0, [0.01, 0.02, 0.15], np.diag([8e-3, 7e-3, 2e-3]))
+    places = (Placement.identity(), along, along)
+    joints = (Joint(f"left_{n}", "revolute", i - 1, places[i], axes[i], (body,)) for i, n in enumerate("abc"))
+    return Mechanism("arm", tuple(joints), {"left_gripper": Frame(2, along)})
 
 
 def small_y(foot: np.ndarray):
@@ -59,25 +51,18 @@ def small_y(foot: np.ndarray):
 
 def position(mechanism: Mechanism, frame: str, q: np.ndarray) -> np.ndarray:
     """Origin of a frame at nominal parameters."""
-    return np.array(
-        ca.DM(forward_kinematics(mechanism.with_numeric_values(), ca.SX(ca.DM(q))).frame_position(frame))
-    ).ravel()
+    kinematics = forward_kinematics(mechanism.with_numeric_values(), ca.SX(ca.DM(q)))
+    return np.array(ca.DM(kinematics.frame_position(frame))).ravel()
 
 
-def build(prescribed: bool = False, grasped: bool = True) -> System:
+def build(prescribed: bool = False) -> System:
     """The arm at `POSTURE` holding the tip of T2 of the undeformed object, 2 cm beside it."""
     robot, item = arm(), small_y(np.eye(4))
     gap = position(robot, "left_gripper", POSTURE) - position(item.mechanism, "w_T2", np.zeros(9))
     foot = homogeneous_transform(np.eye(3), gap + np.array([0.01, -0.02, -0.015]))
-    names = robot.joint_names
-    return System.build(
-        robot,
-        objects=[(small_y(foot), None, None)],
-        grasps=[Grasp("left", "left_gripper", "w_T2")] if grasped else [],
-        driven=() if prescribed else names,
-        prescribed=names if prescribed else (),
-        damping=0.05,
-    )
+    moved = {"prescribed" if prescribed else "driven": robot.joint_names}
+    objects, grasps = [(small_y(foot), None, None)], [Grasp("left", "left_gripper", "w_T2")]
+    return System.build(robot, objects=objects, grasps=grasps, damping=0.05, **moved)
 
 
 @dataclass(frozen=True)
@@ -102,16 +87,12 @@ class Bench:
         self.rest = EquilibriumSolver(self.plain).solve(POSTURE, system.parameters.vector())
         assert self.rest.is_converged, self.rest.message
         t = H * np.arange(steps + 1)[:, None]
-        self.torque = self.rest.holding_torque + np.array([1.0, -2.0, 0.7][: len(system.driven)]) * np.sin(
-            30 * t[:-1] + 1
-        )
+        size = np.array([1.0, -2.0, 0.7][: len(system.driven)])
+        self.torque = self.rest.holding_torque + size * np.sin(30 * t[:-1] + 1)
         self.path = POSTURE + 0.03 * np.sin(25 * t + np.arange(3)) - 0.03 * np.sin(np.arange(3))
         self.path = self.path[:, : len(system.prescribed)]
         rng = np.random.default_rng(3)
         self.kick = 1e-3 * rng.normal(size=system.n_coordinates)
-
-    def effect(self, kind: str, location: str, **values: float) -> EffectBase:
-        return make_effect(kind, location, self.system, values)
 
     def step(self, *effects: EffectBase) -> Step:
         return compile_step(self.system.with_effects(effects), H, use_compiler=False)
@@ -121,10 +102,8 @@ class Bench:
         names, sizes = step.system.mechanism.joint_names, step.sizes
         at = [names.index(name) for name in self.system.mechanism.joint_names]
         state, n = np.zeros(sizes["nx"]), sizes["n"]
-        state[at] = self.rest.state[: self.system.n_coordinates]
-        state[[n + i for i in at]] = (
-            self.rest.state[self.system.n_coordinates : 2 * self.system.n_coordinates] + self.kick
-        )
+        state[at] = self.rest.state[: len(at)]
+        state[[n + i for i in at]] = self.rest.state[len(at) : 2 * len(at)] + self.kick
         for row, name in enumerate(step.system.internal_coordinates):
             joint = name.rpartition(".")[2]
             if joint in names and not name.startswith("hysteresis"):
@@ -136,9 +115,8 @@ class Bench:
         begin = self.start(step) if start is None else start
         directions = SensitivityDirections(tuple(names), np.zeros((len(begin), len(names)))) if names else None
         count = steps or self.steps
-        rollout = simulate(
-            step, theta, begin, count, self.torque[:count], self.path[: count + 1], directions=directions
-        )
+        inputs = self.torque[:count], self.path[: count + 1]
+        rollout = simulate(step, theta, begin, count, *inputs, directions=directions)
         return Run(step, theta, begin, rollout)
 
     def nominal_part(self, run: Run) -> np.ndarray:
@@ -178,28 +156,25 @@ CAMERA = PointSensor("points_camera", ("w_T1", "w_T3"), ("w_T1", "w_T3"), POSE)
 
 
 @pytest.fixture(scope="session")
-def driven() -> Bench:
-    return Bench(build())
+def benches() -> dict[str, Bench]:
+    return {"driven": Bench(build()), "prescribed": Bench(build(prescribed=True))}
 
 
 @pytest.fixture(scope="session")
-def prescribed() -> Bench:
-    return Bench(build(prescribed=True))
+def driven(benches) -> Bench:
+    return benches["driven"]
 
 
 @pytest.fixture(scope="session")
-def benches(driven, prescribed) -> dict[str, Bench]:
-    return {"driven": driven, "prescribed": prescribed}
+def prescribed(benches) -> Bench:
+    return benches["prescribed"]
 
 
 @pytest.fixture(scope="session")
 def cable() -> tuple[CableTopology, Recording, System]:
     layout, recording = made_cable()
-    return (
-        layout,
-        recording,
-        cable_system(median_point_pair_distances(layout.edges, [recording]), layout, CableOptions()),
-    )
+    lengths = median_point_pair_distances(layout.edges, [recording])
+    return layout, recording, cable_system(lengths, layout, CableOptions())
 
 
 @pytest.fixture(scope="session")
@@ -215,8 +190,5 @@ def all_effects() -> Callable[[System], list[EffectBase]]:
 
 @pytest.fixture(scope="session")
 def sensors() -> SimpleNamespace:
-    return SimpleNamespace(
-        camera=CAMERA,
-        arm=PointSensor("points_arm", ("w_T2",), ("w_T2",)),
-        effort=EffortSensor(("left_a", "left_b", "left_c")),
-    )
+    arm, effort = PointSensor("points_arm", ("w_T2",), ("w_T2",)), EffortSensor(("left_a", "left_b", "left_c"))
+    return SimpleNamespace(camera=CAMERA, arm=arm, effort=effort)

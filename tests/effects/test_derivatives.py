@@ -57,12 +57,8 @@ def test_sensitivities_agree_with_differences(mode, where, cases) -> None:
         own = [name for name in case.names if name.startswith(f"{kind}@")]
         way = {name: case.widths[name] * rng.choice([-1, 1]) * rng.uniform(0.5, 1) for name in own}
         weights = np.array([way.get(name, 0.0) for name in case.names])
-        above, below = (
-            case.bench.run(
-                case.step, case.values | {n: centre[n] + sign * 4e-5 * way[n] for n in own}, (), case.start, STEPS
-            ).rollout
-            for sign in (1, -1)
-        )
+        ends = ({n: centre[n] + sign * 4e-5 * way[n] for n in own} for sign in (1, -1))
+        above, below = (case.bench.run(case.step, case.values | e, (), case.start, STEPS).rollout for e in ends)
         for field in ("state", "multipliers", "effort"):
             exact = getattr(case.run.rollout, f"{field}_sensitivity") @ weights
             if exact.size == 0:

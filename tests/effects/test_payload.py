@@ -24,17 +24,12 @@ TURNED = homogeneous_transform(rotation_from_rpy(0.3, -0.5, 1.1), [0.02, 0.1, 0.
 def arm() -> System:
     """Three joints, of which the last carries a hand in a frame that is turned and beside it."""
     along = Placement.from_matrix(homogeneous_transform(np.eye(3), [0.0, 0.05, 0.3]))
-    body = Inertia.from_values(
-        1.2, [0.01, -0.02, 0.15], np.array([[9e-3, 3e-4, 0], [3e-4, 8e-3, 2e-4], [0, 2e-4, 2e-3]])
-    )
-    axes = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
-    joints = tuple(
-        Joint(f"j{i}", "revolute", i - 1, along if i else Placement.identity(), axes[i], (body,)) for i in range(3)
-    )
-    frames = {f"link{i}": Frame(i, Placement.identity()) for i in range(3)} | {
-        "hand": Frame(2, Placement.from_matrix(TURNED))
-    }
-    return System.build(Mechanism("arm", joints, frames), prescribed=["j0", "j1", "j2"], damping=0.0)
+    body = Inertia.from_values(1.2, [0.01, -0.02, 0.15], [[9e-3, 3e-4, 0], [3e-4, 8e-3, 2e-4], [0, 2e-4, 2e-3]])
+    axes, places = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)), (Placement.identity(), along, along)
+    joints = (Joint(f"j{i}", "revolute", i - 1, places[i], axes[i], (body,)) for i in range(3))
+    frames = {f"link{i}": Frame(i, Placement.identity()) for i in range(3)}
+    frames |= {"hand": Frame(2, Placement.from_matrix(TURNED))}
+    return System.build(Mechanism("arm", tuple(joints), frames), prescribed=["j0", "j1", "j2"], damping=0.0)
 
 
 def mechanics(system: System):
@@ -105,9 +100,8 @@ def test_the_link_keeps_mass_and_inertia_wherever_a_search_goes() -> None:
     effect = make_effect("payload", "hand", nominal)
     system = nominal.with_effects([effect])
     last = merge_bodies(system.mechanism.joints[2].bodies)
-    function = ca.Function(
-        "link", [system.parameters.symbols], [last.mass, last.center_of_mass, last.inertia_about_com]
-    )
+    outputs = [last.mass, last.center_of_mass, last.inertia_about_com]
+    function = ca.Function("link", [system.parameters.symbols], outputs)
     rng = np.random.default_rng(0)
     bounds = [(q.lower, q.upper) for q in effect.definitions]
     centre = nominal.mechanism.joints[2].bodies[0]
@@ -139,11 +133,11 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
     assert far["mass"].std == 0.01
     given = nominal.with_effects([make_effect("payload", "hand", nominal, {"mass": 1.0, "my": 3.0, "mz": 4.0})])
     body = merge_bodies(given.mechanism.joints[2].bodies)
-    first = np.array(
-        ca.evalf(ca.substitute(body.mass * body.center_of_mass, given.parameters.symbols, given.parameters.vector()))
+    first = ca.Function("first", [given.parameters.symbols], [body.mass * body.center_of_mass])(
+        given.parameters.vector()
     )
     own = merge_bodies(nominal.mechanism.joints[2].bodies)
-    added = first.ravel() - np.array(ca.DM(own.mass * own.center_of_mass)).ravel()
+    added = np.array(first).ravel() - np.array(ca.DM(own.mass * own.center_of_mass)).ravel()
     acting = np.array([far[name].value for name in ("mx", "my", "mz")])
     assert added == pytest.approx(TURNED[:3, :3] @ acting + 1.0 * TURNED[:3, 3])
 
@@ -187,18 +181,14 @@ def test_places_for_a_mass() -> None:
     fingers = [j.name for j in whole.joints if j.kind == "prismatic"]
     held = System.build(whole, prescribed=whole.joint_names)
     assert fingers
-    assert not any(
-        held.mechanism.frame(f).joint_index == held.mechanism.joint_index(fingers[0])
-        for f in arm_link_frame_names(held)
-    )
+    carriers = {held.mechanism.frame(name).joint_index for name in arm_link_frame_names(held)}
+    assert held.mechanism.joint_index(fingers[0]) not in carriers
 
 
 def test_ranges_of_strong_joints_follow_their_limits() -> None:
     system = arm()
-    joints = tuple(
-        replace(joint, effort_limit=limit)
-        for joint, limit in zip(system.mechanism.joints, (300.0, 20.0, 1e9), strict=True)
-    )
+    pairs = zip(system.mechanism.joints, (300.0, 20.0, 1e9), strict=True)
+    joints = tuple(replace(joint, effort_limit=limit) for joint, limit in pairs)
     strong = replace(system, mechanism=replace(system.mechanism, joints=joints))
     assert [effort_limit_over_baxter(strong, name) for name in ("j0", "j1", "j2")] == [6.0, 1.0, 1.0]
     for kind in ("joint_coulomb", "joint_presliding"):

@@ -219,22 +219,18 @@ def test_a_mount_is_a_spring_in_series() -> None:
 
 def test_a_junction_turns_all_branches() -> None:
     segments = [Segment("T1", LENGTH, MASS, RADIUS, 2, damping=0.0)]
-    segments += [
-        Segment(n, 0.2, 0.05, RADIUS, 1, parent="T1", rest_rotation=rotation_from_rpy(lean, 0, 0), damping=0.0)
-        for n, lean in (("T2", -0.5), ("T3", 0.5))
-    ]
+    for name, lean in (("T2", -0.5), ("T3", 0.5)):
+        turn = rotation_from_rpy(lean, 0, 0)
+        segments.append(Segment(name, 0.2, 0.05, RADIUS, 1, parent="T1", rest_rotation=turn, damping=0.0))
     system = System.build(objects=[(flexible_object(segments), None, None)], gravity=(0.4, 0.0, 0.0))
     step, rest = rest_of(system, make_effect("junction_compliance", "w_T1", system, {"stiffness": 8.0}))
     at = step.system.mechanism.joint_index
     # the torque of both branches about the junction's y axis goes through its spring
     theta = step.system.parameters.vector()
     kinematics = forward_kinematics(step.system.mechanism, ca.SX(ca.DM(rest.state[: step.sizes["n"]])))
-    where = ca.Function(
-        "p", [step.system.parameters.symbols], [kinematics.frame_position(f"w_{n}") for n in ("T1", "T2", "T3")]
-    )
-    junction, *tips = (np.array(p).ravel() for p in where(theta))
-    axis_function = ca.Function("a", [step.system.parameters.symbols], [kinematics.joint_screws[at("T2_0_x") - 1][:3]])
-    axis = np.array(axis_function(theta)).ravel()
+    vectors = [*map(kinematics.frame_position, ("w_T1", "w_T2", "w_T3")), kinematics.joint_screws[at("T2_0_x") - 1][:3]]
+    found = ca.Function("found", [step.system.parameters.symbols], vectors)(theta)
+    junction, *tips, axis = (np.array(vector).ravel() for vector in found)
     torque = sum(np.cross((tip - junction) / 2, [0.05 * 0.4, 0, 0]) @ axis for tip in tips)
     assert 8.0 * rest.state[at("junction_compliance@w_T1_y")] == pytest.approx(torque, rel=1e-6)
 
@@ -247,10 +243,8 @@ def hanging(kind: str, time_step: float = H, **values: float):
     item = flexible_object([Segment("T1", LENGTH, MASS, RADIUS, 1, bend=KAPPA, damping=0.5)])
     slide = Joint("foot", "prismatic", -1, Placement.identity(), (0.0, 0.0, 1.0))
     tree = robot.with_attached_mechanism(Mechanism("rail", (slide,), {"rail": Frame(0, Placement.identity())}))
-    grasp = Grasp("left", "left_gripper", "w_T1")
-    system = System.build(
-        tree, objects=[(item, "rail", None)], grasps=[grasp], prescribed=["left_a"], gravity=(0, 0, -G), damping=0.0
-    )
+    parts = {"objects": [(item, "rail", None)], "grasps": [Grasp("left", "left_gripper", "w_T1")]}
+    system = System.build(tree, **parts, prescribed=["left_a"], gravity=(0, 0, -G), damping=0.0)
     step = compile_step(system.with_effects([make_effect(kind, "left", system, values)]), time_step, use_compiler=False)
     rest = EquilibriumSolver(step).solve([0.0], step.system.parameters.vector())
     assert rest.is_converged
@@ -327,9 +321,8 @@ def test_every_step_takes_out_more_than_it_stores() -> None:
     step = compile_step(system.with_effects([effect]), H, use_compiler=False)
     e, theta, rng = step.equations, step.system.parameters.vector(), np.random.default_rng(1)
     bare = compile_step(system, H, use_compiler=False).equations
-    law = ca.Function(
-        "law", [e.q0, e.q1, e.z0, e.z1, e.p0, e.theta, e.time_step], [e.internal_residual, e.momentum_balance]
-    )
+    inputs = [e.q0, e.q1, e.z0, e.z1, e.p0, e.theta, e.time_step]
+    law = ca.Function("law", inputs, [e.internal_residual, e.momentum_balance])
     without = ca.Function("without", [bare.q0, bare.q1, bare.p0, bare.theta, bare.time_step], [bare.momentum_balance])
     for _ in range(200):
         turned, before = 10.0 ** rng.uniform(-7, 0) * rng.choice([-1, 1]), rng.uniform(-1, 1)
@@ -413,10 +406,8 @@ def test_joint_readings_and_the_way_back(kind, values, angle, torque) -> None:
     effect = make_effect(kind, "left_a", system, values)
     seen = [read(system, [effect], sensor, [0.5], [3.0])[0] for sensor in (PositionSensor(names), EffortSensor(names))]
     assert seen == pytest.approx([angle, torque])
-    back = [
-        effect.corrected_reading(f"joints.{quantity}.left_a", ca.SX(reading), ca.SX(3.0))
-        for quantity, reading in zip(("position", "effort"), seen, strict=True)
-    ]
+    channels = zip(("joints.position.left_a", "joints.effort.left_a"), seen, strict=True)
+    back = [effect.corrected_reading(channel, ca.SX(reading), ca.SX(3.0)) for channel, reading in channels]
     value = ca.Function("back", [effect.parameters.symbols], back)(ca.DM([p.value for p in effect.parameters]))
     assert [float(x) for x in value] == pytest.approx([0.5, 3.0])
     assert effect.corrected_reading("joints.position.other", ca.SX(1), ca.SX(1)).is_one()
@@ -453,9 +444,8 @@ def test_latency_belongs_to_cameras_and_late_torque_to_arms() -> None:
 
     def seconds(effect, channel: str, camera: bool = False) -> float:
         values = ca.DM([p.value for p in effect.parameters])
-        return float(
-            ca.Function("d", [effect.parameters.symbols], [effect.added_channel_delay(channel, camera)])(values)
-        )
+        delay = effect.added_channel_delay(channel, camera)
+        return float(ca.Function("d", [effect.parameters.symbols], [delay])(values))
 
     assert seconds(late, "torque.left_a") == 0.03
     assert seconds(late, "joints.effort.left_a") == -0.03

@@ -34,6 +34,7 @@ KINDS = {
 # what changes the momentum that the arm's motion has
 HEAVIER = {"rotor_inertia": {"left_b": {"armature": 0.05}}, "link_mass": {"left_c": {"scale": 1.1}}}
 KINDS |= HEAVIER
+OPEN = {"path_cutoff": float("inf"), "weak_prior_factor": 0.0}
 
 
 def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
@@ -44,9 +45,8 @@ def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
     position = bench.posture + 0.02 * ramp * np.sin(14 * t[:, None] + np.arange(3))
     load = np.array([0.5, -3.0, 1.0]) if not len(bench.rest.holding_torque) else bench.rest.holding_torque
     torque = load + 0.4 * ramp * np.sin(11 * t[:, None] + 2 * np.arange(3))
-    joints = JointGroup(
-        NAMES, t, position, effort=torque if effort else None, position_std=1e-4, effort_std=0.05, effort_kind="command"
-    )
+    known = {"position_std": 1e-4, "effort_std": 0.05, "effort_kind": "command"}
+    joints = JointGroup(NAMES, t, position, effort=torque if effort else None, **known)
     groups = [PointGroup("points_arm", ("w_T2",), t, rng.normal(size=(len(t), 1, 3)), np.array(0.01), "arm")]
     if camera:
         seen = np.sort(rng.uniform(0.0, t[-1], 9))
@@ -58,24 +58,16 @@ def recording(bench, effort: bool = True, camera: bool = True) -> Recording:
 
 @cache
 def effects_and_step(bench, kinds: tuple[str, ...], neutral: bool):
-    effects = [
-        make_effect(kind, place, bench.system, {} if neutral else values)
-        for kind in kinds
-        for place, values in KINDS[kind].items()
-    ]
+    chosen = [(kind, place, values) for kind in kinds for place, values in KINDS[kind].items()]
+    effects = [make_effect(kind, place, bench.system, {} if neutral else values) for kind, place, values in chosen]
     return effects, compile_step(bench.system.with_effects(effects), H, use_compiler=False)
 
 
 def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options) -> EstimationProblem:
     effects, step = effects_and_step(bench, tuple(kinds), neutral)
     names = tuple(name for effect in effects for name in effect.parameters.names)
-    settings = ProblemOptions(
-        path_cutoff=float("inf"),
-        feedback=feedback,
-        proportional_gains=(20.0, 20.0, 10.0),
-        weak_prior_factor=0.0,
-        **options,
-    )
+    gains = (20.0, 20.0, 10.0)
+    settings = ProblemOptions(**OPEN, feedback=feedback, proportional_gains=gains, **options)
     return EstimationProblem(step, [recording(bench)], ("T1.bend", *names, *free), settings)
 
 
@@ -178,9 +170,8 @@ def test_a_late_camera_sees_the_past(driven, sensors) -> None:
 def test_an_offset_is_taken_out_of_the_prescribed_path(prescribed) -> None:
     task = problem(prescribed, ("encoder_offset",))
     inputs = task.predictor.corrected_inputs(task.episodes[0], task.theta, ("encoder_offset@left_b.offset",))
-    assert inputs.prescribed_path - task.episodes[0].prescribed_path == pytest.approx(
-        np.tile([0.0, -0.01, 0.0], (STEPS + 1, 1))
-    )
+    change = inputs.prescribed_path - task.episodes[0].prescribed_path
+    assert change == pytest.approx(np.tile([0.0, -0.01, 0.0], (STEPS + 1, 1)))
     assert np.all(inputs.prescribed_path_sensitivity[:, 1] == -1)
 
 
@@ -205,12 +196,7 @@ def test_what_a_recording_holds(driven) -> None:
 
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     layout, made, system = cable
-    options = ProblemOptions(
-        initial_state="fitted_to_points",
-        clamp_paths=layout.clamp_paths,
-        path_cutoff=float("inf"),
-        weak_prior_factor=0.0,
-    )
+    options = ProblemOptions(**OPEN, initial_state="fitted_to_points", clamp_paths=layout.clamp_paths)
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):
         step = compile_step(one, H, use_compiler=False)

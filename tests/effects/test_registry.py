@@ -27,9 +27,8 @@ def beam() -> System:
     """Panda with a beam on its hand, its joints prescribed."""
     names = [f"panda_joint{i}" for i in range(1, 8)]
     robot = read_urdf("package:panda", joints=names)
-    item = flexible_object(
-        [Segment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, stiffness_per_curvature=True)], name="beam"
-    )
+    segment = Segment("beam", 0.52, 0.33, 0.01, 3, clamped_at_base=True, stiffness_per_curvature=True)
+    item = flexible_object([segment], name="beam")
     return System.build(robot, objects=[(item, "panda_hand", None)], prescribed=names)
 
 
@@ -40,12 +39,8 @@ OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", 
 def with_servos() -> System:
     """The papers' arm with a position servo on every joint."""
     system = baxter_foam_y_system(1)
-    return System.build(
-        system.mechanism,
-        driven=system.driven,
-        servos=PositionServoOptions(motor=MotorOptions("dc")),
-        grasps=system.grasps,
-    )
+    servos = PositionServoOptions(motor=MotorOptions("dc"))
+    return System.build(system.mechanism, driven=system.driven, servos=servos, grasps=system.grasps)
 
 
 def test_the_vocabulary_is_the_shared_one(shared) -> None:
@@ -104,11 +99,8 @@ def test_places_of_a_beam_on_a_gripper(beam) -> None:
     assert ("gravity_scale", "object") in found
     assert not [place for kind, place in found if kind.startswith(("grasp", "junction", "camera"))]
     # without efforts nothing shows what is wrong with a prescribed joint
-    assert not [
-        place
-        for _, place in candidate_kinds_and_locations(beam, ["joints.position"])
-        if place.startswith("panda_joint4")
-    ][1:]
+    unseen = [place for _, place in candidate_kinds_and_locations(beam, ["joints.position"])]
+    assert len([place for place in unseen if place.startswith("panda_joint4")]) <= 1
     bare = System.build(beam.mechanism, prescribed=beam.prescribed)
     assert [p for k, p in candidate_kinds_and_locations(bare, _SENSOR_KINDS) if k == "point_mass"]
 
@@ -151,13 +143,6 @@ def test_a_place_that_does_not_fit(kind, place, error, text, one_arm) -> None:
 def test_a_value_that_does_not_fit(values, text, one_arm) -> None:
     with pytest.raises(ConfigError, match=text):
         make_effect("kelvin_voigt", "T3", one_arm, values)
-
-
-def test_the_same_effect_twice_is_refused(one_arm) -> None:
-    effect = make_effect("kelvin_voigt", "T3", one_arm)
-    with pytest.raises(ConfigError, match="named twice"):
-        one_arm.with_effects([effect, make_effect("kelvin_voigt", "T3", one_arm)])
-    assert len(one_arm.with_effects([effect, make_effect("kelvin_voigt", "T2", one_arm)]).effects) == 2
 
 
 def test_a_compliance_is_given_and_reported_as_stiffness(one_arm) -> None:

@@ -19,14 +19,11 @@ from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy, tr
 from yid_ocp.model.urdf import read_urdf
 
 
-def branched(links=4, **more):
-    return flexible_object(
-        (
-            Segment("T1", 0.8, 0.08, 0.03, links, **more),
-            Segment("T2", 0.5, 0.04, 0.01, links, parent="T1", rest_rotation=rotation_from_rpy(-0.8, 0.0, 0.0)),
-        ),
-        homogeneous_transform(np.eye(3), [0.1, 0.2, 0.3]),
-    )
+def branched(links=4):
+    turn = rotation_from_rpy(-0.8, 0.0, 0.0)
+    branch = Segment("T2", 0.5, 0.04, 0.01, links, parent="T1", rest_rotation=turn)
+    trunk = Segment("T1", 0.8, 0.08, 0.03, links)
+    return flexible_object([trunk, branch], homogeneous_transform(np.eye(3), [0.1, 0.2, 0.3]))
 
 
 def places(tree: Mechanism, names, q=None, values=None):
@@ -69,9 +66,8 @@ def test_points_stay_when_the_tree_is_put_together():
     """On a robot, after another joint was inserted before it, and with numbers for its parameters."""
     base = flexible_object([Segment("B", 0.3, 0.1, 0.01, 2)]).mechanism
     base = replace(base, frames={name: frame for name, frame in base.frames.items() if name != "object_root"})
-    tree = base.with_attached_mechanism(
-        branched().mechanism, "B:50%", homogeneous_transform(np.eye(3), [1.0, 0.0, 0.0])
-    )
+    aside = homogeneous_transform(np.eye(3), [1.0, 0.0, 0.0])
+    tree = base.with_attached_mechanism(branched().mechanism, "B:50%", aside)
     found = places(tree, ["B:50%", "T1:40%"])
     np.testing.assert_allclose(found[0][:3, 3], [0.0, 0.0, 0.15], atol=1e-12)
     np.testing.assert_allclose(found[1][:3, 3], [1.1, 0.2, 0.15 + 0.3 + 0.32], atol=1e-12)
@@ -123,9 +119,8 @@ def test_joined_mechanisms_hang_on_a_frame(urdf_folder):
     assert set(both.parameters.names) == {*carrier.parameters.names, *item.parameters.names}
     expected = numbers(carrier.frames["tip"].placement.homogeneous_matrix()) @ placement
     expected = expected @ numbers(item.with_numeric_values().joints[0].placement.homogeneous_matrix())
-    np.testing.assert_allclose(
-        numbers(both.with_numeric_values().joints[2].placement.homogeneous_matrix()), expected, atol=1e-15
-    )
+    found = numbers(both.with_numeric_values().joints[2].placement.homogeneous_matrix())
+    np.testing.assert_allclose(found, expected, atol=1e-15)
 
 
 def test_merged_bodies_weigh_what_they_weigh_together():
@@ -155,10 +150,8 @@ def test_a_frame_that_the_file_does_not_have(urdf_folder):
     more = robot.with_added_frame("load", "tip", at).with_added_frame("wall", None, at)
     tip, load = more.frame("tip"), more.frame("load")
     assert load.joint_index == tip.joint_index
-    np.testing.assert_allclose(
-        numbers(load.placement.translation - tip.placement.translation),
-        numbers(tip.placement.rotation) @ [[0.1], [0.2], [0.3]],
-    )
+    apart = numbers(load.placement.translation - tip.placement.translation)
+    np.testing.assert_allclose(apart, numbers(tip.placement.rotation) @ [[0.1], [0.2], [0.3]])
     assert more.frame("wall").joint_index == -1
     with pytest.raises(ModelError, match="there is a frame 'tip' already"):
         robot.with_added_frame("tip", None, at)

@@ -53,9 +53,8 @@ def test_forces_and_energy(robot):
     theta, n = system.parameters.vector(), system.n_coordinates
     x, u = ca.SX.sym("x", n), ca.SX.sym("u", 2)
     outputs = [system.viscous_force(x), system.input_force(u, x, x), system.elastic_energy(x)]
-    viscous, driven, energy = ca.Function("f", [x, u, system.parameters.symbols], outputs)(
-        np.arange(1.0, n + 1), [5.0, 6.0], theta
-    )
+    function = ca.Function("f", [x, u, system.parameters.symbols], outputs)
+    viscous, driven, energy = function(np.arange(1.0, n + 1), [5.0, 6.0], theta)
     index = system.mechanism.joint_index
     expected = np.zeros(n)
     expected[index("slide")] = -0.7 * (index("slide") + 1)

@@ -91,10 +91,9 @@ def test_mass_parameters_scale_what_a_joint_carries(urdf_folder):
     assert robot.parameters["spin.mass"].value == pytest.approx(0.9 + 0.35 + 0.6)
     assert robot.parameters["swing.mass"].value == pytest.approx(0.8 + 0.25)
     nominal, heavy = robot.with_numeric_values().joints[0], robot.with_numeric_values({"spin.mass": 2 * 1.85}).joints[0]
-    np.testing.assert_allclose(
-        numbers(heavy.bodies[0].inertia_about_com), 2 * numbers(nominal.bodies[0].inertia_about_com)
-    )
-    np.testing.assert_allclose(numbers(heavy.bodies[0].center_of_mass), numbers(nominal.bodies[0].center_of_mass))
+    [many], [few] = heavy.bodies, nominal.bodies
+    np.testing.assert_allclose(numbers(many.inertia_about_com), 2 * numbers(few.inertia_about_com))
+    np.testing.assert_allclose(numbers(many.center_of_mass), numbers(few.center_of_mass))
 
 
 def test_a_locked_joint_stands_at_its_value_or_within_its_range(urdf_folder):
@@ -127,12 +126,10 @@ def test_round_trip_with_names_that_clash_and_half_open_ranges(tmp_path):
     """A frame called like the link that the writer would make, a joint called like its fixed joint."""
     body = (Inertia.from_values(1.0, [0, 0, 0.1], np.eye(3)),)
     shifted = Placement.from_matrix(homogeneous_transform(np.eye(3), [0.0, 0.0, 0.5]))
-    joints = (
-        Joint("a", "revolute", -1, shifted, (0.0, 0.0, 1.0), body, lower_limit=-1.0),
-        Joint("b_fixed", "prismatic", 0, shifted, (0.0, 1.0, 0.0), body, effort_limit=5e4),
-    )
+    one = Joint("a", "revolute", -1, shifted, (0.0, 0.0, 1.0), body, lower_limit=-1.0)
+    other = Joint("b_fixed", "prismatic", 0, shifted, (0.0, 1.0, 0.0), body, effort_limit=5e4)
     frames = {"a_link": Frame(1, shifted), "world": Frame(0, shifted), "b": Frame(-1, shifted)}
-    mechanism = Mechanism("clash", joints, frames)
+    mechanism = Mechanism("clash", (one, other), frames)
     path = tmp_path / "clash.urdf"
     path.write_text(mechanism_to_urdf(mechanism), encoding="utf-8")
     assert_equal_mechanisms(mechanism, read_urdf(path).with_numeric_values())

@@ -132,13 +132,8 @@ def grippers_beside(system: System, values: dict[str, float], time_step: float, 
 
 def test_the_constraint_solver_converges_on_a_fine_chain() -> None:
     coarse = SYSTEMS[2]
-    fine = System.build(
-        read_urdf("package:baxter", joints=list(coarse.driven)),
-        objects=[(foam_y_object(links=8), None, None)],
-        grasps=coarse.grasps,
-        driven=coarse.driven,
-        damping=0.1,
-    )
+    robot, objects = read_urdf("package:baxter", joints=list(coarse.driven)), [(foam_y_object(links=8), None, None)]
+    fine = System.build(robot, objects=objects, grasps=coarse.grasps, driven=coarse.driven, damping=0.1)
     assert fine.n_coordinates > 80  # MuJoCo takes sparse matrices for more than 60, if it is let
     scene = grippers_beside(fine, {name: 2 * value for name, value in TRUTH.items()}, 1e-4, coarse)
     mujoco.mj_step(scene.model, scene.data, nstep=3)

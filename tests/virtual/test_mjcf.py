@@ -81,13 +81,8 @@ OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", 
 @pytest.fixture(scope="module")
 def system() -> System:
     """Two driven joints, a trunk with two branches, the tip of one of them held by the ceiling."""
-    item = flexible_object(
-        [
-            Segment("T", 0.4, 0.2, 0.01, 2, bend=8.0, twist=5.0),
-            Segment("B", 0.2, 0.1, 0.01, 1, parent="T", bend=6.0),
-            Segment("C", 0.2, 0.1, 0.01, 1, parent="T", bend=6.0),
-        ]
-    )
+    branches = [Segment(name, 0.2, 0.1, 0.01, 1, parent="T", bend=6.0) for name in "BC"]
+    item = flexible_object([Segment("T", 0.4, 0.2, 0.01, 2, bend=8.0, twist=5.0), *branches])
     robot = read_urdf("default:double_pendulum.urdf")
     grasps = [Grasp("hold", "ceiling", "w_B")]
     driven = robot.joint_names
@@ -242,9 +237,8 @@ def test_what_mujoco_cannot_express_is_refused() -> None:
     bare = Frame(tree.joint_index("T2_1_y"), Placement.identity())
     with pytest.raises(ModelError, match="more than six"):
         mujoco_xml(System.build(floating_clamp("clamp"), objects=[(beam, "clamp", None)]))
+    tree = replace(tree, frames={**tree.frames, "bare": bare})
     with pytest.raises(ModelError, match="sits on a joint that carries no mass"):
-        mujoco_xml(
-            replace(SYSTEMS[1], point_frames=("bare",), mechanism=replace(tree, frames={**tree.frames, "bare": bare}))
-        )
+        mujoco_xml(replace(SYSTEMS[1], point_frames=("bare",), mechanism=tree))
     with pytest.raises(ConfigError, match="time_step"):
         mujoco_xml(system, time_step=0.0)

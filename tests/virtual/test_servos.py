@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
@@ -24,17 +26,17 @@ from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 POSTURE = {"pan": 0.2, "lift": 0.4, "elbow": 1.0, "wrist_flex": 0.3, "wrist_roll": 0.0}
 JOINTS = tuple(POSTURE)
-VALUES = {
-    f"{joint}.{name}": value
-    for joint in JOINTS
-    for name, value in {"servo_gain": 40.0, "servo_damping": 2.0, "servo_delay": 0.035}.items()
-}
+SERVO = {"servo_gain": 40.0, "servo_damping": 2.0, "servo_delay": 0.035}
+VALUES = {f"{joint}.{name}": value for joint in JOINTS for name, value in SERVO.items()}
+
+
+def moved_by(servos: PositionServoOptions, **more: Any) -> System:
+    return System.build(read_urdf("default:servo_arm.urdf"), driven=JOINTS, servos=servos, damping=0.02, **more)
 
 
 @pytest.fixture(scope="module")
 def arm() -> System:
-    robot = read_urdf("default:servo_arm.urdf")
-    return System.build(robot, driven=JOINTS, servos=PositionServoOptions(), damping=0.02, point_frames=["gripper"])
+    return moved_by(PositionServoOptions(), point_frames=["gripper"])
 
 
 def played(arm: System, *effects: InjectedEffect) -> Recording:
@@ -86,20 +88,15 @@ def test_both_engines_move_alike(arm: System, recording: Recording) -> None:
 
 def test_both_engines_move_a_direct_current_motor_alike() -> None:
     """At its duty's limit a motor gives the limit less its counter-voltage, which a clip of the whole would not."""
-    robot, joints = read_urdf("default:servo_arm.urdf"), list(JOINTS)
-    kinds = {
-        kind: System.build(
-            robot, driven=JOINTS, servos=PositionServoOptions(motor=MotorOptions(kind)), damping=0.02, point_frames=[]
-        )
-        for kind in ("dc", "ideal")
-    }
-    limited = [("servo_saturation", "lift", {"limit": 1.3})]
-    made = played(kinds["dc"], *(InjectedEffect(*entry) for entry in limited))
+    servos = {kind: PositionServoOptions(motor=MotorOptions(kind)) for kind in ("dc", "ideal")}
+    systems = {kind: moved_by(own, point_frames=[]) for kind, own in servos.items()}
+    limited = ("servo_saturation", "lift", {"limit": 1.3})
+    made = played(systems["dc"], InjectedEffect(*limited))
     assert made.joints is not None
     apart = {}
-    for kind, system in kinds.items():
-        own = system.with_effects([make_effect(name, place, system, values) for name, place, values in limited])
-        apart[kind] = np.abs(evaluated(own, made)[1] - made.joints.position)[:, joints.index("lift")].max()
+    for kind, system in systems.items():
+        own = system.with_effects([make_effect(*limited[:2], system, limited[2])])
+        apart[kind] = np.abs(evaluated(own, made)[1] - made.joints.position)[:, JOINTS.index("lift")].max()
     assert apart["dc"] < 2e-3
     assert apart["ideal"] > 10 * apart["dc"]
 
@@ -136,9 +133,8 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(arm: System) -> None:
     assert [said[f"{kind}@{place}"].status for kind, place, _ in effects] == ["native"] * 3 + ["not representable"]
     for form, status in (("mjcf", "native"), ("urdf", "not representable"), ("sdf", "not representable")):
         own = parameter_format_support(system, effect_format_support(system, values, form), form)
-        assert {own[f"wrist_flex.servo_{name}"].status for name in ("gain", "damping", "delay", "torque_limit")} == {
-            status
-        }
+        names = ("gain", "damping", "delay", "torque_limit")
+        assert {own[f"wrist_flex.servo_{name}"].status for name in names} == {status}
     kept = arm.with_effects([make_effect(kind, place, arm, values) for kind, place, values in effects[:3]])
     model = mujoco.MjModel.from_xml_string(mujoco_xml(kept, VALUES))
     pan, lift = model.actuator("pan"), model.actuator("lift")

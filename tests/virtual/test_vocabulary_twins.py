@@ -86,10 +86,8 @@ def test_a_payload_that_cannot_be_is_refused() -> None:
 
 
 def test_friction_that_holds_is_found() -> None:
-    values = {"tau_c": 0.5, "yield_angle": 0.01}
-    found = fitted(
-        "joint_presliding", "elbow", recorded([InjectedEffect("joint_presliding", "elbow", values)]), "prescribed"
-    )
+    recording = recorded([InjectedEffect("joint_presliding", "elbow", {"tau_c": 0.5, "yield_angle": 0.01})])
+    found = fitted("joint_presliding", "elbow", recording, "prescribed")
     assert agrees(found["tau_c"], 0.5, 5e-3)
     assert agrees(found["yield_angle"], 0.01, 0.02)
 
