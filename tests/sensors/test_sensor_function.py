@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -15,14 +16,44 @@ from yid_ocp.data import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError, SolverError
 from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import Mechanism, Segment, System, flexible_object
+from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
-from yid_ocp.model.system import Effect, NodeState, System
+from yid_ocp.model.system import Effect, NodeState
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.sensors import ChannelKind, EffortSensor, PointSensor, Sensor, sensor_reading_function
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
 LABEL = "drift@left"
+
+
+@pytest.fixture(scope="session")
+def system() -> System:
+    """An arm of two joints beside a flexible Y."""
+    along = Placement.from_matrix(homogeneous_transform(np.eye(3), [0.0, 0.0, 0.5]))
+    body = Inertia.from_values(1.0, [0.0, 0.0, 0.25], np.diag([0.02, 0.02, 0.001]))
+    upper = Joint("left_a", "revolute", -1, Placement.identity(), (0.0, 1.0, 0.0), (body,))
+    lower = Joint("left_b", "revolute", 0, along, (1.0, 0.0, 0.0), (body,))
+    robot = Mechanism("arm", (upper, lower), {"left_gripper": Frame(1, along)})
+    segments = (
+        Segment("T1", 0.4, 0.08, 0.03, 2),
+        Segment("T2", 0.3, 0.04, 0.01, 1, parent="T1", rest_rotation=rotation_from_rpy(-0.8, 0.0, 0.0)),
+    )
+    return System.build(robot, objects=[(flexible_object(segments), None, None)], prescribed=robot.joint_names)
+
+
+@pytest.fixture(scope="session")
+def read() -> Callable[..., np.ndarray]:
+    """read(system, sensor, q, effort): outputs at the parameters' nominal values."""
+
+    def outputs(system: System, sensor: Sensor, q=None, effort=None) -> np.ndarray:
+        n = system.n_coordinates
+        function = sensor_reading_function(system, sensor, ())
+        at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
+        return np.array(ca.densify(function(**at, theta=system.parameters.vector())["y"])).ravel()
+
+    return outputs
 
 
 class Drift(Effect):

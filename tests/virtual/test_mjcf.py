@@ -74,7 +74,7 @@ OTHERS = {
 }
 
 
-# actuators of another system: tests/virtual/test_servos.py
+# actuators of another system: tests/virtual/test_vocabulary_twins.py
 OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", "back_emf"}
 
 
