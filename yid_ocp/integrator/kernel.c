@@ -50,8 +50,6 @@ typedef struct {
     whole iterations, factorisations;
 } Work;
 
-static void work_free(Work *k) { YID_FREE(k->block); }
-
 typedef struct {
     const real *q0, *p0, *z0, *u, *theta, *time_step;
     real *q1, *z1, *lam;
@@ -700,10 +698,6 @@ static void sensitivity_step(Work *k, const Point *a, int d, int members, const 
     }
 }
 
-static void effort_of(const Work *k, real *effort) {
-    for (int j = 0; j < NC; j++) effort[j] = -k->balance[prescribed_index[j]] / k->h;
-}
-
 /* u = nominal - gain (state[index] - reference) */
 static void apply_feedback(int count, const int *index, const real *gain, const real *reference, const real *state,
                            const real *nominal, real *u) {
@@ -761,24 +755,13 @@ static Work *work_new(size_t numbers, Outcome *outcome) {
     return k;
 }
 
-/* `count` entries of an array of every member, side by side; members beyond the last are like it. */
-static void gather(const double *const *from, size_t count, real *to) {
-    EACH
-        for (size_t i = 0; i < count; i++) SIMD_ENTRY(to[i], entry) = from[entry][i];
-}
-
-/* Entries of one member back into its own array. */
-static void scatter(const real *from, size_t count, int entry, double *to) {
-    for (size_t i = 0; i < count; i++) to[i] = SIMD_ENTRY(from[i], entry);
-}
-
-/* One member's rows of `own` columns, among those of `d` columns of all. */
-static void gather_columns(const double *from, size_t rows, size_t own, size_t d, int entry, real *to) {
+/* One member's rows of `own` columns, among those of `d` columns of all; and back into its own array. */
+static void gather(const double *from, size_t rows, size_t own, size_t d, int entry, real *to) {
     for (size_t i = 0; i < rows; i++)
         for (size_t c = 0; c < own; c++) SIMD_ENTRY(to[i * d + c], entry) = from[i * own + c];
 }
 
-static void scatter_columns(const real *from, size_t rows, size_t own, size_t d, int entry, double *to) {
+static void scatter(const real *from, size_t rows, size_t own, size_t d, int entry, double *to) {
     if ((const void *)from == (const void *)to) return;
     for (size_t i = 0; i < rows; i++)
         for (size_t c = 0; c < own; c++) to[i * own + c] = SIMD_ENTRY(from[i * d + c], entry);
@@ -831,7 +814,6 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
     const Motion *motion[SIMD_WIDTH];
     const Trajectory *out[SIMD_WIDTH];
     const Sensitivities *by[SIMD_WIDTH];
-    const double *from[SIMD_WIDTH];
     int most = 0;
     EACH {
         const int who = entry < members ? entry : 0;
@@ -843,17 +825,15 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
         SIMD_ENTRY(m.time_step, entry) = motion[entry]->time_step;
         SIMD_ENTRY(m.tolerance, entry) = motion[entry]->tolerance;
     }
-    EACH from[entry] = motion[entry]->theta;
-    gather(from, NTHETA, m.theta);
-    EACH from[entry] = out[entry]->state;
-    gather(from, NX, m.x[0]);
     size_t own[SIMD_WIDTH];
     int moves = 0, fed_forward = 0;
     EACH {
+        gather(motion[entry]->theta, NTHETA, 1, 1, entry, m.theta);
+        gather(out[entry]->state, NX, 1, 1, entry, m.x[0]);
         own[entry] = d ? (size_t)motion[entry]->directions->count : 0;
         moves |= d && by[entry]->path;
         fed_forward |= d && by[entry]->torque;
-        if (apart) gather_columns(by[entry]->state, NX, own[entry], d, entry, X[0]);
+        if (apart) gather(by[entry]->state, NX, own[entry], d, entry, X[0]);
     }
     prepare(k, m.theta, &m.time_step);
 
@@ -867,18 +847,12 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
             const int last = motion[entry]->steps - 1;
             row[entry] = step < last ? step : last;
             SIMD_ENTRY(at_work, entry) &= ONES(step <= last);
-        }
-        EACH from[entry] = motion[entry]->path + (size_t)(row[entry] + 1) * NC;
-        gather(from, NC, m.prescribed);
-        if (NU) {
-            EACH from[entry] = motion[entry]->torque + (size_t)row[entry] * NU;
-            gather(from, NU, m.nominal);
-        }
-        if (feeds) {
-            EACH from[entry] = motion[entry]->feedback->gain + (size_t)row[entry] * NU * feeds;
-            gather(from, (size_t)NU * feeds, m.gain);
-            EACH from[entry] = motion[entry]->feedback->reference + (size_t)row[entry] * feeds;
-            gather(from, feeds, m.reference);
+            const Feedback *loop = motion[entry]->feedback;
+            const size_t at = row[entry];
+            gather(motion[entry]->path + (at + 1) * NC, NC, 1, 1, entry, m.prescribed);
+            if (NU) gather(motion[entry]->torque + at * NU, NU, 1, 1, entry, m.nominal);
+            if (feeds) gather(loop->gain + at * NU * feeds, (size_t)NU * feeds, 1, 1, entry, m.gain);
+            if (feeds) gather(loop->reference + at * feeds, feeds, 1, 1, entry, m.reference);
         }
         const real *x = m.x[0];
         real *next = m.x[2];
@@ -887,19 +861,19 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
         Point a = {x, x + N, x + 2 * N, u, m.theta, &m.time_step, q1, z1, lam};
         const mask good = one_step(k, &a, m.tolerance, motions->limit, at_work, &error, &status);
         m.error = choose(at_work, error, m.error);
-        effort_of(k, effort);
+        for (int j = 0; j < NC; j++) effort[j] = -k->balance[prescribed_index[j]] / k->h;
         for (int entry = 0; entry < members; entry++) {
             if (!SIMD_ENTRY(at_work, entry)) continue;
             double *state = outs[entry].state + (size_t)(step + 1) * NX;
-            scatter(u, NU, entry, outs[entry].applied + (size_t)step * NU);
-            scatter(q1, N, entry, state);
-            scatter(k->p1, N, entry, state + N);
-            scatter(z1, NZ, entry, state + 2 * N);
+            scatter(u, NU, 1, 1, entry, outs[entry].applied + (size_t)step * NU);
+            scatter(q1, N, 1, 1, entry, state);
+            scatter(k->p1, N, 1, 1, entry, state + N);
+            scatter(z1, NZ, 1, 1, entry, state + 2 * N);
             outcomes[entry].step = step;
             outcomes[entry].status = SIMD_ENTRY(good, entry) ? OK : SIMD_WIDTH == 1 ? status : NOT_CONVERGED;
             if (!SIMD_ENTRY(good, entry)) continue;
-            scatter(lam, M, entry, outs[entry].multipliers + (size_t)step * M);
-            scatter(effort, NC, entry, outs[entry].effort + (size_t)step * NC);
+            scatter(lam, M, 1, 1, entry, outs[entry].multipliers + (size_t)step * M);
+            scatter(effort, NC, 1, 1, entry, outs[entry].effort + (size_t)step * NC);
         }
         /* those that have ended, well or not, stay where they are */
         for (int i = 0; i < N; i++) next[i] = choose(good, q1[i], x[i]);
@@ -924,7 +898,7 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
                 memset(columns.input_room, 0, sizeof(real) * NU * d);
                 EACH {
                     const double *given = by[entry]->torque ? by[entry]->torque + row[entry] * NU * own[entry] : NULL;
-                    if (given) gather_columns(given, NU, own[entry], d, entry, columns.input_room);
+                    if (given) gather(given, NU, own[entry], d, entry, columns.input_room);
                 }
                 feed_columns(feeds, fed, m.gain, (int)d, columns.before, columns.input_room);
             }
@@ -932,7 +906,7 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
                 columns.path = SIMD_WIDTH == 1 ? (const real *)bys->path + (size_t)(step + 1) * NC * d : moved_path;
                 EACH {
                     const double *given = by[entry]->path ? by[entry]->path + (row[entry] + 1) * NC * own[entry] : NULL;
-                    if (given && SIMD_WIDTH > 1) gather_columns(given, NC, own[entry], d, entry, moved_path);
+                    if (given && SIMD_WIDTH > 1) gather(given, NC, own[entry], d, entry, moved_path);
                 }
             }
             if (any(solvable)) sensitivity_step(k, &a, (int)d, members, motions, &columns);
@@ -941,9 +915,9 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
                 if (!SIMD_ENTRY(solvable, entry)) outcomes[entry].status = SINGULAR;
                 else {
                     const size_t of = own[entry], at = step;
-                    scatter_columns(columns.after, NX, of, d, entry, bys[entry].state + (at + 1) * NX * of);
-                    scatter_columns(columns.multipliers, M, of, d, entry, bys[entry].multipliers + at * M * of);
-                    scatter_columns(columns.effort, NC, of, d, entry, bys[entry].effort + at * NC * of);
+                    scatter(columns.after, NX, of, d, entry, bys[entry].state + (at + 1) * NX * of);
+                    scatter(columns.multipliers, M, of, d, entry, bys[entry].multipliers + at * M * of);
+                    scatter(columns.effort, NC, of, d, entry, bys[entry].effort + at * NC * of);
                 }
             }
             m.running &= solvable | NOT(good);
@@ -958,7 +932,7 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
         outcomes[entry].iterations = SIMD_ENTRY(k->iterations, entry);
         outcomes[entry].factorisations = SIMD_ENTRY(k->factorisations, entry);
     }
-    work_free(k);
+    YID_FREE(k->block);
     return OK;
 }
 
@@ -1080,7 +1054,7 @@ int yid_adjoint(const Motion *motion, const Trajectory *rollout, const Partials 
     memcpy(gradient->start, costate, sizeof(double) * NX);
     for (int j = 0; j < NC; j++) gradient->path[j] = costate[prescribed_index[j]];
     outcome->step = step;
-    work_free(k);
+    YID_FREE(k->block);
     return status;
 }
 
@@ -1116,7 +1090,7 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
             add_sparse(dir->p1_nz, dir->p1_pattern, out->p1_theta + (size_t)step * N * d, d, 0);
         }
     }
-    work_free(k);
+    YID_FREE(k->block);
     return OK;
 }
 #endif
