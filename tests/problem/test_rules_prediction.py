@@ -159,9 +159,8 @@ def test_an_encoder_that_is_offset_moves_the_path(urdf_folder):
 def test_an_elastic_gear_gives_under_the_recorded_effort(urdf_folder):
     problem = problem_of(urdf_folder, "prescribed gears", seeds=(1,))
     episode = problem.episodes[0]
-    theta = problem.system.parameters.vector(
-        {"series_elasticity@shoulder.compliance": 0.004, "backlash@shoulder.width": 0.0}
-    )
+    values = {"series_elasticity@shoulder.compliance": 0.004, "backlash@shoulder.width": 0.0}
+    theta = problem.system.parameters.vector(values)
     inputs = problem.predictor.corrected_inputs(episode, theta, ())
     effort = episode.recording.joints.effort
     np.testing.assert_allclose(episode.joint_loads, effort, atol=1e-12)
@@ -235,15 +234,10 @@ def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder)
     problem = problem_of(urdf_folder, "driven, filtered, both", seeds=(1,))
     episode, vector = problem.episodes[0], problem.system.parameters.vector
     neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral_values.items()}
-    none = np.zeros(problem.step.sizes["nx"])
-    assert (
-        problem.predictor.corrected_inputs_with_momentum_shift(episode, vector(neutral), (), none).momentum_shift
-        is None
-    )
-    armature = neutral | {"rotor_inertia@shoulder.armature": 0.05}
-    found = problem.predictor.corrected_inputs_with_momentum_shift(
-        episode, vector(armature), ("rotor_inertia@shoulder.armature",), none
-    )
+    none, shifted = np.zeros(problem.step.sizes["nx"]), problem.predictor.corrected_inputs_with_momentum_shift
+    assert shifted(episode, vector(neutral), (), none).momentum_shift is None
+    name = "rotor_inertia@shoulder.armature"
+    found = shifted(episode, vector(neutral | {name: 0.05}), (name,), none)
     # of the motion up to each node; it begins from a stand
     rate = np.diff(episode.smoothed_driven_angles[:, 0], prepend=episode.smoothed_driven_angles[0, 0])[:-1] / H
     np.testing.assert_allclose(found.momentum_shift, np.stack([0.05 * rate, 0 * rate], axis=1), atol=1e-12)
@@ -268,13 +262,11 @@ def test_gains_do_not_know_of_effects(urdf_folder):
     """They are worked out at the nominal parameters with the effects' momentum left out, which is followed apart."""
     effects, how, _ = CASES["driven, filtered, both"]
     light = tuple((kind, place, {} if kind == "rotor_inertia" else values) for kind, place, values in effects)
-    made = []
+    made, options = [], ProblemOptions(path_cutoff=math.inf)
     for chosen in (effects, light):
         step = pendulum_step(urdf_folder, chosen, **how)
-        options = ProblemOptions(path_cutoff=math.inf)
-        made.append(
-            EstimationProblem(step, [taken(step, 1)], ("elbow.damping",), options).episodes[0].tracking_feedback
-        )
+        [episode] = EstimationProblem(step, [taken(step, 1)], ("elbow.damping",), options).episodes
+        made.append(episode.tracking_feedback)
     np.testing.assert_allclose(made[0].gain, made[1].gain, rtol=1e-9)
     np.testing.assert_allclose(made[0].reference, made[1].reference, rtol=1e-9)
 
@@ -286,9 +278,8 @@ def test_an_episode_begins_at_its_first_posture(urdf_folder, case, driven, presc
     assert episode.measured_driven_angles.shape == (STEPS + 1, driven)
     assert episode.prescribed_path.shape == (STEPS + 1, prescribed)
     np.testing.assert_allclose(episode.initial_known_coordinates, position[0], atol=1e-12)
-    np.testing.assert_allclose(
-        np.hstack([episode.measured_driven_angles, episode.prescribed_path]), position, atol=1e-12
-    )
+    path = np.hstack([episode.measured_driven_angles, episode.prescribed_path])
+    np.testing.assert_allclose(path, position, atol=1e-12)
     assert episode.torque.shape == (STEPS, driven)
     np.testing.assert_allclose(episode.torque, episode.recording.joints.effort[:-1, :driven], atol=1e-9)
 
@@ -300,15 +291,13 @@ def test_a_filtered_arm_is_smooth_enough_to_be_differenced(urdf_folder):
     noisy = made.joints.position + 1e-3 * np.random.default_rng(1).standard_normal(made.joints.position.shape)
     made = replace(made, joints=replace(made.joints, position=noisy))
     smooth, plain = (
-        EstimationProblem(
-            step, [made], ("elbow.damping",), ProblemOptions(path_cutoff=5.0, feedback=kind, proportional_gains=(9.0,))
-        )
-        for kind in ("lqr", "proportional")
+        EstimationProblem(step, [made], ("elbow.damping",), ProblemOptions(path_cutoff=5.0, **how)).episodes[0]
+        for how in (FILTERED, TRACKED)
     )
-    rough = [np.abs(np.diff(p.episodes[0].smoothed_driven_angles, 2, axis=0)).max() for p in (smooth, plain)]
+    rough = [np.abs(np.diff(episode.smoothed_driven_angles, 2, axis=0)).max() for episode in (smooth, plain)]
     assert rough[0] < 0.5 * rough[1]
-    np.testing.assert_array_equal(plain.episodes[0].smoothed_driven_angles, plain.episodes[0].measured_driven_angles)
-    np.testing.assert_array_equal(smooth.episodes[0].measured_driven_angles, plain.episodes[0].measured_driven_angles)
+    np.testing.assert_array_equal(plain.smoothed_driven_angles, plain.measured_driven_angles)
+    np.testing.assert_array_equal(smooth.measured_driven_angles, plain.measured_driven_angles)
 
 
 # -- the first part of an episode -------------------------------------------------------------------------------------
@@ -343,47 +332,14 @@ def test_filters_follow_the_true_angles_and_momenta():
     inputs = CorrectedInputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), arm)
     assert inputs.corrected_feedback(feedback, (0, 1), measured) is feedback
     assert inputs.corrected_feedback(None, (0, 1), measured) is None
-    angles = replace(inputs, driven_angles_sensitivity=np.zeros((4, 2, 1))).corrected_feedback(
-        feedback, (0, 1), measured
-    )
+    turned = replace(inputs, driven_angles_sensitivity=np.zeros((4, 2, 1)))
+    angles = turned.corrected_feedback(feedback, (0, 1), measured)
     np.testing.assert_array_equal(angles.reference, np.full((3, 4), [1.0, 2.0, 0.0, 0.0]))
     momenta = replace(inputs, momentum_shift=momentum).corrected_feedback(feedback, (0, 1), measured)
     np.testing.assert_array_equal(momenta.reference, np.full((3, 4), [0.0, 0.0, 10.0, 20.0]))
     assert not feedback.reference.any()
-    swapped = replace(inputs, driven_angles_sensitivity=np.zeros((4, 2, 1))).corrected_feedback(
-        feedback, (1, 0), measured
-    )
+    swapped = turned.corrected_feedback(feedback, (1, 0), measured)
     np.testing.assert_array_equal(swapped.reference[:, :2], np.full((3, 2), [2.0, 1.0]))
-
-
-def test_a_moving_reference_moves_the_torque_by_the_gain():
-    gain = np.arange(24.0).reshape(3, 2, 4)
-    feedback = TrackingFeedback(np.array([0, 1, 4, 5]), gain, np.zeros((3, 4)))
-    by_arm, by_momentum = np.zeros((4, 2, 1)), np.zeros((3, 2, 1))
-    by_arm[:, 1], by_momentum[:, 0] = 1.0, 2.0
-    plain = CorrectedInputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), np.zeros((4, 2)))
-    assert plain.nominal_torque_sensitivity(feedback, (0, 1), 1) is None
-    by_torque = np.full((3, 2, 1), 100.0)
-    full = replace(
-        plain, torque_sensitivity=by_torque, driven_angles_sensitivity=by_arm, momentum_shift_sensitivity=by_momentum
-    )
-    np.testing.assert_array_equal(full.nominal_torque_sensitivity(None, (0, 1), 1), by_torque)
-    found = full.nominal_torque_sensitivity(feedback, (0, 1), 1)
-    np.testing.assert_array_equal(found[:, :, 0], 100.0 + gain[:, :, 1] + 2 * gain[:, :, 2])
-    np.testing.assert_array_equal(by_torque, np.full((3, 2, 1), 100.0))
-    alone = replace(plain, momentum_shift_sensitivity=by_momentum).nominal_torque_sensitivity(feedback, (0, 1), 1)
-    np.testing.assert_array_equal(alone[:, :, 0], 2 * gain[:, :, 2])
-
-
-def test_known_coordinates_are_driven_then_prescribed():
-    inputs = CorrectedInputs(np.zeros((3, 1)), np.zeros(1), np.array([[5.0, 6.0], [0, 0]]), np.array([[4.0], [0.0]]))
-    assert inputs.initial_known_coordinates.tolist() == [4.0, 5.0, 6.0]
-    np.testing.assert_array_equal(inputs.initial_known_coordinates_sensitivity(2), np.zeros((3, 2)))
-    by_path = np.arange(8.0).reshape(2, 2, 2)
-    np.testing.assert_array_equal(
-        replace(inputs, prescribed_path_sensitivity=by_path).initial_known_coordinates_sensitivity(2),
-        [[0, 0], [0, 1], [2, 3]],
-    )
 
 
 @pytest.mark.parametrize(
