@@ -6,14 +6,15 @@ import math
 
 import numpy as np
 import pytest
+from small_problems import PENDULUM, pendulum_step, taken
 
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME
 from yid_ocp.solvers import GaussNewton, solve
 
 JOINTS = ("shoulder", "elbow")
@@ -65,10 +66,6 @@ def test_neighbours_that_repeat_each_other_are_left_out(arm):
     plain, smooth = (arm(np.zeros((601, 2)), cutoff).episodes[0].measurements[0] for cutoff in (math.inf, CUTOFF))
     np.testing.assert_array_equal(plain.node, np.arange(1, 600))
     np.testing.assert_array_equal(smooth.node + np.rint(smooth.fraction), np.arange(77, 524, 10))
-    assert LowPassFilter(CUTOFF).decorrelation_stride(0.01) == 10
-    assert LowPassFilter(CUTOFF).settling_time == pytest.approx(0.574, abs=1e-3)
-    assert effort_filter(CUTOFF).settling_time == pytest.approx(0.768, abs=1e-3)
-    assert LowPassFilter(30.0).decorrelation_stride(0.05) == 1
 
 
 @pytest.mark.parametrize(("kind", "late"), [(None, 0.0), ("sample", 0.0), ("mean", 0.005), ("command", 0.005)])
@@ -78,6 +75,18 @@ def test_an_effort_that_stands_for_an_interval_belongs_to_its_middle(arm, kind, 
     at = 0.01 * (samples.node + samples.fraction)[:, None]
     expected = np.hstack([at - late, 2 - at + late])
     np.testing.assert_allclose(samples.value.reshape(len(at), 2), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["sample", "mean", "command"])
+def test_settings_say_what_recorded_efforts_are(urdf_folder, kind):
+    step = pendulum_step(urdf_folder, driven=PENDULUM)
+    recorded, free = taken(step, 1), ["shoulder.damping"]
+    stated = ProblemOptions(sensors={JOINT_EFFORT_GROUP_NAME: SensorOptions(effort_kind=kind)})
+    [said] = EstimationProblem(step, [recorded], free, stated).episodes
+    [held] = EstimationProblem(step, [recorded.with_effort_kind(kind)], free, ProblemOptions()).episodes
+    assert said.recording.joints.effort_kind == kind
+    np.testing.assert_array_equal(said.torque, held.torque)
+    assert (np.abs(said.torque - recorded.joints.effort[:-1]).max() < 1e-12) == (kind != "sample")
 
 
 @pytest.mark.parametrize("cutoff", [math.inf, CUTOFF])
