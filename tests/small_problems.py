@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import casadi as ca
 import numpy as np
+import pytest
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import make_effect
@@ -133,3 +134,33 @@ def swinging_pendulum(folder, *effects):
         return recording(None, group, name=f"swing_{seed}")
 
     return step, record
+
+
+def torque_function(step, known):
+    """Torques at (u, q, v) and known values."""
+    system = step.system
+    u, q, v = (ca.SX.sym(name, 2) for name in "uqv")
+    function = ca.Function("torque", [u, q, v, system.parameters.symbols], [system.input_force(u, q, v)])
+    theta = system.parameters.vector({name: x for name, x in known.items() if name in system.parameters})
+    return lambda *at: np.array(function(*at, theta)).ravel()
+
+
+def assert_slopes_are_those_of_differences(made, width, rtol, atol):
+    """Of rows of data, by moves of each unknown by `width(name, value)`."""
+    x, rows = made.initial_unknowns, made.residual_rows.data
+    at = made.evaluate(x)
+    assert at.ok, at.message
+    for i, name in enumerate(made.unknown_names):
+        move = width(name, x[i]) * np.eye(len(x))[i]
+        ends = [made.evaluate(x + sign * move, False).residual[rows] for sign in (1, -1)]
+        exact = at.jacobian[rows, i]
+        assert np.abs(exact - (ends[0] - ends[1]) / (2 * move[i])).max() < rtol * np.abs(exact).max() + atol, name
+
+
+def assert_the_compiled_step_agrees(slow, problem_with):
+    fast = compile_step(slow.system, H)
+    if not fast.is_compiled:
+        pytest.skip("no C compiler")
+    one, other = (p.evaluate(p.initial_unknowns) for p in map(problem_with, (slow, fast)))
+    np.testing.assert_allclose(one.residual, other.residual, atol=1e-7)
+    np.testing.assert_allclose(one.jacobian, other.jacobian, rtol=1e-6, atol=1e-6)

@@ -5,11 +5,20 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from small_problems import PENDULUM, H, joints, pendulum_step, recording
+from small_problems import (
+    PENDULUM,
+    H,
+    assert_slopes_are_those_of_differences,
+    assert_the_compiled_step_agrees,
+    joints,
+    pendulum_step,
+    recording,
+    torque_function,
+)
 
 from yid_ocp.data.recording import validate_recording
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.step import compile_step, simulate
+from yid_ocp.integrator.step import simulate
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorOptions, PositionServoOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.recorded_inputs import recorded_servo_gain_factors
@@ -27,16 +36,8 @@ def step(urdf_folder):
     return pendulum_step(urdf_folder, driven=PENDULUM, servos=DC)
 
 
-def torque_function(step):
-    system = step.system
-    u, q, v = (ca.SX.sym(name, 2) for name in "uqv")
-    function = ca.Function("torque", [u, q, v, system.parameters.symbols], [system.input_force(u, q, v)])
-    theta = system.parameters.vector({k: x for k, x in VALUES.items() if k in system.parameters})
-    return lambda *at: np.array(function(*at, theta)).ravel()
-
-
 def test_a_dc_motor_limits_its_duty_and_its_speed_takes_torque_beyond_the_limit(step) -> None:
-    torque = torque_function(step)
+    torque = torque_function(step, VALUES)
     # an error of 1 rad asks for 60 N m, the duty gives 9, and 2 rad/s against it cost 8 more
     assert torque([1.0, 0.0], [0.0, 0.0], [2.0, 0.0])[0] == pytest.approx(9.0 - 8.0)
     assert torque([1.0, 0.0], [0.0, 0.0], [-2.0, 0.0])[0] == pytest.approx(9.0 + 8.0)
@@ -44,7 +45,7 @@ def test_a_dc_motor_limits_its_duty_and_its_speed_takes_torque_beyond_the_limit(
 
 
 def test_a_motor_that_is_off_gives_no_torque_however_fast_it_turns(step) -> None:
-    assert list(torque_function(step)([MOTOR_OFF_COMMAND] * 2, [0.3, 0.2], [3.0, -5.0])) == [0.0, 0.0]
+    assert list(torque_function(step, VALUES)([MOTOR_OFF_COMMAND] * 2, [0.3, 0.2], [3.0, -5.0])) == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("preset", MOTOR_PRESETS)
@@ -138,21 +139,8 @@ def test_slopes_through_sticking_reversal_and_rest_are_those_of_differences(urdf
     names = step.system.parameters.names
     # a delay moves the sample at which a motor is switched off: there is a jump, not a slope
     free = [name for name in names if ("servo" in name or "@" in name) and "servo_delay" not in name]
-    values = dict(zip(names, step.system.parameters.vector(), strict=True))
-    made = problem_of(step, group, free, {name: value for name, value in values.items() if "@" in name})
-    x = made.initial_unknowns
-    at = made.evaluate(x)
-    assert at.ok, at.message
-    rows = made.residual_rows.data
-    for i, name in enumerate(made.unknown_names):
-        ends = []
-        for sign in (1, -1):
-            there = x.copy()
-            there[i] += sign * 1e-6 * max(1e-2, abs(x[i]))
-            ends.append(made.evaluate(there, False).residual[rows])
-        numeric = (ends[0] - ends[1]) / (2e-6 * max(1e-2, abs(x[i])))
-        exact = at.jacobian[rows, i]
-        assert np.abs(exact - numeric).max() < 2e-4 * np.abs(exact).max() + 1e-4, name
+    made = problem_of(step, group, free)
+    assert_slopes_are_those_of_differences(made, lambda _, value: 1e-6 * max(1e-2, abs(value)), 2e-4, 1e-4)
 
 
 def test_friction_of_a_load_grows_with_what_hangs_and_pulls(urdf_folder) -> None:
@@ -168,7 +156,7 @@ def test_friction_of_a_load_grows_with_what_hangs_and_pulls(urdf_folder) -> None
         theta = system.parameters.vector(VALUES | {"joint_load_friction@elbow.share": share})
         return float(balance(start, end, [0, 0], [0.2, command], theta, h)[1]) * 2 / h
 
-    torque = torque_function(step)
+    torque = torque_function(step, VALUES)
     for command in (0.2, 0.7, 1.5):
         pull = torque([0.2, command], point["q"], point["v"])[1]
         # at rest both nodes are at the same place, and half the slope is of either
@@ -184,13 +172,7 @@ def weight_at(e, system, q):
 
 def test_the_compiled_step_agrees(urdf_folder) -> None:
     effects = [(kind, "elbow", values) for kind, values in [*LADDER["load"], *LADDER["drive"]]]
-    slow = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=DC)
-    fast = compile_step(slow.system, H)
-    if not fast.is_compiled:
-        pytest.skip("no C compiler")
-    enabled = np.ones((61, 2))
+    slow, enabled = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=DC), np.ones((61, 2))
     enabled[20:35] = 0.0
-    runs = [problem_of(s, swing(torque_enable=enabled), ["shoulder.servo_gain", "elbow.damping"]) for s in (slow, fast)]
-    one, other = (p.evaluate(p.initial_unknowns) for p in runs)
-    np.testing.assert_allclose(one.residual, other.residual, atol=1e-7)
-    np.testing.assert_allclose(one.jacobian, other.jacobian, rtol=1e-6, atol=1e-6)
+    free = ["shoulder.servo_gain", "elbow.damping"]
+    assert_the_compiled_step_agrees(slow, lambda step: problem_of(step, swing(torque_enable=enabled), free))

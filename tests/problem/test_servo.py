@@ -4,16 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
-from small_problems import PENDULUM, H, joints, pendulum_step, recording
+from small_problems import (
+    PENDULUM,
+    H,
+    assert_slopes_are_those_of_differences,
+    assert_the_compiled_step_agrees,
+    joints,
+    pendulum_step,
+    recording,
+    torque_function,
+)
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import _SENSOR_KINDS, candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import applied_joint_torque, compile_step, simulate
+from yid_ocp.integrator.step import applied_joint_torque, simulate
 from yid_ocp.model.servos_and_springs import TORQUE_SATURATION_EXPONENT, PositionServoOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid
@@ -57,27 +65,23 @@ def problem_of(step, made, free, values=None, **options) -> EstimationProblem:
     return EstimationProblem(step, [made], free, ProblemOptions(**options), {**known, **(values or {})})
 
 
+def saturated(demand, limit):
+    power = TORQUE_SATURATION_EXPONENT
+    return demand / (1 + (np.abs(demand) / limit) ** power) ** (1 / power)
+
+
 @pytest.mark.parametrize("demand", [-40.0, -2.0, 0.5, 8.0, 30.0])
 def test_the_torque_is_that_of_a_spring_and_a_damper_within_a_limit(step, demand) -> None:
-    system = step.system
-    u, q, v = (ca.SX.sym(name, 2) for name in "uqv")
-    torque = ca.Function("torque", [u, q, v, system.parameters.symbols], [system.input_force(u, q, v)])
-    theta = system.parameters.vector(VALUES)
     command = np.array([0.3 + (demand + 4.0 * 0.7) / 60.0, 0.0])
-    found = np.array(torque(command, [0.3, 0.0], [0.7, 0.0], theta)).ravel()
-    assert found[0] == pytest.approx(
-        demand / (1 + (abs(demand) / 9.0) ** TORQUE_SATURATION_EXPONENT) ** (1 / TORQUE_SATURATION_EXPONENT)
-    )
+    found = torque_function(step, VALUES)(command, [0.3, 0.0], [0.7, 0.0])
+    assert found[0] == pytest.approx(saturated(demand, 9.0))
     assert abs(found[0]) < 9.0
     assert found[1] == 0.0
 
 
-def test_a_clip_is_what_the_limit_is_away_from_its_corner(step) -> None:
+def test_a_clip_is_what_the_limit_is_away_from_its_corner() -> None:
     for ratio, most in ((0.5, 1e-3), (0.9, 0.012), (1.0, 0.045), (1.1, 0.013)):
-        assert (
-            abs(ratio / (1 + ratio**TORQUE_SATURATION_EXPONENT) ** (1 / TORQUE_SATURATION_EXPONENT) - min(ratio, 1.0))
-            < most
-        )
+        assert abs(saturated(ratio, 1.0) - min(ratio, 1.0)) < most
 
 
 def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
@@ -85,18 +89,10 @@ def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
     rest = EquilibriumSolver(step).solve(command, theta, command)
     assert rest.is_converged
     sag = command - rest.state[:2]
-    weight = -9.81 * np.array(
-        [
-            1.0 * 0.25 * np.sin(rest.state[0])
-            + 0.6 * (0.5 * np.sin(rest.state[0]) + 0.2 * np.sin(rest.state[0] + rest.state[1])),
-            0.6 * 0.2 * np.sin(rest.state[0] + rest.state[1]),
-        ]
-    )
-    demand = np.array([60.0, 25.0]) * sag
-    torque = demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** TORQUE_SATURATION_EXPONENT) ** (
-        1 / TORQUE_SATURATION_EXPONENT
-    )
-    np.testing.assert_allclose(torque, -weight, rtol=1e-8)
+    upper, lower = np.sin(rest.state[0]), np.sin(rest.state[0] + rest.state[1])
+    weight = 9.81 * np.array([0.25 * upper + 0.6 * (0.5 * upper + 0.2 * lower), 0.6 * 0.2 * lower])
+    torque = saturated(np.array([60.0, 25.0]) * sag, [9.0, 3.0])
+    np.testing.assert_allclose(torque, weight, rtol=1e-8)
     still = simulate(step, theta, rest.state, 30, np.tile(command, (30, 1)))
     np.testing.assert_allclose(still.state, np.tile(rest.state, (31, 1)), atol=1e-9)
     for i in range(2):
@@ -117,11 +113,7 @@ def test_the_torque_along_a_rollout_is_what_moves_it(step) -> None:
     q = result.rollout.state[:, :2]
     rate, middle = np.diff(q, axis=0) / H, (q[1:] + q[:-1]) / 2
     demand = np.array([60.0, 25.0]) * (result.rollout.torque - middle) - np.array([4.0, 1.5]) * rate
-    np.testing.assert_allclose(
-        torque,
-        demand / (1 + (np.abs(demand) / [9.0, 3.0]) ** TORQUE_SATURATION_EXPONENT) ** (1 / TORQUE_SATURATION_EXPONENT),
-        rtol=1e-9,
-    )
+    np.testing.assert_allclose(torque, saturated(demand, [9.0, 3.0]), rtol=1e-9)
 
 
 def test_a_controller_that_carries_the_arm_leaves_no_sag(urdf_folder) -> None:
@@ -159,25 +151,12 @@ def test_commands_are_held_or_interpolated_and_late(urdf_folder, commands, expec
 def test_slopes_are_those_of_differences(urdf_folder, commands, period) -> None:
     step = servo_step(urdf_folder, EFFECTS, commands)
     free = [name for name in step.system.parameters.names if "servo" in name or "@" in name]
-    values = {
-        name: entry
-        for name, entry in zip(step.system.parameters.names, step.system.parameters.vector(), strict=True)
-        if "@" in name
-    }
-    made = problem_of(step, commanded(round(0.4 / period), period), free, values)
-    x = made.initial_unknowns
-    at = made.evaluate(x)
-    assert at.ok, at.message
-    for i, name in enumerate(made.unknown_names):
-        width = 1e-6 * max(1.0, abs(x[i])) if "tightness" not in name else 1e-4 * x[i]
-        ends = []
-        for sign in (1, -1):
-            there = x.copy()
-            there[i] += sign * width
-            ends.append(made.evaluate(there, False).residual[made.residual_rows.data])
-        numeric = (ends[0] - ends[1]) / (2 * width)
-        exact = at.jacobian[made.residual_rows.data, i]
-        assert np.abs(exact - numeric).max() < 1e-4 * np.abs(exact).max() + 1e-6, name
+    made = problem_of(step, commanded(round(0.4 / period), period), free)
+
+    def width(name, value):
+        return 1e-4 * value if "tightness" in name else 1e-6 * max(1.0, abs(value))
+
+    assert_slopes_are_those_of_differences(made, width, 1e-4, 1e-6)
 
 
 def test_nothing_drives_it_wrong_and_no_filter_follows_its_encoders(step) -> None:
@@ -217,6 +196,10 @@ def test_effects_on_efforts_are_none_of_a_servo(step) -> None:
     assert not kinds & {"effort_gain", "effort_offset", "effort_lag", "series_elasticity"}
     without = {kind for kind, _ in candidate_kinds_and_locations(step.system, ["joints.position"])}
     assert {"servo_gain", "servo_delay", "servo_saturation", "backlash"} <= without
+    assert make_effect("servo_gain", "elbow", step.system).neutral_values == {"servo_gain@elbow.scale": 1.0}
+    bare = candidate_kinds_and_locations(replace(step.system, servos={}, driven=()), _SENSOR_KINDS)
+    assert bare
+    assert "servo_gain" not in {kind for kind, _ in bare}
 
 
 @pytest.mark.parametrize("kind", ["servo_gain", "servo_delay", "servo_saturation", "backlash"])
@@ -234,16 +217,13 @@ def test_neutral_it_changes_nothing_and_shows_at_once(urdf_folder, step, kind) -
 
 
 def test_a_servo_delay_and_a_gain_are_what_the_servo_itself_could_be(urdf_folder, step) -> None:
-    made = commanded()
-    late = problem_of(
-        servo_step(urdf_folder, [("servo_delay", "shoulder", {"delay": 0.013})]), made, ["shoulder.damping"]
-    )
-    same = problem_of(step, made, ["shoulder.damping"], {"shoulder.servo_delay": 0.03})
-    np.testing.assert_allclose(*(p.evaluate(p.initial_unknowns).residual for p in (late, same)), atol=1e-9)
-    weak = problem_of(servo_step(urdf_folder, [("servo_gain", "shoulder", {"scale": 0.7})]), made, ["shoulder.damping"])
-    less = {"shoulder.servo_gain": 42.0, "shoulder.servo_damping": 2.8}
-    same = problem_of(step, made, ["shoulder.damping"], less)
-    np.testing.assert_allclose(*(p.evaluate(p.initial_unknowns).residual for p in (weak, same)), atol=1e-9)
+    made, free = commanded(), ["shoulder.damping"]
+    for effect, values in (
+        (("servo_delay", "shoulder", {"delay": 0.013}), {"shoulder.servo_delay": 0.03}),
+        (("servo_gain", "shoulder", {"scale": 0.7}), {"shoulder.servo_gain": 42.0, "shoulder.servo_damping": 2.8}),
+    ):
+        pair = problem_of(servo_step(urdf_folder, [effect]), made, free), problem_of(step, made, free, values)
+        np.testing.assert_allclose(*(p.evaluate(p.initial_unknowns).residual for p in pair), atol=1e-9)
 
 
 def test_a_saturation_reports_its_limit_and_binds_like_the_servos_own(urdf_folder, step) -> None:
@@ -251,10 +231,8 @@ def test_a_saturation_reports_its_limit_and_binds_like_the_servos_own(urdf_folde
     limited = servo_step(urdf_folder, [("servo_saturation", "shoulder", {"limit": 5.0})])
     [effect] = limited.system.effects
     name = effect.amplitude_names[0]
-    told = effect.reported_parameters(
-        {name: 5.0**-TORQUE_SATURATION_EXPONENT},
-        {name: 0.01 * TORQUE_SATURATION_EXPONENT * 5.0**-TORQUE_SATURATION_EXPONENT},
-    )["limit"]
+    power = TORQUE_SATURATION_EXPONENT
+    told = effect.reported_parameters({name: 5.0**-power}, {name: 0.01 * power * 5.0**-power})["limit"]
     assert (told.value, told.std, told.unit) == (pytest.approx(5.0), pytest.approx(0.05), "N m")
     one = problem_of(limited, made, ["shoulder.damping"], far)
     other = problem_of(step, made, ["shoulder.damping"], {"shoulder.servo_torque_limit": 5.0})
@@ -288,24 +266,11 @@ def test_a_zero_that_is_off_moves_readings_and_commands_alike(urdf_folder, step)
 
 
 def test_the_compiled_step_agrees(urdf_folder) -> None:
+    free = ["shoulder.servo_gain", "elbow.servo_delay"]
     slow = servo_step(urdf_folder, EFFECTS)
-    fast = compile_step(slow.system, H)
-    if not fast.is_compiled:
-        pytest.skip("no C compiler")
-    runs = [problem_of(s, commanded(), ["shoulder.servo_gain", "elbow.servo_delay"]) for s in (slow, fast)]
-    one, other = (p.evaluate(p.initial_unknowns) for p in runs)
-    np.testing.assert_allclose(one.residual, other.residual, atol=1e-7)
-    np.testing.assert_allclose(one.jacobian, other.jacobian, rtol=1e-6, atol=1e-6)
+    assert_the_compiled_step_agrees(slow, lambda step: problem_of(step, commanded(), free))
 
 
 def test_an_estimated_start_frees_the_arm_as_well(step) -> None:
     made = problem_of(step, commanded(), ["shoulder.damping"], initial_state="estimated")
     assert {"start.q.shoulder[made]", "start.p.elbow[made]"} <= set(made.unknown_names)
-
-
-def test_the_effect_is_an_effect_of_the_servos_joint_only(step) -> None:
-    assert make_effect("servo_gain", "elbow", step.system).neutral_values == {"servo_gain@elbow.scale": 1.0}
-    assert candidate_kinds_and_locations(replace(step.system, servos={}, driven=()), _SENSOR_KINDS)
-    assert "servo_gain" not in {
-        kind for kind, _ in candidate_kinds_and_locations(replace(step.system, servos={}, driven=()), _SENSOR_KINDS)
-    }
