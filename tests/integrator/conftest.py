@@ -13,7 +13,7 @@ import pytest
 
 from yid_ocp.errors import InsufficientMemoryError
 from yid_ocp.integrator.step import Step, compile_step
-from yid_ocp.integrator.step_model import RolloutInputs, TrackingFeedback
+from yid_ocp.integrator.step_model import NewtonStatus, RolloutInputs, TrackingFeedback
 from yid_ocp.model import (
     Grasp,
     Kinematics,
@@ -304,11 +304,36 @@ def case(request, urdf_folder) -> Case:
     return BUILDERS[request.param](urdf_folder)
 
 
+def close(actual, expected, tolerance):
+    scale = max(1.0, np.max(np.abs(expected), initial=0.0))
+    assert actual.shape == expected.shape
+    assert np.all(np.isfinite(actual))
+    np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance * scale)
+
+
+def assert_kernels_agree(steps, inputs, conditioning=1.0, tolerance=1e-10):
+    """Two steps: rollouts with derivatives, and the gradients of a cost of all that they give."""
+    one, two = (step.kernel.rollout(inputs) for step in steps)
+    assert one.status.code == two.status.code == NewtonStatus.OK
+    close(one.state, two.state, tolerance)
+    for key in ("multipliers", "effort", "torque"):
+        close(getattr(one, key), getattr(two, key), tolerance * conditioning)
+    for key in ("state_sensitivity", "multipliers_sensitivity", "effort_sensitivity"):
+        close(getattr(one, key), getattr(two, key), 1e-9 * conditioning)
+    for key in ("internal_coordinates", "prescribed_effort"):
+        close(getattr(one.status, key), getattr(two.status, key), 1e-9 * conditioning)
+    rng, names = np.random.default_rng(2), inputs.directions.parameter_names
+    cost = [rng.normal(size=values.shape) for values in (one.state, one.multipliers, one.effort)]
+    back = [step.kernel.adjoint_gradient(inputs.theta, one, inputs.feedback, names, *cost) for step in steps]
+    for key in vars(back[0]):
+        close(getattr(back[0], key), getattr(back[1], key), 1e-9 * conditioning)
+
+
 @pytest.fixture(scope="session")
 def parts():
     """The builders above, for tests that need a system of their own."""
     own = (Added, maxwell_branch, soft_joint, soft_grasp, thick_air, creeping_grasp, cable, cable_object, clamped_cable)
-    made = {function.__name__: function for function in (*own, closed_loop, make_case, tip)}
+    made = {function.__name__: function for function in (*own, closed_loop, make_case, tip, assert_kernels_agree)}
     return SimpleNamespace(**made, builders=BUILDERS)
 
 

@@ -36,6 +36,22 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.fixture
+def choose(monkeypatch, tmp_path):
+    """Take another compiler: a name, or what a shell does that is asked for more than its version."""
+
+    def take(name="", script="", version=""):
+        if script:
+            path = tmp_path / "other_cc"
+            path.write_text(f'#!/bin/sh\n[ "$1" = --version ] && echo {version} && exit\n{script}\n', encoding="utf-8")
+            path.chmod(0o755)
+        monkeypatch.setenv("CC", name or str(path))
+        compiler._compiler_path.cache_clear()
+        compiler._machine.cache_clear()
+
+    return take
+
+
+@pytest.fixture
 def pendulum(urdf_folder):
     return System.build(read_urdf(urdf_folder / "double_pendulum.urdf"))
 
@@ -71,17 +87,11 @@ def test_the_second_compilation_reads_the_cache(cache, runs):
 
 @needs_compiler
 @pytest.mark.parametrize("change", ["compiler", "processor", "flags", "level", "casadi"])
-def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkeypatch, change):
+def test_what_a_library_was_made_with_is_part_of_its_key(cache, choose, monkeypatch, change):
     """A cache that moves to another machine, or meets another compiler, is not trusted."""
     compiler.compiled_shared_library(SOURCE % 42)
     if change == "compiler":
-        other = tmp_path / "other_cc"
-        other.write_text(
-            f'#!/bin/sh\n[ "$1" = --version ] && echo other && exit\nexec {compiler._compiler_path()} "$@"\n'
-        )
-        other.chmod(0o755)
-        monkeypatch.setenv("CC", str(other))
-        compiler._compiler_path.cache_clear()
+        choose(script=f'exec {compiler._compiler_path()} "$@"', version="other")
     elif change == "processor":
         monkeypatch.setattr(compiler.platform, "machine", lambda: "another")
         monkeypatch.setattr(compiler.platform, "processor", lambda: "another")
@@ -97,27 +107,21 @@ def test_what_a_library_was_made_with_is_part_of_its_key(cache, tmp_path, monkey
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="this system has no file owners and modes")
-@pytest.mark.parametrize("mode", [0o720, 0o702, 0o777])
-def test_a_cache_that_others_may_write_is_refused(cache, mode):
+def test_a_cache_that_others_may_write_or_that_cannot_be_made_is_refused(cache, monkeypatch):
     cache.mkdir()
-    cache.chmod(mode)
-    with pytest.raises(OutputError) as caught:
-        compiler._cache_folder()
-    for word in (str(cache), "empty it", "chmod 700", "YID_OCP_CACHE"):
-        assert word in str(caught.value)
-
-
-def test_a_cache_that_cannot_be_made_is_an_output_error(tmp_path, monkeypatch):
-    blocked = tmp_path / "file"
-    blocked.write_text("not a folder", encoding="utf-8")
-    monkeypatch.setenv("YID_OCP_CACHE", str(blocked / "cache"))
+    for mode in (0o720, 0o702, 0o777):
+        cache.chmod(mode)
+        with pytest.raises(OutputError) as caught:
+            compiler._cache_folder()
+        assert all(word in str(caught.value) for word in (str(cache), "empty it", "chmod 700", "YID_OCP_CACHE"))
+    (cache / "file").write_text("not a folder", encoding="utf-8")
+    monkeypatch.setenv("YID_OCP_CACHE", str(cache / "file" / "cache"))
     with pytest.raises(OutputError, match="CC=none"):
         compiler._cache_folder()
 
 
-def test_without_a_compiler_everything_works_after_one_notice(cache, monkeypatch, caplog, pendulum):
-    monkeypatch.setenv("CC", "none")
-    compiler._compiler_path.cache_clear()
+def test_without_a_compiler_everything_works_after_one_notice(cache, choose, caplog, pendulum):
+    choose("none")
     with caplog.at_level(logging.INFO, logger="yid_ocp"):
         step = compile_step(pendulum, 0.01)
         q, _, _, status = step([0.3, 0.1], [0.0, 0.0], [], pendulum.parameters.vector())
@@ -199,16 +203,11 @@ def test_a_home_that_cannot_be_written_to_has_a_cache_for_the_command(cache, tmp
     assert (folder.stat().st_mode & 0o777, len(list(folder.glob("*.so")))) == (0o700, 1)
 
 
-def test_a_compiler_that_hangs_is_spoken_of_and_waited_for_once(cache, tmp_path, monkeypatch, caplog):
-    slow = tmp_path / "slow_cc"
-    slow.write_text(f'#!/bin/sh\n[ "$1" = --version ] && exit\necho x >> {tmp_path}/calls\nexec sleep 60\n')
-    slow.chmod(0o755)
-    monkeypatch.setenv("CC", str(slow))
+def test_a_compiler_that_hangs_is_spoken_of_and_waited_for_once(cache, choose, tmp_path, monkeypatch, caplog):
+    choose(script=f"echo x >> {tmp_path}/calls\nexec sleep 60")
     monkeypatch.setattr(compiler, "_COMPILE_TIMEOUT", 0.5)
     monkeypatch.setattr(compiler, "_NOTICE_DELAY", 0.1)
     monkeypatch.setattr(compiler, "_HUNG_COMPILERS", set())
-    compiler._compiler_path.cache_clear()
-    compiler._machine.cache_clear()
     assert [compiler.compiled_shared_library(SOURCE % i) for i in range(3)] == [None] * 3
     assert (tmp_path / "calls").read_text().split() == ["x"]
     assert "has been at work for" in caplog.text
@@ -216,36 +215,22 @@ def test_a_compiler_that_hangs_is_spoken_of_and_waited_for_once(cache, tmp_path,
 
 @needs_compiler
 @pytest.mark.parametrize(
-    "text",
-    [
-        "echo no space left >&2; exit 1",
-        "exit 0",
-        'while [ "$1" != -o ]; do shift; done; echo nothing > "$2"',
-    ],
+    "text", ["echo no space left >&2; exit 1", "exit 0", 'while [ "$1" != -o ]; do shift; done; echo nothing > "$2"']
 )
-def test_a_compiler_that_makes_no_library_leaves_the_interpreter(cache, tmp_path, monkeypatch, caplog, pendulum, text):
-    odd = tmp_path / "odd_cc"
-    odd.write_text(f'#!/bin/sh\n[ "$1" = --version ] && exit\n{text}\n', encoding="utf-8")
-    odd.chmod(0o755)
-    monkeypatch.setenv("CC", str(odd))
+def test_a_compiler_that_makes_no_library_leaves_the_interpreter(cache, choose, monkeypatch, caplog, pendulum, text):
+    choose(script=text)
     monkeypatch.setattr(compiler, "_COMPILE_TIMEOUT", 0.5)
-    compiler._compiler_path.cache_clear()
-    compiler._machine.cache_clear()
     assert not compile_step(pendulum, 0.01).is_compiled
     assert "going on without compiled code" in caplog.text
     assert ("no space left" in caplog.text) == ("no space left" in text)
     assert list(cache.iterdir()) == []
 
 
-def test_a_level_of_optimization_that_is_none_is_said(cache, monkeypatch):
+def test_a_level_of_optimization_or_a_compiler_that_is_none_is_said(cache, choose, monkeypatch):
     monkeypatch.setenv("YID_OCP_OPTIMIZE", "fast")
     with pytest.raises(ConfigError, match="YID_OCP_OPTIMIZE"):
         compiler.compiled_shared_library(SOURCE % 42)
-
-
-def test_a_compiler_that_is_not_there_is_said(cache, monkeypatch):
-    monkeypatch.setenv("CC", "no_such_cc")
-    compiler._compiler_path.cache_clear()
+    choose("no_such_cc")
     with pytest.raises(ConfigError, match="no_such_cc"):
         compiler._compiler_path()
 
@@ -285,14 +270,13 @@ def test_a_function_is_compiled_once_and_keeps_its_sparsity(cache, runs):
 
 
 @needs_compiler
-def test_a_function_that_cannot_be_compiled_is_as_it_was(cache, monkeypatch, caplog):
+def test_a_function_that_cannot_be_compiled_is_as_it_was(cache, choose, monkeypatch, caplog):
     plain = polynomial()
     with monkeypatch.context() as change:
         change.setattr(compiler.os, "replace", lambda source, target: target.write_bytes(b"not a library"))
         assert compiler.compiled_casadi_function(plain).is_a("SXFunction")
     assert "cannot be loaded" in caplog.text
-    monkeypatch.setenv("CC", "none")
-    compiler._compiler_path.cache_clear()
+    choose("none")
     assert compiler.compiled_casadi_function(polynomial(3.0)).is_a("SXFunction")
 
 

@@ -11,12 +11,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.integrator.step_model import (
-    NewtonStatus,
-    RolloutInputs,
-    SensitivityDirections,
-    StepStatus,
-)
+from yid_ocp.integrator.step_model import NewtonStatus, RolloutInputs, SensitivityDirections, StepStatus
 from yid_ocp.model import Grasp, System
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
@@ -138,13 +133,7 @@ def first_correction(hard: Hard) -> float:
     return float(np.max(np.abs(change[: len(unknown) - sizes["m"]])))
 
 
-def close(actual, expected, tolerance):
-    scale = max(1.0, np.max(np.abs(expected), initial=0.0))
-    assert actual.shape == expected.shape
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=tolerance * scale)
-
-
-def test_both_kernels_agree(hard):
+def test_both_kernels_agree(parts, hard):
     if not hard.step(use_compiler=True).is_compiled:
         pytest.skip("this machine has no C compiler to compare with")
     steps = [hard.step(use_compiler) for use_compiler in (True, False)]
@@ -163,15 +152,7 @@ def test_both_kernels_agree(hard):
         return
     if hard.damped:
         assert first_correction(hard) > 0.5
-    close(one.state, two.state, 1e-10)
-    close(one.multipliers, two.multipliers, 1e-10 * hard.conditioning)
-    close(one.effort, two.effort, 1e-9 * hard.conditioning)
-    for key in ("state_sensitivity", "multipliers_sensitivity", "effort_sensitivity"):
-        close(getattr(one, key), getattr(two, key), 1e-9 * hard.conditioning)
-    by_state = np.random.default_rng(2).normal(size=one.state.shape)
-    back = [step.kernel.adjoint_gradient(theta, one, None, names, by_state, None, None) for step in steps]
-    for key in vars(back[0]):
-        close(getattr(back[0], key), getattr(back[1], key), 1e-9 * hard.conditioning)
+    parts.assert_kernels_agree(steps, inputs, hard.conditioning)
 
 
 @pytest.mark.parametrize("code", list(NewtonStatus))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.integrator.step import AdditionalLoadDerivatives, compile_step_like, linearized_steps
-from yid_ocp.integrator.step_model import SensitivityDirections
+from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 
 
 def sizes_of(theta):
@@ -37,14 +37,12 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     feedback = case.feedback if fed_back else None
     names = case.step.system.parameters.names
     fixed = list(case.step.system.prescribed_coordinate_indices)
-    weights = random_cost(case)
-    rng = np.random.default_rng(12)
+    weights, rng = random_cost(case), np.random.default_rng(12)
 
     rollout = case.rollout(feedback=feedback)
     assert rollout.status.is_converged, rollout.status.message
-    gradient = case.step.kernel.adjoint_gradient(
-        theta, rollout, feedback, names, weights.state, weights.multipliers, weights.effort
-    )
+    cost = (weights.state, weights.multipliers, weights.effort)
+    gradient = case.step.kernel.adjoint_gradient(theta, rollout, feedback, names, *cost)
 
     # columns: all of theta, then two of everything else at once
     d = s["ntheta"] + 2
@@ -55,11 +53,8 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     path[..., -1] = rng.normal(size=(steps + 1, s["nc"]))
     start[fixed] = path[0]
     forward = case.rollout(feedback=feedback, directions=SensitivityDirections(names, start, torque, path))
-    slopes = (
-        np.tensordot(weights.state, forward.state_sensitivity, 2)
-        + np.tensordot(weights.multipliers, forward.multipliers_sensitivity, 2)
-        + np.tensordot(weights.effort, forward.effort_sensitivity, 2)
-    )
+    by_directions = (forward.state_sensitivity, forward.multipliers_sensitivity, forward.effort_sensitivity)
+    slopes = sum(np.tensordot(weight, by, 2) for weight, by in zip(cost, by_directions, strict=True))
 
     np.testing.assert_allclose(forward.state, rollout.state, rtol=0, atol=1e-9 * scale_of(rollout.state))
     scale = np.max(np.abs(slopes))
@@ -68,13 +63,8 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     assert slopes[-2] == pytest.approx(expected, rel=1e-8, abs=1e-9 * scale)
 
     def along(direction, epsilon):
-        moved = case.rollout(
-            theta + epsilon * direction[0],
-            case.start + epsilon * direction[1],
-            case.torque + epsilon * direction[2],
-            case.path + epsilon * direction[3],
-            feedback,
-        )
+        values = zip((theta, case.start, case.torque, case.path), direction, strict=True)
+        moved = case.rollout(*(value + epsilon * move for value, move in values), feedback)
         assert moved.status.is_converged, moved.status.message
         return weights.value(weights, moved)
 
@@ -91,35 +81,17 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
         assert slopes[column] * unit[column] == pytest.approx(difference((unit, *zero)), rel=1e-5, abs=1e-5 * scale)
 
 
-def test_interpreter_equals_compiled(case):
+def test_interpreter_equals_compiled(parts, case):
     plain = compile_step_like(case.step, case.step.system, use_compiler=False)
     if not case.step.is_compiled:
         pytest.skip("this machine has no C compiler to compare with")
-    assert not plain.is_compiled
     names = tuple(case.step.system.parameters.names[::2])
-    feedback = case.feedback
-    nx, d = case.step.sizes["nx"], len(names) + 1
-    rng = np.random.default_rng(3)
-    torque = rng.normal(size=(*case.torque.shape, d))
-    path = rng.normal(size=(*case.path.shape, d))
-    directions = SensitivityDirections(names, rng.normal(size=(nx, d)), torque, path)
+    d, rng = len(names) + 1, np.random.default_rng(3)
+    torque, path = (rng.normal(size=(*values.shape, d)) for values in (case.torque, case.path))
+    directions = SensitivityDirections(names, rng.normal(size=(len(case.start), d)), torque, path)
     directions.initial_state_tangents[list(case.step.system.prescribed_coordinate_indices)] = path[0]
-    one = case.rollout(feedback=feedback, directions=directions)
-    two = case.rollout(feedback=feedback, directions=directions, step=plain)
-    weights = random_cost(case)
-    partial = (weights.state, weights.multipliers, weights.effort)
-    back = [s.kernel.adjoint_gradient(case.theta, one, feedback, names, *partial) for s in (case.step, plain)]
-    pairs = [(getattr(one, key), getattr(two, key)) for key in ("state", "multipliers", "effort", "torque")]
-    differentiated = ("state_sensitivity", "multipliers_sensitivity", "effort_sensitivity")
-    pairs += [(getattr(one, key), getattr(two, key)) for key in differentiated]
-    pairs += [(getattr(back[0], key), getattr(back[1], key)) for key in ("by_theta", "by_initial_state", "by_torque")]
-    for actual, expected in pairs:
-        assert np.all(np.isfinite(actual))
-        scale = max(1.0, np.max(np.abs(expected), initial=0.0))
-        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale)
-    np.testing.assert_allclose(one.status.internal_coordinates, two.status.internal_coordinates, rtol=0, atol=1e-9)
-    actual, expected = one.status.prescribed_effort, two.status.prescribed_effort
-    np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-9 * scale_of(expected))
+    inputs = RolloutInputs(case.theta, case.start, case.torque, case.path, case.feedback, directions)
+    parts.assert_kernels_agree((case.step, plain), inputs, tolerance=1e-9)
 
 
 def scale_of(array):
@@ -131,14 +103,12 @@ def test_linearized_steps_are_the_equations_along_any_trajectory(case):
     n, h = s["n"], step.time_step
     rollout = case.rollout()
     exact = step.kernel.linearize(case.theta, rollout.state, rollout.multipliers, rollout.torque, (), False)
-    assert np.max(np.abs(exact.residual[:, step.model.index_tables.unknown_rows])) < 1e-9 * scale_of(
-        rollout.multipliers
-    )
+    solved = exact.residual[:, step.model.index_tables.unknown_rows]
+    assert np.max(np.abs(solved)) < 1e-9 * scale_of(rollout.multipliers)
     np.testing.assert_allclose(exact.p1, rollout.state[1:, n : 2 * n], rtol=0, atol=1e-9)
     fixed = list(step.system.prescribed_coordinate_indices)
-    np.testing.assert_allclose(
-        -exact.residual[:, fixed] / h, rollout.effort, rtol=0, atol=1e-7 * scale_of(rollout.effort)
-    )
+    effort = -exact.residual[:, fixed] / h
+    np.testing.assert_allclose(effort, rollout.effort, rtol=0, atol=1e-7 * scale_of(rollout.effort))
 
     rng = np.random.default_rng(8)
     state = rollout.state + 0.01 * rng.normal(size=rollout.state.shape)
