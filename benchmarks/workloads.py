@@ -228,9 +228,8 @@ def sensitivities_of_one(bench: Bench) -> int:
 
 def adjoint_500(bench: Bench) -> int:
     """The gradient by six stiffnesses from the adjoint sweep back over 500 steps (the rollout not included)."""
-    bench.step.kernel.adjoint_gradient(
-        bench.theta, bench.trajectory, bench.feedback, STIFFNESSES, bench.trajectory.state, None, None
-    )
+    cost = (bench.trajectory.state, None, None)
+    bench.step.kernel.adjoint_gradient(bench.theta, bench.trajectory, bench.feedback, STIFFNESSES, cost)
     return 1
 
 

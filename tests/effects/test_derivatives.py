@@ -102,7 +102,7 @@ def test_compiled_and_interpreted_agree_with_every_effect(cases) -> None:
     weight = np.random.default_rng(1).normal(size=slow.state.shape)
     exact = np.einsum("kx,kxd->d", weight, slow.state_sensitivity)
     for s, rollout in ((step, fast), (case.step, slow)):
-        gradient = s.kernel.adjoint_gradient(case.run.theta, rollout, None, case.names, weight, None, None)
+        gradient = s.kernel.adjoint_gradient(case.run.theta, rollout, None, case.names, (weight, None, None))
         assert gradient.by_theta == pytest.approx(exact, rel=1e-6, abs=1e-8 * np.max(np.abs(exact)))
 
 

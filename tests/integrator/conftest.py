@@ -324,7 +324,7 @@ def assert_kernels_agree(steps, inputs, conditioning=1.0, tolerance=1e-10):
         close(getattr(one.status, key), getattr(two.status, key), 1e-9 * conditioning)
     rng, names = np.random.default_rng(2), inputs.directions.parameter_names
     cost = [rng.normal(size=values.shape) for values in (one.state, one.multipliers, one.effort)]
-    back = [step.kernel.adjoint_gradient(inputs.theta, one, inputs.feedback, names, *cost) for step in steps]
+    back = [step.kernel.adjoint_gradient(inputs.theta, one, inputs.feedback, names, cost) for step in steps]
     for key in vars(back[0]):
         close(getattr(back[0], key), getattr(back[1], key), 1e-9 * conditioning)
 

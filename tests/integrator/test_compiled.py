@@ -46,13 +46,8 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     # all that a call works with is one block
     assert poor.grants_needed(lambda: kernel.rollout(inputs)) == 1
     assert poor.grants_needed(lambda: kernel.rollout(differentiated)) == 1
-    by_state = np.ones_like(plain.state)
-    assert (
-        poor.grants_needed(
-            lambda: kernel.adjoint_gradient(case.theta, plain, case.feedback, names, by_state, None, None)
-        )
-        == 1
-    )
+    back = (case.theta, plain, case.feedback, names, (np.ones_like(plain.state), None, None))
+    assert poor.grants_needed(lambda: kernel.adjoint_gradient(*back)) == 1
     trajectory = (case.theta, plain.state, plain.multipliers, plain.torque, names, True)
     assert poor.grants_needed(lambda: kernel.linearize(*trajectory)) == 1
     poor.grants.value = 100

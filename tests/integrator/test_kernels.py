@@ -42,7 +42,7 @@ def test_forward_equals_adjoint_equals_differences(case, fed_back):
     rollout = case.rollout(feedback=feedback)
     assert rollout.status.is_converged, rollout.status.message
     cost = (weights.state, weights.multipliers, weights.effort)
-    gradient = case.step.kernel.adjoint_gradient(theta, rollout, feedback, names, *cost)
+    gradient = case.step.kernel.adjoint_gradient(theta, rollout, feedback, names, cost)
 
     # columns: all of theta, then two of everything else at once
     d = s["ntheta"] + 2

@@ -71,9 +71,8 @@ def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, t
         def run(theta):
             rollout = step.kernel.rollout(replace(inputs, theta=theta))
             assert rollout.status.is_converged, rollout.status.message
-            back = step.kernel.adjoint_gradient(
-                theta, rollout, case.feedback, names, np.ones_like(rollout.state), None, None
-            )
+            cost = (np.ones_like(rollout.state), None, None)
+            back = step.kernel.adjoint_gradient(theta, rollout, case.feedback, names, cost)
             along = step.kernel.linearize(theta, rollout.state, rollout.multipliers, rollout.torque, names, True)
             found = (
                 rollout.state,

@@ -21,7 +21,6 @@ from yid_ocp.problem.unknown_vector import (
     UnknownVectorLayout,
     check_parameter_bounds,
     soft_logarithm_and_slope,
-    with_named_entries,
 )
 
 FREE = ("shoulder.stiffness", "elbow.stiffness", "elbow.rest")
@@ -68,8 +67,6 @@ def test_blocks_and_values_find_their_places():
     wide = LAYOUT.scatter_to_unknown_columns(block, 1)
     np.testing.assert_array_equal(wide[1], [5, 6, 0, 0, 0, 7, 8, 9])
     np.testing.assert_array_equal(LAYOUT.pack_same_for_all_recordings([1, 2], [3], [4, 5]), [1, 2, 3, 4, 5, 3, 4, 5])
-    changed = with_named_entries(np.array([1.0, 2.0]), ("a", "b"), {"b": 7.0, "c": 9.0})
-    np.testing.assert_array_equal(changed, [1.0, 7.0])
 
 
 def test_a_recording_has_its_own_values_and_start(make):

@@ -19,6 +19,7 @@ from yid_ocp.integrator import codegen, compiler
 from yid_ocp.integrator.step_model import (
     NEWTON_ITERATION_LIMIT,
     CostGradient,
+    CostSlopes,
     NewtonStatus,
     Rollout,
     RolloutInputs,
@@ -192,33 +193,20 @@ class CompiledKernel:
         filled = (_Motion * len(members))(*motions), (_Trajectory * len(members))(*trajectories)
         by = (_Sensitivities * len(members))(*sensitivities) if sensitivities else None
         _check(library.yid_rollout(ctypes.c_int(len(members)), *filled, by, outcomes), outcomes[0])
-        return [
-            rollout_with_status(out, sizes, o.status, o.step, o.error, (o.iterations, o.factorisations))
-            for out, o in zip(outs, outcomes, strict=True)
-        ]
+        ends = ((o.status, o.step, o.error, (o.iterations, o.factorisations)) for o in outcomes)
+        return [rollout_with_status(out, sizes, *end) for out, end in zip(outs, ends, strict=True)]
 
     def adjoint_gradient(
-        self,
-        theta: Array,
-        rollout: Rollout,
-        feedback: TrackingFeedback | None,
-        names: tuple[str, ...],
-        by_state: Array,
-        by_multipliers: Array | None,
-        by_effort: Array | None,
+        self, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, names: tuple[str, ...], by: CostSlopes
     ) -> CostGradient:
         """Gradient of a cost along a rollout, computed backwards in C."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
         gradient = CostGradient(*(np.zeros(shape) for shape in shapes))
-        partials = [_doubles(a) for a in (by_state, by_multipliers, by_effort)]
-        code = self._call(
-            "yid_adjoint",
-            self._motion(steps, theta, None, None, feedback, self._directions(names, len(names))),
-            _along(rollout.state, rollout.multipliers, rollout.torque),
-            _filled(_Partials, *partials),
-            _filled(_Gradient, *vars(gradient).values()),
-        )
+        motion = self._motion(steps, theta, None, None, feedback, self._directions(names, len(names)))
+        along, partials = _along(rollout.state, rollout.multipliers, rollout.torque), map(_doubles, by)
+        made = _filled(_Gradient, *vars(gradient).values())
+        code = self._call("yid_adjoint", motion, along, _filled(_Partials, *partials), made)
         if code != NewtonStatus.OK:
             for array in vars(gradient).values():
                 array[:] = np.nan
@@ -232,14 +220,10 @@ class CompiledKernel:
         # in the order of the struct
         matrices = [out.residual_by_new, out.residual_by_old, out.residual_by_input, out.p1_by_new, out.p1_by_old]
         matrices += [out.p1_by_input, out.residual_by_theta, out.p1_by_theta]
-        self._call(
-            "yid_linearize",
-            self._motion(
-                len(torque), theta, None, None, None, self._directions(names, len(names)) if derivatives else None
-            ),
-            _along(state, multipliers, torque),
-            _filled(_Linearization, out.residual, out.p1, *(matrices if derivatives else [None] * len(matrices))),
-        )
+        directions = self._directions(names, len(names)) if derivatives else None
+        motion = self._motion(len(torque), theta, None, None, None, directions)
+        made = _filled(_Linearization, out.residual, out.p1, *(matrices if derivatives else [None] * len(matrices)))
+        self._call("yid_linearize", motion, _along(state, multipliers, torque), made)
         return out
 
     def _call(self, function: str, *structs: _Struct) -> int:

@@ -144,10 +144,7 @@ def discrete_equations(
 ) -> DiscreteEquations:
     """The DEL equations of one step; arguments as in `compile_step`.
 
-    Raises
-    ------
-    ModelError
-        Unknown force split or constraint force, or an internal coordinate without an equation.
+    `ModelError` for an unknown force split or constraint force, or an internal coordinate without an equation.
 
     References
     ----------

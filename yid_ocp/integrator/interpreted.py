@@ -18,6 +18,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.step_model import (
     NEWTON_ITERATION_LIMIT,
     CostGradient,
+    CostSlopes,
     NewtonStatus,
     Rollout,
     RolloutInputs,
@@ -48,10 +49,8 @@ class InterpretedKernel:
         names = ("q0", "q1", "p0", "z0", "z1", "lam", "u", "theta", "time_step")
         ends = np.cumsum([0, *(argument.numel() for argument in model.equations.arguments)])
         self._at = {name: np.arange(*ends[i : i + 2]) for i, name in enumerate(names)}
-        free, fixed = (
-            np.array(index, int)
-            for index in (system.unprescribed_coordinate_indices, system.prescribed_coordinate_indices)
-        )
+        free = np.array(system.unprescribed_coordinate_indices, int)
+        fixed = np.array(system.prescribed_coordinate_indices, int)
         self._fixed, self._coordinates = self._at["q1"][fixed], len(free) + sizes["nz"]
         self._unknown = np.concatenate([self._at["q1"][free], self._at["z1"], self._at["lam"]])
         self._rows = sizes["n"] + sizes["nz"] + sizes["m"]
@@ -192,20 +191,13 @@ class InterpretedKernel:
         return [self.rollout(member) for member in members]
 
     def adjoint_gradient(
-        self,
-        theta: Array,
-        rollout: Rollout,
-        feedback: TrackingFeedback | None,
-        names: tuple[str, ...],
-        by_state: Array,
-        by_multipliers: Array | None,
-        by_effort: Array | None,
+        self, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, names: tuple[str, ...], by: CostSlopes
     ) -> CostGradient:
         """Gradient of a cost along a finished rollout by the adjoint (the paper's Lemma 1).
 
-        With the cost's partial derivatives by states (N + 1, nx), multipliers (N, m) and efforts (N, nc),
         costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k.
         """
+        by_state, by_multipliers, by_effort = by
         sizes, at, steps = self._model.sizes, self._at, len(rollout.torque)
         slopes, n = self._evaluators()[-1], sizes["n"]
         by_theta, by_torque = np.zeros(len(names)), np.zeros((steps, sizes["nu"]))

@@ -583,8 +583,7 @@ typedef struct {
     double *rows, *p1, *rows_new, *rows_old, *rows_input, *p1_new, *p1_old, *p1_input, *rows_theta, *p1_theta;
 } Linearization;
 
-/* The step reached and how it ended, Newton's last correction, totals of iterations and factorisations, and the memory that was asked
- * for [bytes]. */
+/* The step reached and how it ended, Newton's last correction, totals, and the memory that was asked for [bytes]. */
 typedef struct {
     int step, status;
     double error;
@@ -775,8 +774,8 @@ typedef struct {
 } March;
 
 /* Rollouts of so many members at once, with forward sensitivities where there are directions. Members have their own
- * number of steps and their own directions, if any has some; what their feedback reads is the same. How each ended is in
- * its outcome: a batch leaves members that do not get through by simplified Newton alone to whoever asked. */
+ * number of steps and their own directions, if any has some; what their feedback reads is the same. A batch leaves members
+ * that do not get through by simplified Newton alone to whoever asked. */
 int yid_rollout(int members, const Motion *motions, const Trajectory *outs, const Sensitivities *bys, Outcome *outcomes) {
     const Feedback *feedback = NU ? motions->feedback : NULL;
     const int feeds = feedback ? feedback->count : 0;

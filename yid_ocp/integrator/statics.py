@@ -67,7 +67,7 @@ class EquilibriumSolver:
         rows = system.n_coordinates + e.z0.numel() + e.lam.numel()
         self._sought = [*self.free_coordinates, *range(system.n_coordinates, rows)]
         self._equations = CasadiLockedCache[None, EquilibriumEquations](lambda _: equilibrium_equations(e))
-        self._inner_slopes: CasadiLockedCache[None, ca.Function] = CasadiLockedCache(
+        self._inner_slopes = CasadiLockedCache[None, ca.Function](
             lambda _: ca.Function("inner", e.arguments, [ca.jacobian(e.internal_residual_at_rest, e.theta)])
         )
         potential = system.elastic_energy(e.q0) + e.rigid_body_terms.potential_energy + _servo_energy(system, e.u, e.q0)
@@ -144,9 +144,8 @@ class EquilibriumSolver:
             message = f"the measured {parts} at rest: {far}"
         # torque and posture enter together, as the torque plus the holding spring's stiffness times the posture
         by_torque = np.where(hold.by_hand > 0, 0.0, by_posture[:, :nu] / stiffness)
-        return Equilibrium(
-            state, held + stiffness * give, w[count:], by_theta, by_posture, by_torque, not failed, error, message
-        )
+        derivatives, said = (by_theta, by_posture, by_torque), (not failed, error, message)
+        return Equilibrium(state, held + stiffness * give, w[count:], *derivatives, *said)
 
     def _guesses(self, given: Array, guess: ArrayLike | None) -> list[Array]:
         """Starts of the search: the given configuration or the undeformed object, then small bends of it.
@@ -189,11 +188,8 @@ class EquilibriumSolver:
     def _lowest_energy(self, theta: Array, hold: _Hold) -> Array | None:
         """A configuration of lowest potential energy within the constraints, shape (n,); None where there is none.
 
-        Newton's iteration leaves an object that is held far from its undeformed shape, as a cable between two clamps.
-
-        References
-        ----------
-        Waechter and Biegler (2006), Math. Programming 106:25, doi:10.1007/s10107-004-0559-y.
+        Newton's iteration leaves an object that is held far from its undeformed shape, as a cable between two clamps;
+        an interior-point method does not (Waechter and Biegler 2006, doi:10.1007/s10107-004-0559-y).
         """
         size, m, given = len(self.free_coordinates), self.step.sizes["m"], hold.given
         if not size or not m:

@@ -69,11 +69,6 @@ class Step(ReprMixin):
         return self.model.equations.force_split
 
     @property
-    def constraint_force(self) -> ConstraintForcePlacement:
-        """Configuration at which the constraint forces act, `node` or `midpoint`."""
-        return self.model.equations.constraint_force
-
-    @property
     def equations(self) -> DiscreteEquations:
         """The symbolic equations of a step."""
         return self.model.equations
@@ -212,7 +207,8 @@ def step_with_time_step(step: Step, time_step: float) -> Step:
 def compile_step_like(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
     """The step of another system with the time step, integration rules and, by default, kernel type of `step`."""
     compiled = step.is_compiled if use_compiler is None else use_compiler
-    return compile_step(system, step.time_step, step.force_split, step.constraint_force, use_compiler=compiled)
+    rules = (step.force_split, step.equations.constraint_force)
+    return compile_step(system, step.time_step, *rules, use_compiler=compiled)
 
 
 def _positive(time_step: float) -> float:

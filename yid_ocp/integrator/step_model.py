@@ -195,6 +195,10 @@ class Rollout:
     status: StepStatus
 
 
+CostSlopes = tuple[Array, Array | None, Array | None]
+"""Partial derivatives of a cost by states (N + 1, nx), multipliers (N, m) and efforts (N, nc) of a rollout."""
+
+
 @dataclass(frozen=True)
 class CostGradient:
     """Gradient of a scalar cost along a rollout, from the adjoint; NaN where a step's equations turned out singular.

@@ -51,22 +51,10 @@ def lqr_feedback(
     """Feedback of a finite-horizon LQR of the driven arms, linearised about their measured motion.
 
     Minimises the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 + |du|^2/torque^2 over the recording for the arms without
-    the object, with the errors that weigh the same; the gains act on the arms' angles and momenta. The reference
-    momentum follows from the measured angles and torques by the arms' own DEL equations, so that it means the same as
-    the model's.
-
-    Parameters
-    ----------
-    measured : array_like, shape (N + 1, nu)
-        Angles of the driven joints at every node [rad], smooth enough to be differenced.
-    torque : array_like, shape (N, nu)
-        Measured torques [N m].
-    arms : Step, optional
-        From `driven_joints_only_step`; made when absent.
-
-    References
-    ----------
-    Anderson and Moore (1990), Optimal Control: Linear Quadratic Methods, section 2.4.
+    the object, with the errors that weigh the same; the gains act on the arms' angles and momenta (Anderson and Moore
+    1990, Optimal Control: Linear Quadratic Methods, section 2.4). The reference momentum follows from the measured
+    angles (N + 1, nu) [rad], smooth enough to be differenced, and torques (N, nu) [N m] by the arms' own DEL equations,
+    so that it means the same as the model's. `arms` is the `driven_joints_only_step`, made when absent.
     """
     reference, torques = np.asarray(measured, float), np.asarray(torque, float)
     system = step.system

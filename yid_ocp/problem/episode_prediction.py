@@ -386,11 +386,8 @@ class EpisodePredictor:
         for by_rate, rate in ((read.by_v, node_velocity), (read.by_a, node_acceleration)):
             if by_rate.shape[2]:
                 total += by_rate @ rate(along.by_state[:, :n], nodes, self.step.time_step)
-        loads = (
-            (self.system.prescribed_coordinate_indices, along.by_effort),
-            (self.system.driven_coordinate_indices, along.by_torque),
-        )
-        for index, by_load_there in loads:
+        prescribed, driven = self.system.prescribed_coordinate_indices, self.system.driven_coordinate_indices
+        for index, by_load_there in ((prescribed, along.by_effort), (driven, along.by_torque)):
             by_load = read.by_load[:, :, list(index)]
             if by_load_there is not None and np.any(by_load):
                 total += by_load @ by_load_there[np.minimum(nodes, len(by_load_there) - 1)]
@@ -414,12 +411,11 @@ class EpisodePredictor:
         """
         wanted, rollout = self.unknowns.free_parameters, result.rollout
         theta = self.theta_with_episode_values(episode, theta)
-        by_state = np.zeros((episode.grid.steps + 1, self.step.sizes["nx"]))
-        by_effort, by_applied = np.zeros_like(rollout.effort), np.zeros_like(rollout.torque)
-        by_multipliers = np.zeros_like(rollout.multipliers)
+        pulled = {key: np.zeros_like(getattr(rollout, key)) for key in ("state", "effort", "torque", "multipliers")}
         total, read = np.zeros(len(wanted)), self.node_values(self._recorded(episode, rollout, theta, ()))
         for samples, pull in zip(episode.measurements, pulls, strict=True):
-            total += self._pull(samples, pull, read, theta, _Pulls(by_state, by_effort, by_applied, by_multipliers))
+            total += self._pull(samples, pull, read, theta, pulled)
+        by_state, by_effort, by_applied, by_multipliers = pulled.values()
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             by_effort = smooth.smoothing_adjoint(by_effort)
         if (lag := self.model_functions.input_corrections.joint_times("effort_lag", theta, wanted)) is not None:
@@ -430,7 +426,8 @@ class EpisodePredictor:
         if feedback is not None:
             by_state[:-1, feedback.state_indices] -= np.einsum("kub,ku->kb", feedback.gain, by_applied)
         by_lam = by_multipliers if np.any(by_multipliers) else None
-        by_inputs = self.step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, by_state, by_lam, by_effort)
+        partials = (by_state, by_lam, by_effort)
+        by_inputs = self.step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, partials)
         start = self.initial_state(episode, theta, offset, wanted, result.equilibrium_guess)
         inputs = self.corrected_inputs_with_momentum_shift(episode, theta, wanted, start.state, start.state_sensitivity)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
@@ -444,9 +441,9 @@ class EpisodePredictor:
         return np.asarray(own + by_inputs.by_initial_state @ start.state_sensitivity)
 
     def _pull(
-        self, samples: Measurements, pull: Array, values: TimeGridStateValues, theta: Array, pulls: _Pulls
+        self, samples: Measurements, pull: Array, values: TimeGridStateValues, theta: Array, pulled: dict[str, Array]
     ) -> Array:
-        """Spread the pull at one group's samples over states and efforts; the direct part by the parameters."""
+        """Add the pull at one group's samples to that of what a rollout gives; the direct part by the parameters."""
         n, wanted = self.system.n_coordinates, self.unknowns.free_parameters
         unmoved, late = samples, self._delay_in_steps(samples, theta, wanted)
         if late is not None:
@@ -456,22 +453,19 @@ class EpisodePredictor:
         direct = np.einsum("mk,mkq->q", at_nodes, read.by_theta)
         if late is not None:
             direct -= np.sum(pull * samples.prediction_rate_per_step(read.output, unmoved, late[0]), axis=0) @ late[1]
-        pulls.by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, read.by_q)
-        pulls.by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, read.by_z)
-        last, h = np.minimum(nodes, len(pulls.by_effort) - 1), self.step.time_step
+        by_state = pulled["state"]
+        by_state[nodes, :n] += np.einsum("mk,mkq->mq", at_nodes, read.by_q)
+        by_state[nodes, 2 * n :] += np.einsum("mk,mkq->mq", at_nodes, read.by_z)
+        last, h = np.minimum(nodes, len(by_state) - 2), self.step.time_step
         for by_rate, adjoint in ((read.by_v, node_velocity_adjoint), (read.by_a, node_acceleration_adjoint)):
             if by_rate.shape[2]:
-                pulled = np.einsum("mk,mkq->mq", at_nodes, by_rate)
-                pulls.by_state[:, :n] += adjoint(pulled, nodes, len(pulls.by_state), h)
+                by_state[:, :n] += adjoint(np.einsum("mk,mkq->mq", at_nodes, by_rate), nodes, len(by_state), h)
         if read.by_lam.shape[2]:
-            np.add.at(pulls.by_multipliers, last, np.einsum("mk,mkq->mq", at_nodes, read.by_lam) / h)
-        loads = (
-            (self.system.prescribed_coordinate_indices, pulls.by_effort),
-            (self.system.driven_coordinate_indices, pulls.by_torque),
-        )
-        for index, by_load_there in loads:
+            np.add.at(pulled["multipliers"], last, np.einsum("mk,mkq->mq", at_nodes, read.by_lam) / h)
+        prescribed, driven = self.system.prescribed_coordinate_indices, self.system.driven_coordinate_indices
+        for index, key in ((prescribed, "effort"), (driven, "torque")):
             if index:
-                np.add.at(by_load_there, last, np.einsum("mk,mkq->mq", at_nodes, read.by_load[:, :, list(index)]))
+                np.add.at(pulled[key], last, np.einsum("mk,mkq->mq", at_nodes, read.by_load[:, :, list(index)]))
         return np.asarray(direct)
 
 
@@ -486,27 +480,11 @@ class _Trajectory:
     by_multipliers: Array | None
 
 
-@dataclass(frozen=True)
-class _Pulls:
-    """Derivatives of a cost by states, efforts of prescribed joints, applied torques and multipliers, added up."""
-
-    by_state: Array
-    by_effort: Array
-    by_torque: Array
-    by_multipliers: Array
-
-
 # -- what a recording shows of its start and of its loads --------------------------------------------------------------
 
 
 def with_observed_equilibrium_and_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """Episode with the initial equilibrium that its points show and with gear loads free of effort noise.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (ntheta,)
-        Nominal parameters.
-    """
+    """Episode with the initial equilibrium that its points show and gear loads without effort noise, at a theta."""
     return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
 
 
@@ -539,11 +517,9 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
 def _first(samples: Measurements, time_step: float) -> Measurements | None:
     """The first sample of points, as if it were taken at node 0; None where it comes too late."""
     rows = np.flatnonzero(samples.used_output_mask.any(axis=1))[:1]
-    if (
-        not samples.sensor.point_names
-        or not len(rows)
-        or np.max(samples.node[rows]) * time_step > _MAX_FIRST_SAMPLE_TIME
-    ):
+    if not samples.sensor.point_names or not len(rows):
+        return None
+    if np.max(samples.node[rows]) * time_step > _MAX_FIRST_SAMPLE_TIME:
         return None
     parts = {name: getattr(samples, name)[rows] for name in ("value", "weight", "std")}
     return replace(samples, node=np.zeros(1, np.int64), fraction=np.zeros(1), noise_correlation=None, **parts)

@@ -81,9 +81,8 @@ class InitialState:
 
 log = logging.getLogger(__name__)
 
+# least error of a torque beside encoders, in parts of how far it varies: no model follows them for seconds uncorrected
 _MIN_TORQUE_ERROR_FRACTION = 1e-3
-"""Least error of a torque beside encoders, in parts of how far it varies: nothing that is computed follows them for
-seconds without correction."""
 
 
 @dataclass(frozen=True)
@@ -143,9 +142,8 @@ def _recorded_input_errors(
     joints, driven = recording.joints, system.driven
     if joints is None or joints.effort is None or not driven or system.servos:
         return None
-    effort, position = (
-        sensors.get(group, SensorOptions()) for group in (JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME)
-    )
+    effort = sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())
+    position = sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
     std = joint_torque_noise_std(joints, driven, effort, recording.name)
     bias = joint_torque_bias_std(joints, driven, effort)
     encoders = any(isinstance(entry.sensor, PositionSensor) for entry in samples)
@@ -162,17 +160,10 @@ def _recorded_input_errors(
     period = float(np.median(np.diff(joints.t)))
     middle = grid.node_times[:-1] + grid.time_step / 2
     sample = np.clip(np.searchsorted(joints.t, middle, "right") - 1, 0, len(joints.t) - 1)
-    return InputErrorModel(
-        # a step that spans several samples averages them
-        std * min(1.0, np.sqrt(period / grid.time_step)),
-        bias,
-        angle,
-        sample.astype(np.int64),
-        max(1.0, period / grid.time_step),
-        encoders,
-        np.zeros(len(driven)),
-        *(np.zeros((grid.steps, len(driven))) for _ in range(3)),
-    )
+    # a step that spans several samples averages them
+    held, shared = std * min(1.0, np.sqrt(period / grid.time_step)), max(1.0, period / grid.time_step)
+    none = (np.zeros(len(driven)), *(np.zeros((grid.steps, len(driven))) for _ in range(3)))
+    return InputErrorModel(held, bias, angle, sample.astype(np.int64), shared, encoders, *none)
 
 
 @dataclass(frozen=True)
@@ -220,11 +211,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     """Place a recording on the nodes of a rollout: torques, paths, joint coordinates, samples, tracking filter.
 
     At the nominal parameters `theta` encoder noise is converted to effort and the filter's gains are computed.
-
-    Raises
-    ------
-    DataError
-        The recording does not fit the model, is too short, or states no noise level.
+    `DataError` where the recording does not fit the model, is too short, or states no noise level.
     """
     step, system = functions.step, functions.step.system
     recording = recording.with_effort_kind(options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_kind)

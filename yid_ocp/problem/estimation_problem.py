@@ -45,7 +45,6 @@ from yid_ocp.problem.unknown_vector import (
     soft_logarithm_and_slope,
     stated_prior_jacobian,
     stated_prior_std,
-    with_named_entries,
 )
 
 _HELD_OUT_START_WINDOW = 0.2
@@ -91,18 +90,6 @@ class EstimationProblem(ReprMixin):
     DataError
         A recording that does not fit the model: missing joints or points, no noise level, too short.
     """
-
-    model_functions: ModelFunctions
-    options: ProblemOptions
-    free: tuple[str, ...]
-    theta: Array
-    episodes: tuple[Episode, ...]
-    held_out: tuple[Episode, ...]
-    unknowns: UnknownVectorLayout
-    predictor: EpisodePredictor
-    residual_rows: ResidualVectorLayout
-    whitening_filters: tuple[ResidualWhitener | None, ...]
-    held_out_whitening_filters: tuple[ResidualWhitener | None, ...]
 
     def __init__(
         self,
@@ -267,7 +254,8 @@ class EstimationProblem(ReprMixin):
 
     def vector(self, values: Mapping[str, float]) -> Array:
         """Initial unknown vector with named entries replaced, clipped to the bounds, shape (nx,)."""
-        return np.clip(with_named_entries(self.initial_unknowns, self.unknown_names, values), *self.bounds)
+        start = self.named_values(self.initial_unknowns)
+        return np.clip([values.get(name, value) for name, value in start.items()], *self.bounds)
 
     def named_values(self, x: Array) -> dict[str, float]:
         """Unknown vector as a dictionary of name to value."""

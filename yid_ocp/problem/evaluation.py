@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -38,16 +38,6 @@ class ResidualWhitener(Protocol):
         Of `rows` (r, c), a residual in units of the sensors' noise and columns of its derivative, and `push`
         (N, nu, c), the tracking filter's correction of the torque and its derivative [N m].
         """
-        ...
-
-
-class EvaluateFunction(Protocol):
-    """Evaluates residual, cost and Jacobian at an unknown vector, as `EstimationProblem.evaluate` does."""
-
-    def __call__(
-        self, x: Array, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
-    ) -> Evaluation:
-        """Evaluate the problem at the unknown vector `x`, shape (nx,)."""
         ...
 
 
@@ -99,6 +89,10 @@ class Evaluation(ReprMixin):
     def equilibrium_guesses(self) -> EquilibriumGuesses:
         """Guesses of the initial equilibria for evaluating a nearby point."""
         return tuple(result.equilibrium_guess for result in self.episode_predictions)
+
+
+EvaluateFunction = Callable[..., Evaluation]
+"""Evaluates a problem at an unknown vector, with the arguments of `EstimationProblem.evaluate`."""
 
 
 def _sensor_whitened_residual(

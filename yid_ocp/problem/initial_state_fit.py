@@ -107,12 +107,8 @@ class InitialStateFitter:
         """Fit the configuration to the points of the first frame and the momentum to their change within the window.
 
         Given are driven, then prescribed coordinates at node 0 (nk,), samples, of which only points are used, how far
-        from the start frames may be used [s], and the prescribed coordinates at all nodes (N + 1, nc).
-
-        Raises
-        ------
-        DataError
-            No point is seen within the window.
+        from the start frames may be used [s], and the prescribed coordinates at all nodes (N + 1, nc). `DataError`
+        where no point is seen within the window.
         """
         step, system = self.step, self.step.system
         last = max(round(window / step.time_step), 1)

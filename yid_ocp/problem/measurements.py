@@ -49,10 +49,7 @@ class TimeGrid:
 def make_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
     """Time grid that covers the recording's joint samples, or its first group of points where it has no joints.
 
-    Raises
-    ------
-    DataError
-        The recording is shorter than two steps, or longer than `_MAX_STEPS`, or has too few samples for its length.
+    `DataError` where it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples for its length.
     """
     t = recording.all_groups[0].t
     span = float(t[-1] - t[0]) if duration is None else min(duration, float(t[-1] - t[0]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -113,10 +113,7 @@ class CorrectedInputs:
 class InputCorrections:
     """Maps from recorded to true inputs and times, by the recording-error effects of a system.
 
-    Parameters
-    ----------
-    names : tuple of str
-        Parameters by which derivatives may be asked for; those wanted are some of them.
+    Derivatives may be asked for by the parameters `names`; those wanted are some of them.
     """
 
     def __init__(self, system: System, names: tuple[str, ...], use_compiler: bool) -> None:
@@ -304,21 +301,6 @@ class _SensorReadings(NamedTuple):
         return self.by_v.shape[2] + self.by_a.shape[2] + self.by_lam.shape[2] > 0
 
 
-@dataclass(frozen=True)
-class _CompiledSensor:
-    """A compiled sensor function with derivatives by some of its parameters, all of them where `columns` is None."""
-
-    all_derivatives: MappedFunction
-    columns: tuple[int, ...] | None = None
-
-    def __call__(self, at: TimeGridStateValues, theta: Array) -> _SensorReadings:
-        """Readings at nodes."""
-        output, *slopes = self.all_derivatives(at.q, at.v, at.a, at.z, at.load, at.lam, theta)
-        if self.columns is not None:
-            slopes[-1] = slopes[-1][:, :, list(self.columns)]
-        return _SensorReadings._make([output[:, :, 0], *slopes])
-
-
 class ModelFunctions:
     """Compiled functions of one step's system: sensors, equilibrium, initial state fit and input corrections.
 
@@ -357,12 +339,19 @@ class ModelFunctions:
         """Momenta that effects add to those that the tracking filter follows."""
         return self._momentum(None)
 
-    def compiled_sensor_function(self, sensor: Sensor, wanted: tuple[str, ...] = ()) -> _CompiledSensor:
-        """Compiled function of a sensor's readings, with derivatives by the parameters `wanted`."""
-        if not wanted or wanted == self.parameter_names:
-            return _CompiledSensor(self._sensors((sensor, bool(wanted))))
-        columns = tuple(self.parameter_names.index(name) for name in wanted)
-        return _CompiledSensor(self._sensors((sensor, True)), columns)
+    def compiled_sensor_function(
+        self, sensor: Sensor, wanted: tuple[str, ...] = ()
+    ) -> Callable[[TimeGridStateValues, Array], _SensorReadings]:
+        """Compiled function of a sensor's readings at nodes, with derivatives by the parameters `wanted`."""
+        function, columns = self._sensors((sensor, bool(wanted))), [self.parameter_names.index(name) for name in wanted]
+
+        def read(at: TimeGridStateValues, theta: Array) -> _SensorReadings:
+            output, *slopes = function(at.q, at.v, at.a, at.z, at.load, at.lam, theta)
+            if wanted not in ((), self.parameter_names):
+                slopes[-1] = slopes[-1][:, :, columns]
+            return _SensorReadings._make([output[:, :, 0], *slopes])
+
+        return read
 
     def _compiled(self, key: tuple[Sensor, bool]) -> MappedFunction:
         sensor, differentiated = key

@@ -24,10 +24,7 @@ _InitialStateKind = Literal["equilibrium", "estimated", "fitted_to_points"]
 class MultivariateGaussianPrior:
     """Multivariate Gaussian prior of shared parameters about their initial values, such as an earlier estimate.
 
-    Attributes
-    ----------
-    covariance : ndarray, shape (n, n)
-        Positive definite, in the parameters' units.
+    The covariance (n, n) is positive definite, in the parameters' units.
     """
 
     parameter_names: tuple[str, ...] = ()

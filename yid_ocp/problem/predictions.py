@@ -369,10 +369,8 @@ def _levels(
     """
     joints, driven = episode.recording.joints, predictor.system.driven
     assert joints is not None
-    effort, position = (
-        predictor.options.sensors.get(group, SensorOptions())
-        for group in (JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME)
-    )
+    effort = predictor.options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())
+    position = predictor.options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
     joint_angles = joints.position_std if position.std is None else position.std
     torques = joints.effort_std if effort.std is None else effort.std
     if episode.input_errors is None:

@@ -35,12 +35,8 @@ def mean_step_inputs(
     An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; through samples of
     efforts goes a cubic spline, and where means over the recorded intervals are given, the derivative of one through
     their sums, which keeps every mean. Each acts later than recorded by its `delay` (nu,) [s]; with `servos`, those of
-    all driven joints, these follow commands. `where` is the recording's name.
-
-    Raises
-    ------
-    DataError
-        No effort recorded, or no commands where servos move the arms, or a joint that is missing.
+    all driven joints, these follow commands. `where` is the recording's name. `DataError` where a joint is missing, no
+    effort is recorded, or no commands where servos move the arms.
     """
     if not driven:
         return np.zeros((grid.steps, 0))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -66,11 +66,6 @@ class UnknownVectorLayout:
         parts = [np.asarray(shared, float)]
         parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
         return np.concatenate(parts)
-
-
-def with_named_entries(x: Array, names: Sequence[str], values: Mapping[str, float]) -> Array:
-    """Copy of an unknown vector with named entries replaced."""
-    return np.array([values.get(name, value) for name, value in zip(names, x, strict=True)], float)
 
 
 def stated_prior_std(
