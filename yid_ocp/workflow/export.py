@@ -246,14 +246,11 @@ def _replayed(
         progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), recording.name)
         for name, error in replay_in_mujoco(text, system, recording).items():
             found.setdefault(name, []).append(error)
-    return {
-        name: ReplayMismatch(_rms([e.rmse for e in errors]), _rms([e.noise_rms for e in errors]), errors[0].unit)
-        for name, errors in found.items()
-    }
-
-
-def _rms(values: Sequence[float]) -> float:
-    return float((sum(value**2 for value in values) / len(values)) ** 0.5)
+    together = {}
+    for name, errors in found.items():
+        rmse, noise = np.sqrt(np.mean([(error.rmse**2, error.noise_rms**2) for error in errors], axis=0))
+        together[name] = ReplayMismatch(float(rmse), float(noise), errors[0].unit)
+    return together
 
 
 def _fall(pairs: Sequence[tuple[ReplayMismatch, ReplayMismatch]]) -> float | None:

@@ -18,6 +18,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.errors import ModelError
 from yid_ocp.export.equations import export_step_functions, write_equation_sheet
+from yid_ocp.files import attributes_to_json
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepEquationLinearizations
@@ -100,7 +101,7 @@ def _run_inspect(
             },
             "equations": step_diagnostics.step_size_summary(step),
             "blocks": {
-                kind: [{"name": b.name, "meaning": b.meaning, "names": list(b.full_names)} for b in own if b.labels]
+                kind: [attributes_to_json(block, "name meaning names=full_names") for block in own if block.labels]
                 for kind, own in blocks.items()
             },
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
@@ -108,9 +109,8 @@ def _run_inspect(
             "dependence": {entry.parameter: {**asdict(entry), "words": entry.words} for entry in dependences},
             "linearisation": {
                 "at": point.description,
-                "spectral_radius": linearisation.spectral_radius,
                 "norms": {name: float(np.linalg.norm(matrix)) for name, matrix in matrices.items()},
-                "finite_difference_errors": linearisation.finite_difference_errors,
+                **{key: getattr(linearisation, key) for key in ("spectral_radius", "finite_difference_errors")},
             },
             "asked": named,
             "entries": [_entry_result(entry, symbols, at) for entry in chosen],
@@ -232,15 +232,9 @@ def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]
 
 
 def _entry_result(entry: EquationEntry, symbols: StepSymbols, at: Array) -> dict[str, Any]:
-    return {
-        "title": entry.title,
-        "row": entry.row_name,
-        "column": entry.column_name,
-        "operations": entry.formula.n_operations,
-        "zero": entry.is_identically_zero,
-        "value": entry.numeric_value(symbols.column_symbols, at),
-        "lines": entry.text_lines,
-    }
+    names = "title row=row_name column=column_name zero=is_identically_zero lines=text_lines"
+    value = entry.numeric_value(symbols.column_symbols, at)
+    return attributes_to_json(entry, names) | {"operations": entry.formula.n_operations, "value": value}
 
 
 def _write_matrices(path: Path, step: Step, arrays: Mapping[str, Any]) -> None:

@@ -129,12 +129,12 @@ def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | N
         recording, held, points = episode.recording, cable.clamped_vertex_names, sensor.point_names
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
+        parents, children = cable.parent_vertices, cable.child_vertices
+        carried = predictions.interpolated_displacement_baseline
         arrays = {
             "stays": predictions.constant_position_baseline(recording, points, _START_FRAMES),
             "moves_with_clamps": predictions.clamp_displacement_baseline(recording, points, held, _START_FRAMES),
-            "linear_carry": predictions.interpolated_displacement_baseline(
-                recording, points, cable.parent_vertices, cable.child_vertices, given=_START_FRAMES
-            ),
+            "linear_carry": carried(recording, points, parents, children, given=_START_FRAMES),
         }
         return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}
     if not len(samples.value):
@@ -225,20 +225,11 @@ def write_solve_trajectories(
             if isinstance(outcome, str):
                 group.attrs["message"] = outcome
                 continue
-            n, rollout = system.n_coordinates, outcome.rollout
-            arrays = {
-                "t": episode.grid.node_times,
-                "q": rollout.state[:, :n],
-                "p": rollout.state[:, n : 2 * n],
-                "multipliers": rollout.multipliers,
-                "command" if system.servos else "torque": (
-                    np.where(rollout.torque < MOTOR_OFF_COMMAND / 2, rollout.torque, np.nan)
-                    if system.servos
-                    else rollout.torque
-                ),
-                "effort": rollout.effort,
-            }
-            _store(group, arrays)
+            n, rollout, torque = system.n_coordinates, outcome.rollout, {"torque": outcome.rollout.torque}
+            if system.servos:
+                torque = {"command": np.where(rollout.torque < MOTOR_OFF_COMMAND / 2, rollout.torque, np.nan)}
+            _store(group, {"t": episode.grid.node_times, "q": rollout.state[:, :n], "p": rollout.state[:, n : 2 * n]})
+            _store(group, {"multipliers": rollout.multipliers, **torque, "effort": rollout.effort})
             for samples, predicted in zip(episode.measurements, outcome.predicted_outputs, strict=True):
                 _store_sensor(group, episode, samples, {"predicted": predicted})
 
@@ -274,21 +265,14 @@ def write_diagnosis_trajectories(
             problem = finding.nominal_model.problem
             group = file.create_group(f"where/{trace.recording}")
             group.attrs["start"] = next(e.grid.start_time for e in problem.episodes if e.name == trace.recording)
-            texts = {
-                "unknowns": trace.unknown_names,
-                "locations": [source.location for source in trace.unknown_groups],
-                "kinds": [source.kind for source in trace.unknown_groups],
-                "units": smoothed_unknown_units(problem.system, trace),
-            }
-            _store_texts(group, texts)
+            _store_texts(group, {"unknowns": trace.unknown_names})
+            _store_texts(group, {"locations": [source.location for source in trace.unknown_groups]})
+            _store_texts(group, {"kinds": [source.kind for source in trace.unknown_groups]})
+            _store_texts(group, {"units": smoothed_unknown_units(problem.system, trace)})
             variance = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
-            arrays = {
-                "edges": trace.interval_edges,
-                "mean": trace.posterior_mean * trace.reference_std,
-                "std": trace.posterior_std * trace.reference_std,
-                "prior": np.sqrt(variance) * trace.reference_std,
-            }
-            _store(group, arrays)
+            relative = {"mean": trace.posterior_mean, "std": trace.posterior_std, "prior": np.sqrt(variance)}
+            _store(group, {"edges": trace.interval_edges})
+            _store(group, {name: array * trace.reference_std for name, array in relative.items()})
         for force in finding.events.force_estimates:
             group = file.create_group(f"events/{force.recording}/{force.coordinate}")
             group.attrs["unit"] = force.unit

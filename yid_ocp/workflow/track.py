@@ -163,11 +163,8 @@ def _track_result(
 
 def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, Any]:
     names = "name stamp t=joint_time reason=drop_reason raw_points=n_raw_points object_points=n_filtered_points"
-    found = {
-        "distance": fit and fit.mean_distance,
-        "covered": fit and fit.visible_length_coverage,
-        "contested": fit and fit.contested_fraction,
-    }
+    known = {"distance": "mean_distance", "covered": "visible_length_coverage", "contested": "contested_fraction"}
+    found = {key: fit and getattr(fit, name) for key, name in known.items()}
     return found | attributes_to_json(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
 
 
