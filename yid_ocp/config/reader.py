@@ -22,24 +22,11 @@ from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEv
 from ruamel.yaml.parser import Parser
 from ruamel.yaml.scanner import Scanner
 
-from yid_ocp.config.schema import (
-    SectionVariants,
-    iter_settable_key_completions,
-    section_variants_from_annotation,
-    unknown_key_error,
-)
+from yid_ocp import options
+from yid_ocp.config import schema
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
 from yid_ocp.files import read_input_text
-from yid_ocp.options import (
-    OptionInfo,
-    dataclass_options,
-    describe_type,
-    mapping_value_type,
-    split_annotated,
-    tuple_entry_type,
-    union_members,
-)
 
 _KeyPath = tuple[str | int, ...]
 DEFAULT_CONFIG = "dual_arm_vision.yaml"
@@ -53,17 +40,10 @@ _ALLOWED = "keys with numbers, text, true or false, [lists] and sections"
 def load_config(
     path: str | Path | None = None, overrides: Sequence[str] = (), default: str = DEFAULT_CONFIG
 ) -> RunSettings:
-    """Read and check a configuration file.
+    """Read and check a configuration file, the embedded `default` when none is given.
 
-    Parameters
-    ----------
-    path : str or Path, optional
-        The YAML file; the embedded default when absent.
-    overrides : sequence of str
-        `a.b=c` each: the key and a value in YAML that replaces or adds to the file's. A section merges with the one
-        that stands there, key by key, unless it chooses another kind or method, or is empty.
-    default : str
-        Name of the embedded file.
+    Overrides are `a.b=c` each: the key and a value in YAML that replaces or adds to the file's. A section merges with
+    the one that stands there, key by key, unless it chooses another kind or method, or is empty.
 
     Raises
     ------
@@ -86,7 +66,7 @@ def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> li
     `ConfigError` where the file cannot be read.
     """
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
-    return list(iter_settable_key_completions(RunSettings, prefix, data))
+    return list(schema.iter_settable_key_completions(RunSettings, prefix, data))
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------
@@ -145,9 +125,8 @@ def _loaded(text: str, origin: str) -> Any:
         # the reader's own mistakes on odd text: numbers of thousands of digits, keys that are lists
         problem = next(iter(str(error).splitlines()), type(error).__name__)
         hint = "look for very long numbers and for keys that are lists"
-        raise ConfigError(
-            f"the file is not valid YAML: {problem}", where=origin, allowed=_ALLOWED, hint=hint
-        ) from error
+        what = f"the file is not valid YAML: {problem}"
+        raise ConfigError(what, where=origin, allowed=_ALLOWED, hint=hint) from error
 
 
 def _yaml() -> YAML:
@@ -220,7 +199,7 @@ def _override(data: dict[str, Any], places: dict[_KeyPath, str], text: str) -> N
 
 def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_KeyPath, str]) -> Any:
     """What stands at a key once a value is set there: sections of one kind merge, all else is replaced."""
-    sections = section_variants_from_annotation(hint)
+    sections = schema.section_variants_from_annotation(hint)
     merges = bool(value) and isinstance(before, dict) and isinstance(value, dict)
     if merges and sections is not None and sections.selector_key in value:
         merges = sections.selected_variant_name(value) == sections.selected_variant_name(before)
@@ -230,7 +209,7 @@ def _merged(hint: Any, before: Any, value: Any, path: _KeyPath, places: dict[_Ke
         return value
     keys = {} if sections is None else sections.variant_options(sections.selected_variant_name({**before, **value}))
     for name, entry in value.items():
-        kind = keys[name].type_hint if name in keys else mapping_value_type(hint)
+        kind = keys[name].type_hint if name in keys else options.mapping_value_type(hint)
         before[name] = _merged(kind, before.get(name), entry, (*path, name), places)
     return before
 
@@ -240,12 +219,12 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
     if not parts:
         return (), hint
     name, rest = parts[0], parts[1:]
-    sections, values = section_variants_from_annotation(hint), mapping_value_type(hint)
-    inner = section_variants_from_annotation(values)
+    sections, values = schema.section_variants_from_annotation(hint), options.mapping_value_type(hint)
+    inner = schema.section_variants_from_annotation(values)
     if sections is not None:
         known = sections.variant_options(sections.selected_variant_name(raw))
         if name not in known:
-            raise unknown_key_error(name, known, origin)
+            raise schema.unknown_key_error(name, known, origin)
         below = known[name].type_hint
     elif values is None:
         raise ConfigError(f"there are no keys below '{name}'", where=origin, hint="shorten the key")
@@ -255,7 +234,7 @@ def _key_path(hint: Any, parts: list[str], origin: str, raw: Any) -> tuple[tuple
         known = {} if inner is None else inner.variant_options()
         cut = next((i for i in range(len(parts) - 1, 0, -1) if parts[i] in known), len(parts))
         if isinstance(raw, dict) and ".".join(parts[:-1]) in raw and cut == len(parts) and known:
-            raise unknown_key_error(parts[-1], known, origin)
+            raise schema.unknown_key_error(parts[-1], known, origin)
         name, rest, below = ".".join(parts[:cut]), parts[cut:], values
     path, found = _key_path(below, rest, origin, raw.get(name) if isinstance(raw, dict) else None)
     return (name, *path), found
@@ -282,30 +261,24 @@ class _Reader:
 
     def build(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
         """A value of the given type."""
-        sections, entries, values = (
-            section_variants_from_annotation(hint),
-            tuple_entry_type(hint),
-            mapping_value_type(hint),
-        )
+        sections, entries = schema.section_variants_from_annotation(hint), options.tuple_entry_type(hint)
+        inner = schema.section_variants_from_annotation(options.mapping_value_type(hint))
         if sections is not None:
             return None if raw is None and sections.is_nullable else self._section(sections, raw, path)
-        if entries is not None and section_variants_from_annotation(entries) is not None:
+        if entries is not None and schema.section_variants_from_annotation(entries) is not None:
             if not isinstance(raw, list):
                 raise self._wrong(raw, hint, path)
             return tuple(self.build(entries, value, (*path, i)) for i, value in enumerate(raw))
-        inner = section_variants_from_annotation(values)
         if inner is not None:
             if raw is not None and not isinstance(raw, dict):
                 raise self._wrong(raw, hint, path)
             return {
-                name: self._section(
-                    inner.variants_for_mapping_key(name, self.where((*path, name))), value, (*path, name)
-                )
-                for name, value in (raw or {}).items()
+                name: self._section(inner.variants_for_mapping_key(name, self.where((*path, name))), own, (*path, name))
+                for name, own in (raw or {}).items()
             }
         return self._leaf(hint, raw, path)
 
-    def _section(self, sections: SectionVariants, raw: Any, path: _KeyPath) -> Any:
+    def _section(self, sections: schema.SectionVariants, raw: Any, path: _KeyPath) -> Any:
         raw = {} if raw is None else raw
         if not isinstance(raw, dict):
             keys = list(sections.variant_options(sections.default_variant))
@@ -319,14 +292,14 @@ class _Reader:
         known, kind = sections.variant_options(word), sections.classes[word]
         for name in raw:
             if name not in known:
-                raise unknown_key_error(name, known, self.where((*path, name)), ".".join(map(str, path)))
+                raise schema.unknown_key_error(name, known, self.where((*path, name)), ".".join(map(str, path)))
         values: dict[str, Any] = {}
-        for name, option in dataclass_options(kind).items():
+        for name, option in options.dataclass_options(kind).items():
             if name in raw:
                 values[option.field_name] = self.build(option.type_hint, raw[name], (*path, name))
             elif option.default_value is MISSING:
                 what = f"the key '{name}' is missing"
-                raise ConfigError(what, where=self.where(path), allowed=describe_type(option.type_hint))
+                raise ConfigError(what, where=self.where(path), allowed=options.describe_type(option.type_hint))
         return kind(**values)
 
     def _leaf(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
@@ -339,14 +312,15 @@ class _Reader:
         return _absolute(value, hint, self.base)
 
     def _wrong(self, raw: Any, hint: Any, path: _KeyPath) -> ConfigError:
-        unit = next((m.unit for m in split_annotated(hint)[1] if isinstance(m, OptionInfo) and m.unit), "")
+        markers = options.split_annotated(hint)[1]
+        unit = next((entry.unit for entry in markers if isinstance(entry, options.OptionInfo) and entry.unit), "")
         advice = ""
         if isinstance(raw, str) and (match := re.fullmatch(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*([^\d\s].*)", raw)):
             advice = f"write the number alone, in {unit}" if unit else "write the number alone"
             if unit and match[2].strip() != unit:
                 advice += f": convert it from {match[2].strip()}"
         what = f"{self._name(path)} = {_shown(raw)} is not allowed"
-        return ConfigError(what, where=self.where(path), allowed=describe_type(hint), hint=advice)
+        return ConfigError(what, where=self.where(path), allowed=options.describe_type(hint), hint=advice)
 
     @staticmethod
     def _name(path: _KeyPath) -> str:
@@ -374,10 +348,10 @@ def _refuse_nan(word: str) -> float:
 def _absolute(value: Any, hint: Any, base: Path) -> Any:
     """Paths within a value, relative to the configuration no longer."""
     if isinstance(value, tuple):
-        entries = tuple_entry_type(hint)
+        entries = options.tuple_entry_type(hint)
         return value if entries is None else tuple(_absolute(entry, entries, base) for entry in value)
-    markers = [marker for part in (hint, *union_members(hint)) for marker in split_annotated(part)[1]]
-    is_path = any(isinstance(marker, OptionInfo) and marker.is_path for marker in markers)
+    markers = [marker for part in (hint, *options.union_members(hint)) for marker in options.split_annotated(part)[1]]
+    is_path = any(isinstance(marker, options.OptionInfo) and marker.is_path for marker in markers)
     if not isinstance(value, str) or not is_path or value.startswith(("package:", "default:")):
         return value
     return str((base / Path(value).expanduser()).resolve())

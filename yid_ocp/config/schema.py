@@ -10,18 +10,9 @@ from typing import Any, Literal, get_args
 
 from pydantic import TypeAdapter
 
+from yid_ocp import options
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError, unknown_name_details
-from yid_ocp.options import (
-    Option,
-    OptionInfo,
-    RegistryChoice,
-    dataclass_options,
-    mapping_value_type,
-    split_annotated,
-    tuple_entry_type,
-    union_members,
-)
 
 
 @dataclass(frozen=True)
@@ -39,13 +30,13 @@ class SectionVariants:
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
 
-    def variant_options(self, word: Any = "") -> Mapping[str, Option]:
+    def variant_options(self, word: Any = "") -> Mapping[str, options.Option]:
         """Options by key of the class that `word` selects; of the first class where it selects none."""
         known = isinstance(word, str) and word in self.classes
-        options = dataclass_options(self.classes[word] if known else next(iter(self.classes.values())))
-        if self.selector_key in ("", *options):
-            return options
-        return {self.selector_key: Option(Literal[tuple(self.classes)], self.default_variant), **options}
+        own = options.dataclass_options(self.classes[word] if known else next(iter(self.classes.values())))
+        if self.selector_key in ("", *own):
+            return own
+        return {self.selector_key: options.Option(Literal[tuple(self.classes)], self.default_variant), **own}
 
     def variants_for_mapping_key(self, name: str, where: str) -> SectionVariants:
         """The settings classes allowed under one key of a mapping: the class registered by that name, or all."""
@@ -66,14 +57,14 @@ class SectionVariants:
 
 def section_variants_from_annotation(hint: Any) -> SectionVariants | None:
     """Alternative settings classes that a type annotation allows; None for other types."""
-    bare, markers = split_annotated(hint)
+    bare, markers = options.split_annotated(hint)
     nullable = type(None) in get_args(bare)
-    among = next((marker for marker in markers if isinstance(marker, RegistryChoice)), None)
+    among = next((marker for marker in markers if isinstance(marker, options.RegistryChoice)), None)
     if among is not None:
         registry = among.registry
         classes = {name: registry[name] for name in registry}
         return SectionVariants(classes, among.selector_key, among.default_name, registry.entry_noun, nullable)
-    kinds = [split_annotated(member)[0] for member in union_members(bare)]
+    kinds = [options.split_annotated(member)[0] for member in options.union_members(bare)]
     if len(kinds) != 1 or not all(map(dataclasses.is_dataclass, kinds)):
         return None
     return SectionVariants({"": kinds[0]}, is_nullable=nullable)
@@ -95,21 +86,15 @@ def unknown_key_error(name: str, known: Iterable[str], where: str, within: str =
 def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = "") -> Iterator[str]:
     """Yield completions of a dotted key prefix, up to the next dot or to `=` where a value follows.
 
-    Parameters
-    ----------
-    hint : Any
-        Type of what stands at `at`.
-    raw : Any
-        What a file says there: its names count where users choose them.
-    at : str
-        The keys before, each with its dot.
+    `hint` is the type of what stands behind the keys `at`, each with its dot, and `raw` what a file says there: its
+    names count where users choose them.
     """
-    sections, values = section_variants_from_annotation(hint), mapping_value_type(hint)
+    sections, values = section_variants_from_annotation(hint), options.mapping_value_type(hint)
     named = section_variants_from_annotation(values)
     below: dict[str, Any] = {}
     if sections is not None:
-        options = sections.variant_options(sections.selected_variant_name(raw))
-        below = {name: option.type_hint for name, option in options.items()}
+        known = sections.variant_options(sections.selected_variant_name(raw))
+        below = {name: option.type_hint for name, option in known.items()}
     elif named is not None and named.selector_key == "name":
         below = dict(named.classes)
     elif values is not None and isinstance(raw, dict):
@@ -121,29 +106,25 @@ def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = ""
                 inner, prefix, raw.get(name) if isinstance(raw, dict) else None, f"{path}."
             )
         elif path.startswith(prefix):
-            yield path + (
-                "=" if section_variants_from_annotation(inner) is None and mapping_value_type(inner) is None else "."
-            )
+            has_keys = section_variants_from_annotation(inner) or options.mapping_value_type(inner)
+            yield f"{path}." if has_keys else f"{path}="
 
 
 def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
     """Yield descriptions of the sections that have a key; NAME represents a user-chosen name."""
-    for inner, step in ((mapping_value_type(hint), ".NAME"), (tuple_entry_type(hint), "")):
+    for inner, step in ((options.mapping_value_type(hint), ".NAME"), (options.tuple_entry_type(hint), "")):
         if inner is not None:
             yield from _sections_with_key(inner, name, at + step)
     sections = section_variants_from_annotation(hint)
     if sections is None:
         return
-    having = [word for word, kind in sections.classes.items() if name in dataclass_options(kind)]
+    having = [word for word, kind in sections.classes.items() if name in options.dataclass_options(kind)]
     if having:
         choice = "" if len(having) == len(sections.classes) else f" with {sections.selector_key}: {', '.join(having)}"
         yield (f"`{at}`" if at else "the file itself") + choice
     for kind in sections.classes.values():
-        for key, option in dataclass_options(kind).items():
+        for key, option in options.dataclass_options(kind).items():
             yield from _sections_with_key(option.type_hint, name, f"{at}.{key}" if at else key)
-
-
-# -- JSON Schema ------------------------------------------------------------------------------------------------------
 
 
 def config_json_schema() -> dict[str, Any]:
@@ -159,7 +140,8 @@ def _described_schema(hint: Any) -> dict[str, Any]:
 
 
 def _type_schema(hint: Any) -> dict[str, Any]:
-    sections, entries, values = section_variants_from_annotation(hint), tuple_entry_type(hint), mapping_value_type(hint)
+    sections, entries = section_variants_from_annotation(hint), options.tuple_entry_type(hint)
+    values = options.mapping_value_type(hint)
     if sections is not None:
         parts = [_section_schema(sections, word) for word in sections.classes]
         parts += [{"type": "null"}] if sections.is_nullable else []
@@ -181,7 +163,7 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
     required = []
     if sections.selector_key == "name":
         properties["name"] = {"const": word, "description": f"the {sections.variant_noun}"}
-    for name, option in dataclass_options(kind).items():
+    for name, option in options.dataclass_options(kind).items():
         properties[name] = _described_schema(option.type_hint)
         default = option.default_value
         if default is MISSING:
@@ -196,7 +178,7 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
     return result | ({"required": required} if required else {})
 
 
-def option_info_from_annotation(hint: Any) -> OptionInfo:
+def option_info_from_annotation(hint: Any) -> options.OptionInfo:
     """The `OptionInfo` in a type annotation (meaning and unit); an empty one where there is none."""
-    markers = reversed(split_annotated(hint)[1])
-    return next((marker for marker in markers if isinstance(marker, OptionInfo)), OptionInfo())
+    markers = reversed(options.split_annotated(hint)[1])
+    return next((marker for marker in markers if isinstance(marker, options.OptionInfo)), options.OptionInfo())

@@ -296,9 +296,6 @@ def system_with_second_arm(run: RunSettings, system: System) -> System | None:
         return None  # the robot has no other arm of that name
 
 
-# -- clamps and additional frames -------------------------------------------------------------------------------------
-
-
 def _clamp_mechanism(run: RunSettings) -> Mechanism | None:
     """Mechanism of the clamps that move an object without a robot; None without clamps."""
     model, arms = run.model, run.model.arms

@@ -184,9 +184,6 @@ def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) 
     return build_problem(load_config(path, overrides))
 
 
-# -- checks of the recordings -----------------------------------------------------------------------------------------
-
-
 def _check_recordings(
     run: RunSettings, system: System, free: Sequence[str], estimate: Sequence[Recording], held_out: Sequence[Recording]
 ) -> tuple[list[Recording], list[Recording], tuple[Issue, ...]]:

@@ -96,8 +96,6 @@ def print_json(result: Mapping[str, Any]) -> None:
     print(json.dumps(to_json_types(result), indent=1, allow_nan=False))
 
 
-# -- progress ---------------------------------------------------------------------------------------------------------
-
 _MIN_LINE_INTERVAL = 5.0  # least time between two lines of one tenth of a stage [s]
 _MIN_ESTIMATE_TIME = 2.0  # time that a stage has to last before the rest of it is guessed [s]
 

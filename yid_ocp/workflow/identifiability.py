@@ -245,9 +245,6 @@ class _IdentifiabilityTasks:
         return require_task_values(run_tasks(function, listed, self.results_folder, self.workers, report))
 
 
-# -- tasks ------------------------------------------------------------------------------------------------------------
-
-
 def profile_likelihood_task(common: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Task: profile likelihood of one parameter and its updated verdict, as plain data."""
     run, problem = _problem(common)

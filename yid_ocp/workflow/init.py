@@ -30,7 +30,6 @@ from yid_ocp.workflow.import_recording import (
     reader_options_from_arguments,
 )
 
-_RESULT_FORMAT = "yid-init/1"
 _SCHEMA_FILE = "yid-ocp.schema.json"
 
 
@@ -60,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     imports = reader_options_from_arguments(arguments)
     lines = _config_lines(where, arguments.object, item, proposal, files, imports)
     _write(out, "\n".join(lines) + "\n", written)
-    result = {"format": _RESULT_FORMAT, "configuration": str(out), "recordings": files, "proposal": proposal.to_dict()}
+    result = {"format": "yid-init/1", "configuration": str(out), "recordings": files, "proposal": proposal.to_dict()}
     print_result(arguments, result, lambda: _summary_lines(proposal, out), f"configuration: {out}", str(out))
     return EXIT_DONE
 
@@ -356,11 +355,8 @@ def _sensors(proposal: ConfigProposal) -> Iterator[str]:
             entries, said = [f"std: {_number(noise.std)}"], f"{noise.std:.2g} {noise.unit}, {noise.reason}"
         if frames := {place.point: place.frame for place in places if place.frame and place.frame != place.point}:
             entries.append(f"frames: {_value(frames)}")
-        if (
-            group == "joints.effort"
-            and proposal.arm_mode == "prescribed"
-            and not proposal.is_object_measured_only_by_effort
-        ):
+        told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_object_measured_only_by_effort
+        if group == "joints.effort" and told_by_points:
             entries, said = ["use: false", *entries], "true once friction and payload of the arm are in the model"
         # without a setting of its own, a comment
         yield _line("  ", group, f"{{{', '.join(entries)}}}", said) if entries else f"  # {group}: {said}"

@@ -231,15 +231,12 @@ def require_distinct_recordings(
     known = {other.sha256 for other in without} - {None}
     for episode in (*problem.episodes, *problem.held_out):
         if episode.recording.sha256 in known:
-            what, where = f"{episode.name} is a recording of the baseline too, and would count twice", "baseline"
-            section = "diagnosis"
+            where = ("diagnosis", "baseline")
+            what = f"{episode.name} is a recording of the baseline too, and would count twice"
             if not runs or run.recordings.reference_recordings:
+                where = ("recordings", "reference_recordings")
                 what = f"{episode.name} is among the recordings made without what is looked for"
-                section, where = "recordings", "reference_recordings"
-            raise run.config_error(what, section, where, allowed="recordings of another time")
-
-
-# -- the command ------------------------------------------------------------------------------------------------------
+            raise run.config_error(what, *where, allowed="recordings of another time")
 
 
 def run(arguments: argparse.Namespace) -> int:

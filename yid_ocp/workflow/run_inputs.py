@@ -109,9 +109,6 @@ def _line(error: BaseException, path: Path) -> int | None:
     return lines[-1] if lines else None
 
 
-# -- files ------------------------------------------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def add_setting_location_to_errors(run: RunSettings, *path: str | int) -> Iterator[None]:
     """Context manager that adds the location of a setting to errors raised in its block."""

@@ -170,9 +170,6 @@ def _prediction_errors(
     return [entry(problem, *pair, cable) for pair in pairs], units, residuals
 
 
-# -- discretisation ---------------------------------------------------------------------------------------------------
-
-
 def discretisation_shift_results(
     shifts: Mapping[str, DiscretisationEstimateShift], std: Mapping[str, float]
 ) -> dict[str, Any]:
