@@ -303,6 +303,7 @@ def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
 
 _SAID_IDENTIFIABILITY = "say which parameters the recordings determine, and which experiment would tell more"
 _SAID_BLIND = "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted"
+_SAID_COMPLETION = "print what makes a shell complete commands, options, files and settings"
 COMMANDS = tuple(
     _CliCommand(*row)
     for row in (
@@ -327,12 +328,7 @@ COMMANDS = tuple(
             "export.run",
             _export,
         ),
-        (
-            "completion",
-            "print what makes a shell complete commands, options, files and settings",
-            _print_completion_script,
-            _completion,
-        ),
+        ("completion", _SAID_COMPLETION, _print_completion_script, _completion),
         ("schema", "print the JSON Schema of configuration files, for editors", _print_schema, _schema),
     )
 )

@@ -80,12 +80,7 @@ def run_blind(
     `sealed/labels.json`, `commitment.json` (hash of the labels, written before the first diagnosis, and of the sources
     that made the cases), `answers/` and `best/` (results of tasks, see `yid_ocp.parallel`), then `result.json`
     (`yid-blind/1`), `table.md` and pictures; of an ensemble to calibrate by `thresholds.json` (`yid-calibration/1`).
-
-    Raises
-    ------
-    ConfigError, DataError, ModelError, SolverError, WorkerError
-    OutputError
-        The folder holds another ensemble.
+    `OutputError` where the folder holds another ensemble.
     """
     if count < 1:
         raise runs[0].config_error(f"an ensemble of {count} cases", "diagnosis", hint="give --cases from 1")

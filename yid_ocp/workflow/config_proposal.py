@@ -116,12 +116,10 @@ def propose_config(
     grasps: Mapping[str, str] | None = None,
     standing: bool = False,
 ) -> ConfigProposal:
-    """Propose a configuration from a robot and its recordings.
+    """Propose a configuration from a robot and its recordings, of which at least one has joints.
 
     Parameters
     ----------
-    recordings : sequence of Recording
-        At least one, with joints.
     branches : sequence of Segment
         Segments of the object, parents first.
     holder : str, optional
@@ -131,10 +129,7 @@ def propose_config(
     standing : bool
         Whether the object stands on the ground, and arms hold its ends.
 
-    Raises
-    ------
-    ConfigError
-        No recorded joint is in the URDF, or there is no such frame; others as `read_urdf`.
+    `ConfigError` where no recorded joint is in the URDF, or there is no such frame; others as `read_urdf`.
     """
     first = recordings[0]
     recorded = first.joints
@@ -159,7 +154,11 @@ def propose_config(
     needed = {j for end in carrying for j in tree.ancestor_joint_indices(end)}
     joints = tuple(tree.joint_names[j] for j in sorted(needed))
     mode, why = _mode(first, recorded, bool(held))
-    moving = next(filter(None, (_moving_start(recording, joints) for recording in recordings)), "")
+    moving = ""
+    for recording in recordings:
+        start = min(group.t[0] for group in recording.groups)
+        if not moving and (mover := _moving_joint_or_point(recording, joints, start)):
+            moving = f"{mover} of {recording.name} moves at the start, which is estimated along"
     period = float(np.median(np.diff(recorded.t))) if len(recorded.t) > 1 else _MAX_TIME_STEP
     return ConfigProposal(
         joints,
@@ -240,12 +239,6 @@ def _commanded(joints: JointGroup) -> bool:
         return False
     apart = np.sqrt(np.mean((joints.position_command - joints.position) ** 2))
     return bool(apart > _COPIED_COMMAND_RATIO * np.std(joints.position - joints.position.mean(axis=0)))
-
-
-def _moving_start(recording: Recording, joints: Sequence[str]) -> str:
-    """What says that a recording begins in motion; empty where it begins at rest."""
-    moving = _moving_joint_or_point(recording, joints, min(group.t[0] for group in recording.groups))
-    return f"{moving} of {recording.name} moves at the start, which is estimated along" if moving else ""
 
 
 def _moving_joint_or_point(recording: Recording, joints: Sequence[str], time: float) -> str:

@@ -62,12 +62,6 @@ class IdentifiabilityOptions:
         asked = [flag for flag, given in said.items() if given]
         return asked + ([] if names == "auto" else ["--intervals", names])
 
-    def _wanted(self, problem: EstimationProblem, names: Sequence[str]) -> Sequence[str]:
-        """Parameters of those in the analysis, or others that were asked for, whose interval is wanted."""
-        if self.interval_parameters not in ("auto", "all"):
-            return self.interval_parameters
-        return names if self.interval_parameters == "all" or is_small_enough_for_profiles(problem) else ()
-
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
@@ -125,8 +119,10 @@ def run_identifiability(
             unknown = judged(start="unknown", grasp_std=GRASP_OFFSET_PRIOR_STD)
             judged = partial(judged, start=asked.start_knowledge, grasp_std=asked.grasp_offset_std)
             information = judged()
-            wanted = asked._wanted(problem, information.parameter_names)
-            if tasks is not None and wanted and set(wanted) <= set(information.parameter_names):
+            wanted, names = asked.interval_parameters, information.parameter_names
+            if isinstance(wanted, str):
+                wanted = names if wanted == "all" or is_small_enough_for_profiles(problem) else ()
+            if tasks is not None and wanted and set(wanted) <= set(names):
                 progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
                 information = tasks.with_profile_likelihoods(information, wanted)
             elif wanted:

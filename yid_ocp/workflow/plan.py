@@ -90,8 +90,6 @@ def start_configuration(run: RunSettings, step: Step) -> Mapping[str, float] | N
 
     None where neither says it: then it begins where the arms first grasp the undeformed object. Two arms that hold a
     straight object are at its full stretch, from which it snaps to either side; a recording rarely begins there.
-
-    `DataError` where the recording does not hold a joint that moves.
     """
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
@@ -106,11 +104,7 @@ def start_configuration(run: RunSettings, step: Step) -> Mapping[str, float] | N
 def identified_parameters_with_covariance(
     run: RunSettings, step: Step
 ) -> tuple[Array, ParameterCovariance, dict[str, Any]]:
-    """Parameters, their covariance, and where both come from: a run folder of `solve`, or the settings.
-
-    `ConfigError` or `DataError` where the folder is none of `solve`, its solve failed, or it had effects that this
-    model has not.
-    """
+    """Parameters, their covariance, and where both come from: a run folder of `solve`, or the settings."""
     parameters = step.system.parameters
     theta = parameters.vector()
     if run.plan.parameter_run is None:

@@ -36,27 +36,18 @@ _FULL_HINT = "choose a folder on a disk with room, with --out"
 
 @dataclass
 class RunFolder:
-    """A run folder while it is being written.
-
-    Attributes
-    ----------
-    resume_folder : Path
-        Where an interrupted run may leave what the next one with the same name, or none, can use; not made here.
-    """
+    """A run folder while it is being written."""
 
     final_path: Path  # its name when complete
     path: Path  # where it is now
-    resume_folder: Path
+    resume_folder: Path  # where an interrupted run may leave what the next of its name, or none, can use; not made here
     _log: TextIO = field(repr=False)
     input_hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 of every file that the run reads, by name
     _command_line: str = ""
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
     def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
-        """Write config.yaml, hash what the run reads and log the start of a command with its flags.
-
-        Errors as `input_files`.
-        """
+        """Write config.yaml, hash what the run reads and log the start of a command; errors as `input_files`."""
         self.write_text_file("config.yaml", dump_config(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files(run).items()}
         origins = list(run.key_locations.values())
@@ -72,10 +63,7 @@ class RunFolder:
         self.log_event("start", command=words[0], versions=software_and_plugin_versions(), inputs=self.input_hashes)
 
     def write_result(self, result: Mapping[str, Any], name: str = "result.json") -> dict[str, Any]:
-        """Write a result with command, date, inputs and versions; returns what was written.
-
-        Infinities become null, and `notes` says where.
-        """
+        """Write a result with command, date, inputs and versions; infinities become null, and `notes` says where."""
         made = {"command": self._command_line, "date": local_time_text(), "inputs": self.input_hashes}
         notes: list[str] = []
         clean: dict[str, Any] = to_json_types({**result, **made, "versions": software_and_plugin_versions()}, notes)
@@ -130,12 +118,8 @@ def atomic_run_folder(run: RunSettings, out: str | Path | None = None, command: 
 
     The name is reserved first: two runs never write to one folder, and a run that ends finds its name free. What
     killed runs left beside it is cleared away. `OutputError` where the folder exists and is not empty, another run is
-    making it, or it cannot be made or written to.
-
-    Parameters
-    ----------
-    out : str or Path, optional
-        Its name; `NAME-COMMAND-YYYYmmdd-HHMMSS` in `output.runs_folder` when absent.
+    making it, or it cannot be made or written to. Its name is `out`, or `NAME-COMMAND-YYYYmmdd-HHMMSS` in
+    `output.runs_folder`.
     """
     stem = "-".join(filter(None, (run.name, command)))
     targets = _targets(run, out, stem)

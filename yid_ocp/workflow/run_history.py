@@ -95,10 +95,7 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
 
 
 def read_result_file(file: Path) -> dict[str, Any]:
-    """Contents of a result.json of whatever command.
-
-    `DataError` where it is not there, cannot be read, or is of an earlier version, whose keys had other names.
-    """
+    """Contents of a result.json of whatever command; `DataError` where it cannot be read or is of an old version."""
     if not is_file(file):
         hint = "give the run folder that `solve` or `diagnose` printed"
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), hint=hint)
@@ -113,10 +110,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
 
 
 def baseline_estimates(run: RunSettings) -> tuple[RunEstimates, ...]:
-    """Estimates of the runs listed in `diagnosis.baseline`, in that order.
-
-    Errors as `read_estimates`; `ConfigError` for a run of another model, or one that is given twice.
-    """
+    """Estimates of the runs in `diagnosis.baseline`; `ConfigError` for one of another model, or given twice."""
     found: list[RunEstimates] = []
     for i, folder in enumerate(run.diagnosis.baseline):
         where = ("diagnosis", "baseline", i)
@@ -202,11 +196,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
 
 
 def load_reference_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
-    """Reference recordings made without the sought effect, and a message where there are none.
-
-    Those of `recordings.reference_recordings`, else those on which the baseline was estimated and which it held out.
-    Errors as `read_recordings`, of those that the settings name.
-    """
+    """Recordings made without the sought effect, those of the settings or of the baseline; why there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.reference_recordings):
         file = resolve_recording_path(path)
