@@ -157,9 +157,7 @@ class ModelSettings:
     ] = 0.05
     friction: Annotated[FrictionSettings | None, OptionInfo("of the joints, its amplitudes and damping free")] = None
     gravity: Annotated[_Vector3, OptionInfo("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
-    points: Annotated[_Names | None, OptionInfo("frames that sensors may see, such as T1:40%; or segments' tips")] = (
-        None
-    )
+    points: Annotated[_Names | None, OptionInfo("frames that sensors may see, such as T1:40%; or the tips")] = None
     extra_meshes: Annotated[
         tuple[ExtraMesh, ...],
         OptionInfo("what a camera sees and the URDF does not have: a gripper's body, a table; `track` leaves it out"),
@@ -211,9 +209,7 @@ class ImportSettings:
     torque_constants: Annotated[
         Mapping[str, float] | None, OptionInfo("by joint or pattern, where effort is a motor's current", "N m/A")
     ] = None
-    gears: Annotated[
-        Mapping[str, float] | None, OptionInfo("turns of the motor per turn of a joint or pattern; or 1")
-    ] = None
+    gears: Annotated[Mapping[str, float] | None, OptionInfo("motor turns per turn of a joint, pattern; or 1")] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
     clock: Annotated[ClockKind | None, OptionInfo("of a table: whether its times were measured")] = None
     sensor: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
@@ -306,9 +302,7 @@ class TrackSettings:
 
     frames_path: Annotated[
         _FilePath | None,
-        OptionInfo(
-            "folder of clouds or depth images, bag, MCAP or RealSense file; a virtual frame sequence when absent"
-        ),
+        OptionInfo("folder of clouds or depth images, bag, MCAP or RealSense file; virtual frames when absent"),
     ] = None
     frame_topic: Annotated[str | None, OptionInfo("of clouds or depth images in a bag that has several")] = None
     camera_pose: Annotated[
@@ -318,9 +312,7 @@ class TrackSettings:
     length_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("of the clouds, instead of the folder's")] = None
     background_frames: Annotated[
         _FilePath | None,
-        OptionInfo(
-            "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
-        ),
+        OptionInfo("frames of the scene without robot and object, by the same camera: left out of the others"),
     ] = None
     virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("filmed without frames")] = VirtualFramesSettings()
     keep_frames: Annotated[bool, OptionInfo("whether virtual frames are written to the run folder")] = False
@@ -361,9 +353,7 @@ class RunSettings:
     """Resolved settings of one run: all sections of its configuration file."""
 
     description: Annotated[str, OptionInfo("one sentence for the report")] = ""
-    plugins: Annotated[
-        tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they run")
-    ] = ()
+    plugins: Annotated[tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors")] = ()
     model: Annotated[ModelSettings, OptionInfo("what the world is made of")] = ModelSettings()
     recordings: Annotated[RecordingSettings, OptionInfo("the data")] = RecordingSettings()
     import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = ImportSettings()

@@ -81,9 +81,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
     return CommandResult(folder.path, written, None, not (run.recordings.strict and warnings))
 
 
-def _mechanics(
-    run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]
-) -> dict[str, dict[str, Any]]:
+def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:
     system = step.system
     theta, posture = system.parameters.vector(), np.zeros(system.n_coordinates)
     if problem is not None:

@@ -41,14 +41,12 @@ class CommandResult(Generic[Output]):
     is_successful: bool = True
 
 
-def command_with_settings(
-    work: Callable[..., CommandResult[Any]], *options: str
-) -> Callable[[argparse.Namespace], int]:
-    """A command that runs `work(settings, out, progress, ...)`, at the end the arguments that `options` names."""
+def command_with_settings(work: Callable[..., CommandResult[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
+    """A command that runs `work(settings, out, progress, ...)`, at the end the arguments of these names."""
 
     def run(arguments: argparse.Namespace) -> int:
         settings = load_config(arguments.config, arguments.overrides)
-        more = [getattr(arguments, name) for name in options]
+        more = [getattr(arguments, name) for name in names]
         return run_command_and_print(arguments, lambda shown: work(settings, arguments.out, shown, *more))
 
     return run

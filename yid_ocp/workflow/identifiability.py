@@ -205,16 +205,14 @@ class _IdentifiabilityTasks:
     common: Mapping[str, Any]
     progress: Progress
 
-    def with_profile_likelihoods(
-        self, information: IdentifiabilityResult, names: Sequence[str]
-    ) -> IdentifiabilityResult:
+    def with_profile_likelihoods(self, analysis: IdentifiabilityResult, names: Sequence[str]) -> IdentifiabilityResult:
         """The analysis with profile likelihoods of the named parameters, one task per parameter."""
         found = self._done(profile_likelihood_task, {name: {"name": name} for name in names})
-        parameters, profiles = dict(information.parameters), dict(information.profiles)
+        parameters, profiles = dict(analysis.parameters), dict(analysis.profiles)
         for name, told in zip(names, found, strict=True):
             parameters[name] = dataclass_from_plain_data(fisher.ParameterIdentifiability, told["parameter"])
             profiles[name] = dataclass_from_plain_data(ParameterProfileLikelihood, told["profile"])
-        return replace(information, parameters=parameters, profiles=profiles)
+        return replace(analysis, parameters=parameters, profiles=profiles)
 
     def evaluate_change_sets(
         self, sets: Sequence[Sequence[what_if.ExperimentChange]], inflation: float

@@ -15,7 +15,7 @@ from yid_ocp.data import Recording, preview_file, read_any, write_recording
 from yid_ocp.data.readers.base import parse_quantity_units
 from yid_ocp.errors import ConfigError
 from yid_ocp.files import attributes_to_json
-from yid_ocp.progress import NULL_PROGRESS, Progress
+from yid_ocp.progress import Progress
 from yid_ocp.report.terminal import recording_summary_lines, third_party_file_summary_lines
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
 
@@ -66,9 +66,7 @@ def recording_contents_summary(recording: Recording) -> dict[str, Any]:
     return {"duration": recording.duration, "groups": groups, "notes": list(recording.notes)}
 
 
-def read_third_party_recording(
-    file: str | Path, options: Mapping[str, Any], progress: Progress = NULL_PROGRESS
-) -> Recording:
+def read_third_party_recording(file: str | Path, options: Mapping[str, Any], progress: Progress) -> Recording:
     """Recording read from a file of another tool, the file's hash in `source`; options and errors as `read_any`."""
     progress.begin_stage(f"reading {file}")
     recording = read_any(file, progress=progress, **options)

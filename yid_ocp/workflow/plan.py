@@ -35,8 +35,6 @@ from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_rec
 
 _EFFORT_STD, _POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
 _MAX_DISCRIMINATED_EFFECTS = 3  # effects that one motion is asked to separate, the likeliest ones
-
-
 _Plan = TargetMotionPlan | InformativeMotionPlan
 
 
@@ -227,22 +225,18 @@ def parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, fl
 
 def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> dict[str, Any]:
     """Entries of `yid-plan/1` for an informative motion."""
-    stds = "std_relative_before=std_recorded std_relative_after=std_planned std_relative_together=std_combined"
+    stds = "std_relative_before=std_recorded std_relative_after=std_planned std_relative_together=std_combined verdict"
+    rest = "unseen=unobservable_parameters open=unidentifiable_directions"
     starts = "first=initial_criterion value=final_criterion judged=configured_criterion finished=is_converged"
     return {
         **attributes_to_json(run.plan, "inform=identify separate=discriminate"),
-        "parameters": {
-            name: attributes_to_json(known, f"{stds} verdict") for name, known in found.parameter_precisions.items()
-        },
+        "parameters": {name: attributes_to_json(own, stds) for name, own in found.parameter_precisions.items()},
         "distances": [
             {"effect": first, "explained_by": second, "before": before, "after": after}
             for (first, second), (before, after) in found.effect_distances.items()
         ],
         "starts": [attributes_to_json(start, f"{starts} rounds=n_iterations") for start in found.start_results],
-        "best": found.best_start_index,
-        "limits_reached": {what: list(names) for what, names in found.active_limits.items()},
-        "unseen": dict(found.unobservable_parameters),
-        "open": list(found.unidentifiable_directions),
+        **attributes_to_json(found, f"best=best_start_index limits_reached=active_limits {rest}"),
     }
 
 

@@ -234,9 +234,7 @@ def write_solve_trajectories(
                 _store_sensor(group, episode, samples, {"predicted": predicted})
 
 
-def write_diagnosis_trajectories(
-    path: Path, finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]
-) -> None:
+def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, pairs: Sequence[HeldOutPredictionPair]) -> None:
     """Write held-out predictions and smoothed unknowns as `yid-diagnosis-trajectories/1`.
 
     `RECORDING/GROUP/` for every held-out recording: `t` (M,) [s], `measured`, `before`, `after`, `std` (M, k) and the
@@ -255,7 +253,7 @@ def write_diagnosis_trajectories(
     """
     with create_hdf5_atomically(path) as file:
         file.attrs["format"] = DIAGNOSIS_TRAJECTORIES_FORMAT
-        for episode, before, after in predicted:
+        for episode, before, after in pairs:
             for k, samples in enumerate(episode.measurements):
                 both = {"before": before.predicted_outputs[k], "after": after.predicted_outputs[k]}
                 _store_sensor(file.require_group(episode.name), episode, samples, both)

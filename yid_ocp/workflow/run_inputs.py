@@ -80,20 +80,18 @@ def _run(path: Path, digest: str) -> None:
 
 
 @contextlib.contextmanager
-def _registering(
-    name: str, where: str, hint: str, path: Path | None = None, nothing_new: bool = False
-) -> Iterator[None]:
+def _registering(name: str, where: str, hint: str, path: Path | None = None, known: bool = False) -> Iterator[None]:
     """Say what is wrong with a plug-in that the block runs, and forget what it registered until then."""
     before = [set(registry) for registry in _REGISTRIES]
     try:
         yield
-        unchanged = all(set(registry) == known for registry, known in zip(_REGISTRIES, before, strict=True))
-        if unchanged and not nothing_new:
+        unchanged = all(set(registry) == names for registry, names in zip(_REGISTRIES, before, strict=True))
+        if unchanged and not known:
             allowed = "a class or function under @EFFECTS.register(NAME) or @SENSOR_READERS.register(NAME)"
             raise ConfigError(f"the {name} registers nothing", where=where, allowed=allowed)
     except (Exception, SystemExit) as error:
-        for registry, known in zip(_REGISTRIES, before, strict=True):
-            registry.unregister(set(registry) - known)
+        for registry, names in zip(_REGISTRIES, before, strict=True):
+            registry.unregister(set(registry) - names)
         if isinstance(error, YidError):
             what = f"the {name} cannot be used: {error.what}" if error.where != where else error.what
             raise ConfigError(what, where=where, allowed=error.allowed, hint=error.hint or hint) from error

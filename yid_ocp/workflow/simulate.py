@@ -23,6 +23,7 @@ from yid_ocp.workflow.prediction_outputs import predicted_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import read_recordings
 
+_Made = tuple[Recording | str, list[Animation]]
 _DEFAULT_DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]
 
 
@@ -71,9 +72,7 @@ def run_simulate(
 run = command_with_settings(run_simulate, "seed", "noise")
 
 
-def _virtual(
-    run: RunSettings, system: System, progress: Progress, seed: int
-) -> tuple[Recording | str, list[Animation]]:
+def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) -> _Made:
     from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
@@ -92,9 +91,7 @@ def _virtual(
     return made, [] if alone is None else [alone]
 
 
-def _predicted(
-    run: RunSettings, system: System, progress: Progress, seed: int | None
-) -> tuple[Recording | str, list[Animation]]:
+def _predicted(run: RunSettings, system: System, progress: Progress, seed: int | None) -> _Made:
     progress.begin_stage("building the model and its compiled step")
     step = build_step(run, system)
     recordings = read_recordings(run, count=1)
