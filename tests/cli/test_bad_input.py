@@ -135,8 +135,7 @@ def test_a_truncated_recording(cli, pendulum, pendulum_data, tmp_path, left_noth
     whole = (pendulum_data.folder / "estimate.h5").read_bytes()
     for name, content in (("half.h5", whole[: len(whole) // 2]), ("text.h5", b"time,angle\n0,0\n"), ("empty.h5", b"")):
         (tmp_path / name).write_bytes(content)
-        done = cli("solve", pendulum, "--set", f"recordings.estimate=[{name}]")
-        assert_refused(done, name)
+        assert_refused(cli("solve", pendulum, "--set", f"recordings.estimate=[{name}]"), name)
     left_nothing()
 
 
@@ -156,8 +155,7 @@ def test_a_grasp_of_an_unknown_frame(cli, tmp_path, monkeypatch, repository):
     config = repository / "configs" / "single_arm_no_vision.yaml"
     done = cli("solve", config, "--set", "model.grasp.left.holder_frame=left_griper")
     assert_refused(done, "there is no frame 'left_griper'", "did you mean 'left_gripper'?")
-    done = cli("solve", config, "--set", "model.object={kind: z}")
-    assert_refused(done, "there is no kind 'z'", "y, segments")
+    assert_refused(cli("solve", config, "--set", "model.object={kind: z}"), "there is no kind 'z'", "y, segments")
 
 
 @pytest.mark.parametrize("command", ["solve", "check", "inspect", "simulate"])

@@ -128,5 +128,4 @@ def test_a_model_that_does_not_explain_its_recordings_is_said_first_by_all(carri
     result = done.result
     own = result["methods"]["gauss_newton"] if command == "compare" else result
     assert own["fit"]["explains"] is False
-    verdicts = {entry["verdict"] for entry in own["parameters"].values()} - {"fixed"}
-    assert verdicts == {"not_trusted"}
+    assert {entry["verdict"] for entry in own["parameters"].values()} - {"fixed"} == {"not_trusted"}

@@ -125,8 +125,7 @@ def test_sections_are_what_their_users_take(written):
 
 def test_no_section_repeats_the_options_of_another_package():
     for section, options in ((ProblemSettings, ProblemOptions), (DiagnosisSettings, Thresholds), (Cable, CableOptions)):
-        own = section.__annotations__
-        assert not set(own) & {field.name for field in dataclasses.fields(options)}
+        assert not set(section.__annotations__) & {field.name for field in dataclasses.fields(options)}
 
 
 def test_an_empty_file_is_all_defaults(written):

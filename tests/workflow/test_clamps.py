@@ -63,8 +63,7 @@ def settings(folder, recording=None, overrides=()):
 
 
 def test_a_marker_sits_where_straight_says_in_the_frame_that_carries_it(tmp_path):
-    run = settings(tmp_path)
-    system = build_system(run)
+    system = build_system(settings(tmp_path))
     found = [system.parameters[f"mark.{axis}"].value for axis in "xyz"]
     # the link's z axis is the world's x, its x axis looks down
     assert found == pytest.approx([-0.02, 0.0, 0.0], abs=1e-9)
@@ -152,8 +151,7 @@ def test_a_baseline_is_a_joint_prior_about_its_values(tmp_path):
     moved[at] += [3e-4, -1e-6]
     residual, rows = problem.prior_residual_and_jacobian(moved)
     apart = moved[at] - problem.initial_unknowns[at]
-    expected = apart @ np.linalg.solve(known.covariance, apart)
-    assert residual @ residual == pytest.approx(expected, rel=1e-9)
+    assert residual @ residual == pytest.approx(apart @ np.linalg.solve(known.covariance, apart), rel=1e-9)
     assert rows @ (moved - problem.initial_unknowns) == pytest.approx(residual, rel=1e-9)
 
 

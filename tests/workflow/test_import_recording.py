@@ -121,8 +121,7 @@ def test_a_bad_import_says_what_is_wrong_and_writes_nothing(
     if text is not None:
         (tmp_path / name).write_text(text)
     before = sorted(entry.name for entry in tmp_path.iterdir())
-    words = ["import", name] if flags == "--out" else ["import", name, "--out", "made.h5", *flags.split()]
-    assert main(words) == 2
+    assert main(["import", name] if flags == "--out" else ["import", name, "--out", "made.h5", *flags.split()]) == 2
     told = capsys.readouterr().err
     first, *more = (line for line in told.strip().splitlines() if not line.startswith("reading "))
     assert first.startswith("error: ")

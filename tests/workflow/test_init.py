@@ -128,8 +128,7 @@ def test_several_recordings_are_split_and_a_rest_splits_one(bench: Path) -> None
 
 @pytest.mark.parametrize("parts", [(0.5, 1.0), ()], ids=["joints and points", "joints alone"])
 def test_a_start_in_motion_is_estimated(parts: Sequence[float], bench: Path) -> None:
-    run = proposed(moved(SHORT, parts=parts, effort=True, moving=True))
-    assert run.problem.initial_state == "estimated"
+    assert proposed(moved(SHORT, parts=parts, effort=True, moving=True)).problem.initial_state == "estimated"
 
 
 def test_efforts_alone_bring_zeros_and_friction_of_the_arm(bench: Path) -> None:

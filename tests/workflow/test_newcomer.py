@@ -240,15 +240,13 @@ def test_a_rod_on_an_arm_of_servos(desk: Path) -> None:
         carried_out(f"{bag.stem}.h5", "import", str(bag), "--command-topic", "/joint_commands", "--sensor", "mocap")
     carried_out("rod.yaml", "init", "default:servo_arm.urdf", "run_3.h5", "run_4.h5", *ROD_NUMBERS)
     assert load_config("rod.yaml").model.arms.mode == "servo"
-    checked = carried_out("checked", "check", "rod.yaml")
-    assert not checked["doubts"]
+    assert not carried_out("checked", "check", "rod.yaml")["doubts"]
     solved = carried_out("solved", "solve", "rod.yaml")
     check_truth(solved, SERVO.truth)
     for name, value in SERVOS.items():
         found = solved["parameters"][name]
         assert abs(found["value"] - value) < max(2 * found["std"], 0.02 * value), (name, found)
-    told = carried_out("diagnosed", "diagnose", "rod.yaml")
-    assert told["verdict"] == "no_gap"
+    assert carried_out("diagnosed", "diagnose", "rod.yaml")["verdict"] == "no_gap"
     assert main(["export", "solved", "--out", "rod.xml"]) == 0
     manifest = json.loads(Path("rod.xml.manifest.json").read_text())
     assert manifest["parameters"]["lift.servo_gain"]["status"] == "native"

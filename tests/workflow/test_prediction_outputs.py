@@ -34,8 +34,7 @@ from yid_ocp.workflow.prediction_outputs import (
 
 def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
     problem, solution, held_out = solved_pendulum
-    unpredicted = [(held_out[0][0], "step 3 did not converge")]
-    write_solve_trajectories(tmp_path / "t.h5", problem, solution, unpredicted)
+    write_solve_trajectories(tmp_path / "t.h5", problem, solution, [(held_out[0][0], "step 3 did not converge")])
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-trajectories/1"
         assert list(file["unknowns"].attrs["names"]) == list(solution.unknown_names)
@@ -164,8 +163,7 @@ def simulated(problem, seeds):
 
 
 def test_simulated_torques_are_wrong_as_the_estimation_expects_and_say_so(step):
-    problem = problem_of(step)
-    exact, *wrong = simulated(problem, [None, *range(60)])
+    exact, *wrong = simulated(problem_of(step), [None, *range(60)])
     errors = np.array([(joints.effort - exact.effort)[:, 0] for joints in wrong])
     # for 60 draws a standard deviation is good to a tenth of itself
     assert errors.mean(axis=1).std() == pytest.approx(OFFSET, rel=0.3)
@@ -242,6 +240,5 @@ def test_a_held_out_recording_that_a_guess_predicts_better_withholds_trust(
     result = done.result
     assert result["fit"]["believed"] is believed
     assert [doubt["cause"] for doubt in result["doubts"]] == ([] if believed else ["worse_than_guess"])
-    verdict = result["parameters"]["shoulder.stiffness"]["verdict"]
-    assert verdict == ("identifiable" if believed else "not_trusted")
+    assert result["parameters"]["shoulder.stiffness"]["verdict"] == ("identifiable" if believed else "not_trusted")
     assert ("a prediction without a model is nearer" in done.out) is not believed

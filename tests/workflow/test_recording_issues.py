@@ -21,8 +21,7 @@ def damaged(pendulum_data, tmp_path):
     """Write the pendulum's recording after a change, and its configuration; returns the configuration's file."""
 
     def write(change=lambda recording: recording):
-        recording = change(read_recording(pendulum_data.folder / "estimate.h5"))
-        write_recording(recording, tmp_path / "damaged.h5")
+        write_recording(change(read_recording(pendulum_data.folder / "estimate.h5")), tmp_path / "damaged.h5")
         text = pendulum_data.text.replace(str(pendulum_data.folder / "estimate.h5"), "damaged.h5")
         file = tmp_path / "run.yaml"
         file.write_text(text)

@@ -51,8 +51,7 @@ log = logging.getLogger(__name__)
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    given = arguments.configs or [None]
-    runs = [load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG) for path in given]
+    runs = [load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG) for path in arguments.configs or [None]]
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
         runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG))
     workers = workers_from_arguments(arguments) or LOCAL_WORKER_CONFIG

@@ -161,8 +161,7 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
         what = f"a {kind}'s lengths come from recordings"
         raise run.config_error(what, "recordings", "estimate", hint="list at least one")
     with add_setting_location_to_errors(run, "model", "object"):
-        lengths = median_point_pair_distances(item.topology().edges, recordings)
-        return item.clamped_system(lengths, run.model.gravity)
+        return item.clamped_system(median_point_pair_distances(item.topology().edges, recordings), run.model.gravity)
 
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:

@@ -138,8 +138,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None
         theta = problem.predictor.theta_with_episode_values(episode, problem.theta)
-        solver = problem.model_functions.equilibrium_solver
-        rest = solver.solve(episode.initial_known_coordinates, theta, torque)
+        rest = problem.model_functions.equilibrium_solver.solve(episode.initial_known_coordinates, theta, torque)
         entry["equilibrium"] = {"found": rest.is_converged, "imbalance": rest.max_imbalance, "message": rest.message}
         if not rest.is_converged:
             warnings.append(f"{episode.name}: {rest.message} with the initial parameters")

@@ -363,8 +363,7 @@ def _poses(tree: Mechanism, recording: Recording, frame: str, t: Array) -> Array
     pose = forward_kinematics(tree.with_numeric_values(), q).frame_pose(frame).homogeneous_matrix()
     columns = [group.names.index(name) for name in tree.joint_names]
     angles = np.stack([np.interp(t, group.t, group.position[:, j]) for j in columns])
-    flat = np.array(ca.Function("pose", [q], [pose]).map(len(t))(angles))
-    return flat.reshape(4, len(t), 4).transpose(1, 0, 2)
+    return np.array(ca.Function("pose", [q], [pose]).map(len(t))(angles)).reshape(4, len(t), 4).transpose(1, 0, 2)
 
 
 # -- noise and rates --------------------------------------------------------------------------------------------------
@@ -378,8 +377,7 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
         if values is not None:
             noise = _GroupNoise(None, unit, _STATED_NOISE)
             if getattr(recorded, f"{channel}_std") is None:
-                size = max(least, *(_size(recorded.t, values[:, j]) for j in at))
-                noise = _GroupNoise(size, unit, _SEEN_NOISE)
+                noise = _GroupNoise(max(least, *(_size(recorded.t, values[:, j]) for j in at)), unit, _SEEN_NOISE)
             found[f"joints.{channel}"] = noise
     return found | {group.name: _point_noise(group) for group in recording.points}
 

@@ -130,8 +130,7 @@ def _read_calibrated_model(folder: Path) -> _CalibratedModel:
         raise DataError("the result has no parameters", where=where, hint="run it again") from error
     nominal = load_config(folder / "config.yaml")
     std = {name: entry.get("std") for name, entry in parameters.items() if entry.get("free")}
-    effects = run_history.effect_parameter_values_by_label(values)
-    whole = run_history.settings_with_effect_values(nominal, effects)
+    whole = run_history.settings_with_effect_values(nominal, run_history.effect_parameter_values_by_label(values))
     return _CalibratedModel(whole, nominal, values, std)
 
 

@@ -56,8 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
         return Path(os.path.relpath(Path(path).resolve(), out.parent.resolve())).as_posix()
 
     files, where = list(map(near, made)), robot if robot.startswith(("package:", "default:")) else near(robot)
-    imports = reader_options_from_arguments(arguments)
-    lines = _config_lines(where, arguments.object, item, proposal, files, imports)
+    lines = _config_lines(where, arguments.object, item, proposal, files, reader_options_from_arguments(arguments))
     _write(out, "\n".join(lines) + "\n", written)
     result = {"format": "yid-init/1", "configuration": str(out), "recordings": files, "proposal": proposal.to_dict()}
     print_result(arguments, result, lambda: _summary_lines(proposal, out), f"configuration: {out}", str(out))

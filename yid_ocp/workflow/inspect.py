@@ -197,8 +197,7 @@ def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> dic
         problem.predictor.estimated_initial_state_indices,
     )
     steps = [entry.grid.steps for entry in problem.episodes]
-    kkt = step_diagnostics.kkt_sparsity_pattern(stage, min(_SHOWN_STEPS, *steps))
-    draw_sparsity_patterns(picture, [[kkt]])
+    draw_sparsity_patterns(picture, [[step_diagnostics.kkt_sparsity_pattern(stage, min(_SHOWN_STEPS, *steps))]])
     left_out = [*(sensor.group_name for sensor in sensors if sensor.effort_joints), *problem.local_parameters]
     return {**step_diagnostics.full_nlp_size(stage, steps), "left_out": left_out}
 

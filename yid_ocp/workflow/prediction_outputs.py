@@ -274,8 +274,7 @@ def write_diagnosis_trajectories(path: Path, finding: DiagnosisResult, pairs: Se
         for force in finding.events.force_estimates:
             group = file.create_group(f"events/{force.recording}/{force.coordinate}")
             group.attrs["unit"] = force.unit
-            arrays = {"t": force.t, "value": force.max_likelihood_forces, "allowed": force.allowed_model_error}
-            _store(group, arrays)
+            _store(group, {"t": force.t, "value": force.max_likelihood_forces, "allowed": force.allowed_model_error})
 
 
 def _store_sensor(parent: h5py.Group, episode: Episode, samples: Measurements, predicted: Mapping[str, Array]) -> None:

@@ -166,8 +166,7 @@ def _prediction_errors(
         residuals = rmse_by_channel([result for result, _ in able], [episode for _, episode in able])
         pairs += fitted
     units = {channel: entry["unit"] for channel, entry in residuals.items()}
-    entry = prediction_outputs.prediction_error_entry
-    return [entry(problem, *pair, cable) for pair in pairs], units, residuals
+    return [prediction_outputs.prediction_error_entry(problem, *pair, cable) for pair in pairs], units, residuals
 
 
 def discretisation_shift_results(

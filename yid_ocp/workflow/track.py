@@ -253,11 +253,9 @@ def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tu
         experiment = VirtualExperiment(simulation=simulation, camera=None, seed=seed, **named)
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
         recording = record_simulation(system, None, experiment, truth)
-        late = (settings.latency, settings.latency_std)
-        timing = FrameTiming(settings.frame_rate, settings.dropped_fraction, *late)
+        timing = FrameTiming(settings.frame_rate, settings.dropped_fraction, *(settings.latency, settings.latency_std))
         pose = look_at_pose(settings.camera_position, settings.camera_target)
-        depth = DepthCamera(outlier_probability=settings.outlier_fraction)
-        camera = VirtualCamera(pose, depth, timing, seed=seed)
+        camera = VirtualCamera(pose, DepthCamera(outlier_probability=settings.outlier_fraction), timing, seed=seed)
         made = render_virtual_frames(camera_scene(run, system), truth.t, truth.q, camera)
     return recording, made
 
