@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -12,8 +13,18 @@ import pytest
 from made_models import estimate, solution
 
 from yid_ocp.analysis import compare as module
-from yid_ocp.analysis.compare import compare_methods
+from yid_ocp.analysis.compare import (
+    _PAPER_PARAMETERS,
+    _TRUTH_EXPERIMENT,
+    PAPER_ESTIMATES,
+    _load_torque_ensemble,
+    compare_methods,
+    decide_cable_memory,
+    explain_paper_estimates,
+    is_within_ensemble_range,
+)
 from yid_ocp.cli import main
+from yid_ocp.model.objects.cable import START_SPEED_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, SingleShooting, Status, SteepestDescent
 
@@ -115,9 +126,6 @@ def test_wrong_methods_are_refused(repository, tmp_path, capsys, methods):
     assert main(arguments) == 2
     assert "compare.methods" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-
-
-# -- with made-up solutions -------------------------------------------------------------------------------------------
 
 
 class Problem:
@@ -297,3 +305,242 @@ def test_the_peak_of_memory_is_what_was_used_in_between(compared, monkeypatch):
     found = compare_methods(Problem(), [SimpleNamespace(name="one")])
     assert 150 < found.method_results[0].peak_memory_mib - plain < 300
     assert found.method_results[0].wall_seconds > 0.1
+
+
+def test_the_papers_answers():
+    """Tables of the source paper [N m/rad], thousandths as whole numbers."""
+    told = {name: [round(1000 * value) for value in values.values()] for name, values in PAPER_ESTIMATES.items()}
+    assert told == {
+        "single_arm_no_vision": [23780, 0, 18357, 11103, 3200, 3059],
+        "single_arm_vision": [22270, 13593, 10735, 8202, 11511, 9692],
+        "dual_arm_no_vision": [19559, 4965, 8575, 10374, 0, 11287],
+        "dual_arm_vision": [24840, 0, 12373, 30775, 1406, 24900],
+    }
+    for values in PAPER_ESTIMATES.values():
+        assert tuple(values) == ("T1.bend", "T1.twist", "T2.bend", "T2.twist", "T3.bend", "T3.twist")
+
+
+def test_the_ensemble_covers_every_published_value():
+    found = _load_torque_ensemble()
+    assert set(found) == set(PAPER_ESTIMATES)
+    for by_errors in found.values():
+        assert {"none", "offsets"} <= set(by_errors)
+        for values in by_errors.values():
+            assert tuple(values) == _PAPER_PARAMETERS
+            assert all(np.all(np.isfinite(members)) and min(members) >= 0 for members in values.values())
+        assert {len(members) for members in by_errors["offsets"].values()} == {len(by_errors["offsets"]["T1.bend"])}
+        assert len(by_errors["offsets"]["T1.bend"]) >= 4
+        # a point grasp hides these from any torque, so that no search moves them
+        for name in ("T2.twist", "T3.twist"):
+            assert by_errors["offsets"][name] == pytest.approx([3.0] * len(by_errors["offsets"][name]), abs=0.2)
+
+
+@pytest.mark.parametrize(("least", "expected"), [(0.04, True), (0.06, False)])
+def test_a_published_zero_is_explained_by_members_at_the_bound(least, expected):
+    assert is_within_ensemble_range(0.0, [least, 5.0]) is expected
+
+
+FOUND, LOST = estimate(10.0), estimate(10.0, math.inf, "not_identifiable")
+WEAK = estimate(10.0, 2.0, "weak")
+OPEN = replace(WEAK, interval=(8.0, None))
+
+
+@pytest.mark.parametrize(
+    ("published", "entry", "truth", "stopped", "expected"),
+    [
+        (99.0, LOST, 10.0, 5.0, "not informed"),
+        (10.0, LOST, 10.0, 5.0, "not informed"),
+        (13.9, WEAK, 10.0, 5.0, "not informed"),
+        (14.1, WEAK, 10.0, 5.0, "unexplained"),
+        (13.9, FOUND, 10.0, 5.0, "torque error"),
+        (99.0, OPEN, 10.0, 5.0, "hardly informed"),
+        (7.9, OPEN, 10.0, 5.0, "torque error"),
+        (9.0, FOUND, 10.0, 5.0, "near the truth"),
+        (11.0, FOUND, 10.0, 5.0, "near the truth"),
+        (8.9, FOUND, 10.0, 5.0, "torque error"),
+        (3.0, FOUND, 10.0, 5.0, "slow"),
+        (5.5, FOUND, 10.0, 5.0, "slow"),
+        (5.6, FOUND, 10.0, 5.0, "unexplained"),
+        (2.9, FOUND, 10.0, 5.0, "unexplained"),
+        (4.0, FOUND, 10.0, 9.1, "unexplained"),
+        (6.0, FOUND, 10.0, 8.0, "slow"),
+        (2.5, FOUND, 1.0, 2.0, "slow"),
+        (10.0, FOUND, None, 5.0, "torque error"),
+        (4.0, FOUND, None, 5.0, "unexplained"),
+    ],
+)
+def test_why_a_published_value_is_what_it_is(monkeypatch, published, entry, truth, stopped, expected):
+    """Of descents that start at 3, stop where it says, and end between 6 and 14 with errors of the torques."""
+    monkeypatch.setitem(PAPER_ESTIMATES, "made up", {"T1.bend": published})
+    ensemble = {"made up": {"none": {"T1.bend": [stopped]}, "offsets": {"T1.bend": [6.0, 14.0]}}}
+    monkeypatch.setattr(module, "_load_torque_ensemble", lambda: ensemble)
+    [said] = explain_paper_estimates("made up", {"T1.bend": entry}, {} if truth is None else {"T1.bend": truth})
+    assert said.startswith(f"T1.bend = {published:.4g} of the paper: {expected}")
+
+
+PAPER_TRUTH = dict(zip(_PAPER_PARAMETERS, (22.0, 13.6, 10.7, 8.2, 11.5, 9.7), strict=True))
+
+
+def judged(**verdicts):
+    """Found at the truth, but for some."""
+    made = {name: estimate(value) for name, value in PAPER_TRUTH.items()}
+    return made | {name.replace("_", "."): entry for name, entry in verdicts.items()}
+
+
+def test_each_published_value_has_one_sentence():
+    for experiment, values in PAPER_ESTIMATES.items():
+        said = explain_paper_estimates(experiment, judged(T2_twist=LOST, T3_twist=LOST), PAPER_TRUTH)
+        assert [text.split(" = ")[0] for text in said] == list(_PAPER_PARAMETERS)
+        for text, value in zip(said, values.values(), strict=True):
+            assert f" = {value:.4g} of the paper: " in text
+        assert all("not informed; in such an experiment it cannot be found" in said[i] for i in (3, 5))
+
+
+def test_the_truth_was_chosen_from_one_answer_and_this_is_said():
+    assert all(0 not in values.values() for name, values in PAPER_ESTIMATES.items() if name == _TRUTH_EXPERIMENT)
+    assert all(0 in values.values() for name, values in PAPER_ESTIMATES.items() if name != _TRUTH_EXPERIMENT)
+    assert all(
+        "which was chosen from it" in text for text in explain_paper_estimates(_TRUTH_EXPERIMENT, judged(), PAPER_TRUTH)
+    )
+    other = explain_paper_estimates("single_arm_no_vision", judged(), PAPER_TRUTH)
+    assert other[0] == "T1.bend = 23.78 of the paper: near the truth of these recordings, 22"
+    elsewhere = explain_paper_estimates(
+        _TRUTH_EXPERIMENT, judged(), {name: 1.05 * value for name, value in PAPER_TRUTH.items()}
+    )
+    assert not any("chosen" in text for text in elsewhere)
+
+
+def test_weak_parameters_are_said_with_their_interval():
+    said = explain_paper_estimates(
+        "single_arm_no_vision", judged(T3_bend=replace(OPEN, interval=(0.84, None))), PAPER_TRUTH
+    )
+    assert said[4].endswith(
+        "hardly informed; in such an experiment it is weakly determined, above 0.84, where the value lies"
+    )
+    said = explain_paper_estimates(
+        "single_arm_no_vision", judged(T1_twist=replace(OPEN, interval=(8.65, 109.7))), PAPER_TRUTH
+    )
+    assert said[1].startswith(
+        "T1.twist = 0 of the paper: unexplained; such recordings leave 8.65 to 109.7 open and not this, it is not slow"
+    )
+
+
+def test_nothing_is_said_where_the_recordings_are_not_explained_or_a_parameter_is_not_free():
+    assert (
+        explain_paper_estimates(_TRUTH_EXPERIMENT, judged(T1_bend=estimate(1.0, 1.0, "not_trusted")), PAPER_TRUTH) == ()
+    )
+    fixed = estimate(10.7, 0.0, "fixed", free=False)
+    assert len(explain_paper_estimates(_TRUTH_EXPERIMENT, judged(T2_bend=fixed), PAPER_TRUTH)) == 5
+    assert len(explain_paper_estimates(_TRUTH_EXPERIMENT, {"T1.bend": FOUND, "else": FOUND}, PAPER_TRUTH)) == 1
+
+
+class Means:
+    """One unknown measured once by every recording, and the memory of one branch; without it predictions are off."""
+
+    def __init__(self, values, speeds, names=("k", "a.memory"), off=0.0):
+        self.values, self.unknown_names, self.off = np.array(values, float), names, off
+        self.shared_parameters = self.free = names
+        self.episodes = [self._episode(value, speed) for value, speed in zip(values, speeds, strict=True)]
+        self.residual_rows = SimpleNamespace(measurements=[(slice(i, i + 1),) for i in range(len(values))])
+        self.bounds = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+        self.unknown_scales = np.full(len(names), 100.0)
+        self.predictor = SimpleNamespace(
+            predict_episode=lambda episode, theta, offset, _: SimpleNamespace(predicted_outputs=(np.array([theta]),))
+        )
+
+    @staticmethod
+    def _episode(value, speed):
+        samples = SimpleNamespace(whitened_residual=lambda predicted: predicted - value, n_residuals=1)
+        start = None if speed is None else SimpleNamespace(fitted_parameters={START_SPEED_PARAMETER_NAME: speed})
+        return SimpleNamespace(measurements=(samples,), fixed_initial_state=start)
+
+    def split(self, x, i):
+        return float(x[0]) + (0.0 if "a.memory" in self.unknown_names else self.off), None
+
+    def evaluate(self, x, equilibrium_guesses=None):
+        jacobian = np.zeros((len(self.values), len(self.unknown_names)))
+        jacobian[:, 0] = 1.0
+        return SimpleNamespace(residual=x[0] - self.values, jacobian=jacobian, equilibrium_guesses=None)
+
+    def with_free_subset(self, names):
+        made = Means(self.values, [0.0] * len(self.values), tuple(names), self.off)
+        made.episodes, made.bounds = self.episodes, tuple(bound[:1] for bound in self.bounds)
+        return made
+
+    def with_parameter_values(self, values):
+        assert values == {"a.memory": 0.0}
+        return self
+
+    def vector(self, values):
+        return np.array([values[name] for name in self.unknown_names])
+
+
+def fitted(x, names=("k", "a.memory")):
+    return SimpleNamespace(
+        unknown_names=names, x=np.array(x, float), evaluation=SimpleNamespace(equilibrium_guesses=None)
+    )
+
+
+@pytest.fixture
+def solved(monkeypatch):
+    """Solves the problem without memory where it starts, and keeps it; `ok` is whether that succeeds."""
+    kept = SimpleNamespace(problems=[], ok=True)
+
+    def solve(problem, solver, start, limits):
+        kept.problems.append(problem)
+        return fitted(start, problem.unknown_names) if kept.ok else SimpleNamespace(evaluation=None)
+
+    monkeypatch.setattr(module, "solve", solve)
+    return kept
+
+
+@pytest.mark.parametrize(
+    ("names", "speeds"),
+    [(("k", "m"), (0.5, 0.5, 0.5)), (("k", "a.memory"), (0.0, None, 0.005))],
+    ids=["no memory", "all at rest"],
+)
+def test_nothing_is_asked_where_nothing_is_in_question(solved, names, speeds):
+    problem, found = Means((1.0, 2.0, 3.0), speeds, names), fitted((2.0, 0.5), names)
+    safe = decide_cable_memory(problem, None, found)
+    assert (safe.problem, safe.solution, safe.message, solved.problems) == (problem, found, "", [])
+
+
+def test_a_single_recording_in_motion_bears_nothing_out(solved):
+    safe = decide_cable_memory(Means((1.0, 2.0, 3.0), (0.5, 0.0, None)), None, fitted((2.0, 0.5)))
+    assert safe.problem is solved.problems[0]
+    assert (safe.problem.unknown_names, safe.solution.x.tolist()) == (("k",), [2.0])
+    assert "too few recordings start in motion" in safe.message
+
+
+@pytest.mark.parametrize(
+    ("off", "bounds", "at", "predicted", "kept"),
+    [
+        (1.0, (-np.inf, np.inf), 3.0, (4.0, 1.5), False),
+        (0.0, (-np.inf, np.inf), 10.0, (4.0, 1.5), False),
+        (-1.0, (-np.inf, np.inf), 3.0, (4.0, 1.5), True),
+        (0.0, (-np.inf, 3.0), 2.5, (3.0, 1.5), False),
+        (0.0, (2.0, np.inf), 2.5, (4.0, 2.0), False),
+    ],
+    ids=["worse with it", "no better", "better", "a bound above", "a bound below"],
+)
+def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
+    solved, off, bounds, at, predicted, kept
+):
+    """Each from the others alone: the first from a mean of 4, the last from 1.5, wherever the fit of all stands."""
+    problem, found = Means((1.0, 2.0, 6.0), (0.5, 0.0, 0.5), off=off), fitted((at, 0.5))
+    problem.bounds = tuple(np.array([bound, side]) for bound, side in zip(bounds, (0.0, 1.0), strict=True))
+    safe = decide_cable_memory(problem, None, found)
+    with_it, without = (
+        np.sqrt(((predicted[0] + more - 1.0) ** 2 + (predicted[1] + more - 6.0) ** 2) / 2) for more in (0.0, off)
+    )
+    assert (safe.problem is problem) is kept
+    assert f"memory is {'' if kept else 'not '}kept" in safe.message
+    assert f"{with_it:.3g} with it and {without:.3g} without" in safe.message
+
+
+def test_what_cannot_be_predicted_without_memory_keeps_it(solved):
+    problem, found = Means((1.0, 2.0, 3.0), (0.5, 0.2, 0.0)), fitted((2.0, 0.5))
+    problem.predictor.predict_episode = lambda *_: "it snaps"
+    assert "inf with it and" in decide_cable_memory(problem, None, found).message
+    solved.ok = False
+    assert decide_cable_memory(problem, None, found).solution is found

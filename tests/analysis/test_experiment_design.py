@@ -12,7 +12,9 @@ import pytest
 from heard import Heard
 from made_recordings import group, holding_pendulum, places, setting
 
+from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis import experiment_design as module
+from yid_ocp.analysis import torque_error_propagation as propagation
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
@@ -23,8 +25,12 @@ from yid_ocp.analysis.experiment_design import (
     add_observable_frames_to_step,
     observable_frames,
 )
+from yid_ocp.analysis.identifiability import identifiability
+from yid_ocp.analysis.what_if import what_if
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError
+from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.inference.whitening import problem_whitened_at, problem_without_input_errors
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
@@ -32,6 +38,7 @@ from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.measurements import TimeGrid
+from yid_ocp.workflow.build_problem import load_problem
 
 MARKER_DISTANCE = 0.03
 
@@ -39,9 +46,6 @@ MARKER_DISTANCE = 0.03
 @pytest.fixture(scope="module")
 def holding(urdf_folder):
     return holding_pendulum(urdf_folder)
-
-
-# -- what a recording saw ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -101,9 +105,6 @@ def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen
     np.testing.assert_array_equal(found[1].std, np.full((2, 3), 2e-3))
 
 
-# -- information ------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def sloped():
     """Three recordings whose frames move by random slopes; the prior is 7 of the first unknown."""
@@ -154,9 +155,6 @@ def test_views_add_up_over_frames_times_and_recordings(sloped):
         np.testing.assert_allclose(sloped.fisher_information(views), information(std))
 
 
-# -- what could be seen -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("links", "middle"), [(1, []), (2, ["T1_0_tip"]), (3, ["T1_1_tip"]), (4, ["T1_1_tip"])])
 def test_a_segment_has_a_tip_a_middle_and_a_marker(links, middle):
     tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
@@ -200,9 +198,6 @@ def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
     assert (marker.name, marker.description) == ("turn_marker", "a marker 3 cm off the axis of turn")
     wanted = MARKER_DISTANCE * np.array(beside) / np.linalg.norm(beside)
     np.testing.assert_allclose(places(system, [marker.added_frame], np.zeros(2))[0], wanted, atol=1e-12)
-
-
-# -- mechanics --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -350,9 +345,6 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
     assert ARM_GROUP in {points.name for points in made.problem.episodes[0].recording.points}
 
 
-# -- motions ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def driven(holding):
     """The pendulum's motors at work for a second, with narrow limits; the rod's middle seen."""
@@ -413,3 +405,159 @@ def test_another_motion_starts_where_the_recording_does(driven, monkeypatch, nam
     assert asked.excitation.gripper_travel == pytest.approx(factor * farthest)
     assert (asked.seed, asked.excitation.max_joint_speed) == (11, 1.4 * factor)
     assert asked.excitation.duration == pytest.approx(1.0)
+
+
+STEPS, NX, NU, READINGS = 30, 4, 2, 3
+
+
+@pytest.fixture
+def drawn_motion(monkeypatch):
+    """A made-up motion of two driven joints, torques recorded every other step: course, errors, readings' slopes."""
+    rng = np.random.default_rng(3)
+    steps = [
+        SimpleNamespace(
+            state_by_state=0.9 * np.linalg.qr(rng.standard_normal((NX, NX)))[0],
+            state_by_torque=rng.standard_normal((NX, NU)),
+        )
+        for _ in range(STEPS)
+    ]
+    monkeypatch.setattr(propagation, "linearized_steps", lambda *_: steps)
+    monkeypatch.setattr(propagation, "applied_torque_error_feedthrough", lambda gain, momentum: np.eye(NU))
+    monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
+    functions = SimpleNamespace(
+        step=None, momentum_shift=SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
+    )
+    feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
+    course = SimpleNamespace(
+        model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,
+        initial_state_by_angles=rng.standard_normal((NX, NU)), initial_state_by_torque=rng.standard_normal((NX, NU)),
+    )  # fmt: skip
+    errors = SimpleNamespace(
+        angle_std=np.ones(NU), torque_std=np.array([0.5, 0.2]), torque_bias_std=np.array([2.0, 0.0]),
+        encoder_noise_steps=1.0, sample_of_step=np.repeat(np.arange(STEPS // 2), 2),
+    )  # fmt: skip
+    return course, errors, rng.standard_normal((STEPS + 1, READINGS, NX)), steps
+
+
+def covariance(course, errors, slopes, steps):
+    """Of all readings, from every error by itself."""
+    columns = []
+    samples = errors.sample_of_step
+
+    def run(start, torque=None, angles=None):
+        state, found = start, [slopes[0] @ start]
+        for k, here in enumerate(steps):
+            pulled = here.state_by_torque @ course.tracking_feedback.gain[k]
+            moved = here.state_by_state @ state - pulled @ state[:2]
+            state = moved + here.state_by_torque @ torque[samples[k]] + pulled @ angles[k]
+            found.append(slopes[k + 1] @ state)
+        columns.append(np.ravel(found))
+
+    for joint in np.eye(NU):
+        none, still = np.zeros((STEPS // 2, NU)), np.zeros((STEPS, NU))
+        run(course.initial_state_by_angles @ joint, none, still)
+        bias = joint * errors.torque_bias_std
+        run(course.initial_state_by_torque @ bias, none + bias, still)
+        for i in range(len(none)):
+            white = np.array([joint * errors.torque_std * (i == k) for k in range(len(none))])
+            run(course.initial_state_by_torque @ white[0], white, still)
+        for k in range(STEPS):
+            run(np.zeros(NX), none, still + joint * (np.arange(STEPS) == k)[:, None])
+    return np.array(columns).T @ np.array(columns)
+
+
+@pytest.mark.parametrize("size", [1.0, 0.02])
+def test_few_unknowns_have_the_covariance_of_all(drawn_motion, size):
+    course, errors, slopes, steps = drawn_motion
+    few = propagation._low_rank_error_sensitivity(course, errors, size * slopes)
+    few = few.reshape(READINGS * (STEPS + 1), -1)
+    missing = covariance(course, errors, size * slopes, steps) - few @ few.T
+    assert few.shape[1] < len(few) if size < 1 else few.shape[1] <= len(few)
+    assert np.abs(np.linalg.eigvalsh(missing)).max() < 0.1**2
+
+
+@pytest.fixture(scope="module")
+def noisy(repository):
+    """One arm on a coarse Y, for a second; its torques have white noise and offsets."""
+    coarse = (
+        "model.object.links=1",
+        "problem.duration=1.0",
+        "problem.use_compiler=false",
+        "recordings.held_out=[]",
+        "parameters={}",
+        "parameters={T1.bend: {free: true, initial: 20}, T2.bend: {free: true, initial: 10}, T2.twist: {initial: 10}}",
+    )
+    return load_problem(repository / "configs" / "single_arm_vision.yaml", coarse)
+
+
+def half_without(problem, *groups):
+    """Half a second of a problem without some sensors."""
+    sensors = {**problem.options.sensors, **{name: SensorOptions(use=False) for name in groups}}
+    return problem.with_options(replace(problem.options, sensors=sensors, duration=0.5))
+
+
+def relative(problem):
+    return {name: entry.std_relative for name, entry in identifiability(problem).parameters.items()}
+
+
+@pytest.fixture(scope="module")
+def ranking(noisy):
+    return what_if(noisy, considered_changes=("rate:30",))
+
+
+def test_the_experiment_as_it_is_knows_the_noise_of_its_torques(noisy, ranking):
+    told, exact = relative(noisy), relative(problem_without_input_errors(noisy))
+    for name, std in told.items():
+        assert ranking.unchanged_experiment.std_relative[name] == pytest.approx(std, rel=0.02)
+        assert std > 1.2 * exact[name]
+
+
+def test_encoders_that_are_measurements_stay_so(noisy):
+    problem, without = (half_without(noisy, "points_arm", *more) for more in ((), ("joints.position",)))
+    found, blind = (what_if(one, considered_changes=()).unchanged_experiment.std_relative for one in (problem, without))
+    for name, std in relative(problem).items():
+        assert found[name] == pytest.approx(std, rel=0.3)
+        assert found[name] < 0.5 * blind[name]
+
+
+def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_there(noisy, ranking):
+    """The faster camera predicted, and the same one in the recording."""
+    predicted = ranking.single_changes[0]
+    recording = noisy.episodes[0].recording
+    times = recording.joints.t[0] + np.arange(0.0, 1.0 + 1e-9, 1 / 30)
+    groups = []
+    for own in recording.points:
+        if own.name == "points_camera":
+            shape = (len(times), len(own.names), 3)
+            std = np.full(shape, float(np.nanmedian(own.std)))
+            own = replace(own, t=times, position=np.zeros(shape), std=std)
+        groups.append(own)
+    # what is there tells of errors of torques too: those that the real recording tells of
+    effort, errors = (
+        recording.joints.effort.copy(),
+        problem_whitened_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors,
+    )
+    effort[: len(errors.torque_noise)] -= errors.total_torque_error
+    faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
+    problem = EstimationProblem(
+        noisy.step, [faster], noisy.free, noisy.options, noisy.named_values(noisy.initial_unknowns)
+    )
+    weighted = problem_whitened_at(problem, problem.initial_unknowns)
+    jacobian = linearization_without_weak_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]
+    std = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))) / problem.initial_unknowns
+    for name, value in zip(problem.unknown_names, std, strict=True):
+        assert predicted.std_relative[name] == pytest.approx(value, rel=0.02)
+
+
+def test_made_motions_are_as_noisy_as_the_recorded_one(noisy, monkeypatch):
+    builder = CandidateExperimentBuilder(RecordedExperiment(noisy, noisy.initial_unknowns))
+    made = builder.build_experiment(frozenset({"motion"}))
+    assert not isinstance(made, str), made
+    own, recorded = made.problem.episodes[0].input_errors, noisy.episodes[0].input_errors
+    for name in ("torque_std", "torque_bias_std", "angle_std"):
+        np.testing.assert_allclose(getattr(own, name), getattr(recorded, name))
+    second = SimpleNamespace(driven=(*noisy.system.driven, "other"))
+    angle, torque, bias = experiment_design._noise_as_recorded(noisy.system, second, noisy.episodes[0])
+    assert torque[-1] == np.median(recorded.torque_std)
+    assert bias[-1] == np.median(recorded.torque_bias_std)
+    np.testing.assert_array_equal(angle[:-1], recorded.angle_std)

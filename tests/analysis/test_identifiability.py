@@ -38,9 +38,6 @@ def verdicts(info):
     return [entry.verdict for entry in info.parameters.values()]
 
 
-# -- parameters -------------------------------------------------------------------------------------------------------
-
-
 def test_a_parameter_is_as_sure_as_its_rows_say():
     info = identifiability(Formula(two(), START, units={"a": "N m/rad", "b": "kg"}))
     a, b = info.parameters["a"], info.parameters["b"]
@@ -119,8 +116,6 @@ def test_rows_in_metres_inform_in_units_of_their_noise():
     series = Formula(lambda x: [3 * (x["a"] + x["b"] - 7)], {"a": 2.0, "b": 5.0}, noise=0.01)
     assert "a + b" in identifiability(series).unidentifiable_directions[0].words
 
-
-# -- nuisances --------------------------------------------------------------------------------------------------------
 
 GRASP, SLOPE = "grasp_offset@left.dx", "start.q.x[run]"
 FREE = dict.fromkeys((GRASP, SLOPE), (-math.inf, math.inf))
@@ -215,9 +210,6 @@ def test_a_start_fitted_to_points_becomes_the_centre_of_a_prior(pendulum, twin):
     assert identifiability(estimated).nuisance_names == unknown.nuisance_names
 
 
-# -- directions -------------------------------------------------------------------------------------------------------
-
-
 def test_directions_are_sorted_and_say_how_well_they_are_seen():
     directions = identifiability(Formula(two(30.0, 3.0), START)).directions
     assert [d.singular_value for d in directions] == pytest.approx([3.0, 30.0])
@@ -271,9 +263,6 @@ def test_two_pairs_that_are_each_seen_together_are_told_apart():
         "c and d are seen only as the product c x d",
     }
     assert len(info.directions) == 4
-
-
-# -- combinations -----------------------------------------------------------------------------------------------------
 
 
 def unseen(function, start=None, **more):
@@ -338,9 +327,6 @@ def test_fewer_rows_than_parameters_leave_directions_open():
     assert [sum(abs(part) > 1e-9 for part in d.components.values()) for d in info.directions[:2]] == [2, 2]
 
 
-# -- intervals --------------------------------------------------------------------------------------------------------
-
-
 def test_intervals_are_worked_out_where_they_are_wanted_about_the_best_fit():
     problem = Formula(lambda x: [15 * (x["a"] / 2 - 1), 30 * (x["b"] / 50 - 1)], {"a": 2.1, "b": 50.0})
     info = identifiability(problem, intervals=["a"])
@@ -356,20 +342,6 @@ def test_an_open_interval_lowers_the_verdict():
     problem = Formula(lambda x: [1.9 * (1 - ca.exp(-7.0 / 1.9 * (x["a"] - 2)))], {"a": 2.0})
     assert verdicts(identifiability(problem)) == ["identifiable"]
     assert verdicts(identifiability(problem, intervals="all")) == ["weak"]
-
-
-def test_profile_is_the_parabola_where_the_model_is_nearly_linear(pendulum, twin):
-    empty = pendulum()
-    problem = pendulum(twin(empty, empty.initial_unknowns, 3))
-    info = identifiability(problem, solve(problem, GaussNewton()), intervals=["elbow.rest", "elbow.stiffness"])
-    for name, profile in info.profiles.items():
-        entry = info.parameters[name]
-        half = 1.96 * entry.std
-        np.testing.assert_allclose(entry.interval, [entry.value - half, entry.value + half], atol=0.06 * half)
-        assert profile.delta_chi2.min() == pytest.approx(0.0, abs=0.01)
-
-
-# -- bad input --------------------------------------------------------------------------------------------------------
 
 
 def test_a_point_is_a_solution_an_array_or_the_start():
@@ -392,9 +364,6 @@ def test_a_point_is_a_solution_an_array_or_the_start():
 def test_bad_requests_say_what_is_wrong(error, words, more):
     with pytest.raises(error, match=words):
         identifiability(Formula(two(), START, fails=lambda values: values["a"] == 9.0), **more)
-
-
-# -- the three spring examples and the paper's experiments ------------------------------------------------------------
 
 
 def test_two_springs_in_series_seen_at_the_ends_only(springs):

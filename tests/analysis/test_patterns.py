@@ -12,8 +12,6 @@ import pytest
 from made_recordings import holding_pendulum
 
 from yid_ocp.analysis.step_diagnostics import (
-    NamedIndexRange,
-    SparsityPattern,
     full_nlp_size,
     kkt_sparsity_pattern,
     linearise_step_equations,
@@ -27,8 +25,6 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers.symbolic_transcription import transcribe
-
-# -- a step -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module", params=["driven", "prescribed", "relaxing"])
@@ -99,9 +95,6 @@ def test_a_stiffness_enters_the_rows_of_its_joints_alone(step):
     rows = {found.row_labels[i] for i in np.flatnonzero(found.nonzero_mask[:, column])}
     relaxing = {name for name in step.system.internal_coordinates if name.endswith("_z")}
     assert rows - relaxing == {"T1_0_z", "T1_1_z", "T1_2_z"}
-
-
-# -- the NLP ----------------------------------------------------------------------------------------------------------
 
 
 def made_problem(urdf_folder, feedback, start):
@@ -210,13 +203,3 @@ def test_the_kkt_matrix_is_symmetric_and_its_blocks_are_named(urdf_folder):
     seen = kkt.marked_mask[at["q1"].start : at["q1"].stop, at["q1"].start : at["q1"].stop]
     joints = problem.system.mechanism.joint_names
     assert {joints[i] for i in np.flatnonzero(seen.any(axis=0))} == {"shoulder", "elbow", "T1_0_x", "T1_0_y"}
-
-
-def test_a_pattern_counts_what_can_differ():
-    mask = np.array([[True, False], [True, True]])
-    pattern = SparsityPattern(
-        "p", "made up", mask, (NamedIndexRange("r", 0, 2),), (NamedIndexRange("c", 0, 2),), ("a", "b"), ("c", "d")
-    )
-    assert pattern.n_nonzeros == 3
-    marked = pattern.with_numerical_nonzeros_marked(np.array([[2.0, 0.0], [1e-15, -1.0]]), "rest")
-    np.testing.assert_array_equal(marked.marked_mask, [[True, False], [False, True]])

@@ -8,15 +8,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.joint_checks import RecordedJointsModel, check_efforts_by_inverse_dynamics, check_joint_limits
+from yid_ocp.analysis.clock_checks import check_fit_residuals
+from yid_ocp.analysis.joint_checks import (
+    RecordedJointsModel,
+    check_efforts_by_inverse_dynamics,
+    check_inertial_effort_excitation,
+    check_joint_excitation,
+    check_joint_limits,
+)
 from yid_ocp.analysis.point_checks import check_cable_point_geometry, check_point_distances, check_robot_held_points
+from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
-from yid_ocp.problem.options import SensorOptions
+from yid_ocp.problem import EstimationProblem, SensorOptions
+from yid_ocp.solvers import solve
 from yid_ocp.virtual.experiment import baxter_foam_y_system
+from yid_ocp.workflow.build_problem import build_problem
 
 
 def usual(_group: str) -> SensorOptions:
@@ -47,9 +57,6 @@ def with_points(recording: Recording, name: str, change) -> Recording:
     return replace(recording, points=tuple(groups))
 
 
-# -- the arm ----------------------------------------------------------------------------------------------------------
-
-
 def test_inverse_dynamics_are_pinocchios():
     pin = pytest.importorskip("pinocchio")
     robot = read_urdf("package:baxter", joints=[f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")])
@@ -76,9 +83,6 @@ def test_slopes_of_places_are_their_derivatives(arms):
             arm.frame_positions_and_jacobians(frames, up)[0] - arm.frame_positions_and_jacobians(frames, down)[0]
         ) / (2 * step)
         assert np.max(np.abs(difference - slope[..., j])) < 1e-8
-
-
-# -- efforts ----------------------------------------------------------------------------------------------------------
 
 
 def times(factor, *columns):
@@ -169,8 +173,6 @@ def test_limits_of_joints(arms, runs):
     quick = with_joints(run, t=lambda j: j.t / 30)
     assert "speed_limits" in {d.cause for d in check_joint_limits(arm, quick)}
 
-
-# -- points -----------------------------------------------------------------------------------------------------------
 
 MIRROR = np.array([1.0, -1.0, 1.0])
 TURN = np.array([[0.9, -np.sqrt(0.19), 0.0], [np.sqrt(0.19), 0.9, 0.0], [0.0, 0.0, 1.0]])
@@ -288,8 +290,6 @@ def test_the_object_does_not_stretch(arms, runs, factor, cause):
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
 
 
-# -- a cable ----------------------------------------------------------------------------------------------------------
-
 REST = {f"p{i}": (0.1 * i, 0.0, 0.0) for i in range(9)} | {f"a{i}": (0.4, 0.07 * i, 0.0) for i in (1, 2, 3)}
 CABLE = CableTopology(tuple(f"p{i}" for i in range(9)), {"a": ("p4", "a1", "a2", "a3")}, REST)
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -328,3 +328,101 @@ def test_joints_of_another_name_leave_nothing_to_compare(arms, runs):
     other = JointGroup(tuple(name.replace("left", "right") for name in joints.names), joints.t, joints.position)
     assert not arms[1].has_all_angles_recorded(replace(runs[1], joints=other))
     assert arms[1].has_all_angles_recorded(runs[1])
+
+
+USUAL = SensorOptions()
+
+
+@pytest.fixture(scope="module")
+def pendulum_arm(urdf_folder) -> RecordedJointsModel:
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+    system = System.build(robot, prescribed=robot.joint_names)
+    return RecordedJointsModel.from_system(system, system.parameters.vector())
+
+
+def swung(
+    pendulum_arm: RecordedJointsModel, hertz: float, size: float = 0.3, noise: float = 0.05, seed: int = 0
+) -> Recording:
+    """Both joints to and fro, with the efforts that they need and noise."""
+    rng = np.random.default_rng(seed)
+    t = 0.01 * np.arange(3001)
+    phase = 2 * np.pi * hertz * t[:, None] + np.array([0.0, 1.0])
+    rate = 2 * np.pi * hertz
+    q, v, a = size * np.sin(phase), size * rate * np.cos(phase), -size * rate**2 * np.sin(phase)
+    effort = pendulum_arm._inverse_dynamics(q, v, a) + noise * rng.standard_normal(q.shape)
+    return Recording(JointGroup(pendulum_arm.joint_names, t, q, effort=effort, effort_std=noise), name="run")
+
+
+@pytest.mark.parametrize(("hertz", "said"), [(0.02, True), (0.5, False), (1.0, False)])
+def test_a_motion_so_slow_that_only_postures_tell(pendulum_arm, hertz, said):
+    for seed in range(3):
+        found = list(check_inertial_effort_excitation(pendulum_arm, swung(pendulum_arm, hertz, 0.03, seed=seed), USUAL))
+        assert [(d.cause, d.weight) for d in found] == ([("weak_excitation", "warning")] if said else [])
+
+
+def test_less_noise_sees_more_and_efforts_that_nobody_uses_do_not_count(pendulum_arm):
+    slow = swung(pendulum_arm, 0.02, 0.03)
+    assert list(check_inertial_effort_excitation(pendulum_arm, slow, replace(USUAL, std=1e-4))) == []
+    assert len(list(check_inertial_effort_excitation(pendulum_arm, slow, replace(USUAL, std=10.0)))) == 1
+    assert list(check_inertial_effort_excitation(pendulum_arm, slow, replace(USUAL, use=False))) == []
+
+
+def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(pendulum_arm):
+    asked = {"elbow": ("elbow.stiffness", "elbow.damping")}
+    recording = swung(pendulum_arm, 0.5)
+    still = replace(recording.joints, position=recording.joints.position * [1.0, 0.01])
+    held = replace(recording, joints=still, name="held")
+    (doubt,) = check_joint_excitation([held], asked, USUAL)
+    assert (doubt.cause, doubt.channel, doubt.recording) == ("weak_excitation", "position.elbow", "held")
+    assert doubt.setting == "parameters.elbow.stiffness.free: false; parameters.elbow.damping.free: false"
+    assert list(check_joint_excitation([held, recording], asked, USUAL)) == []
+    assert list(check_joint_excitation([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []
+    coarse = replace(USUAL, std=0.2)
+    assert len(list(check_joint_excitation([recording], asked, coarse))) == 1
+
+
+@pytest.fixture(scope="module")
+def springs(repository):
+    run = load_config(repository / "configs" / "springs_series_joint.yaml", ["problem.use_compiler=false"])
+    return run, build_problem(run)
+
+
+def doubts(springs, late=0.0, drift=0.0, std=None):
+    """Doubts after a fit of the recording on another clock, or with another noise in the settings."""
+    run, problem = springs
+    recording = problem.episodes[0].recording
+    group = recording.points[0]
+    moved = replace(group, t=group.t + late + drift * (group.t - group.t.mean()))
+    inside = (moved.t >= recording.joints.t[0]) & (moved.t <= recording.joints.t[-1])
+    moved = replace(moved, t=moved.t[inside], position=moved.position[inside], std=group.std[inside])
+    options = problem.options
+    if std is not None:
+        own = replace(options.sensors.get(group.name, SensorOptions()), std=std)
+        options = replace(options, sensors={**options.sensors, group.name: own})
+    made = EstimationProblem(problem.step, [replace(recording, points=(moved,))], problem.free, options)
+    solution = solve(made, run.solver)
+    return check_fit_residuals(solution.problem or made, solution.x, solution.evaluation)
+
+
+def test_a_fit_of_a_sound_recording_raises_nothing(springs):
+    assert doubts(springs) == []
+
+
+def test_a_clock_that_runs_apart_is_told_by_what_the_fit_leaves(springs):
+    (doubt,) = doubts(springs, drift=0.01)
+    assert (doubt.cause, doubt.weight, doubt.group) == ("clock_drift", "not_trusted", "points_camera")
+    told, std = map(float, re.search(r"runs ([\d.]+) ± ([\d.]+) parts per thousand too fast", doubt.what).groups())
+    assert told == pytest.approx(10.0, abs=4 * std + 0.5)
+
+
+def test_a_clock_that_is_late_is_left_to_a_diagnosis(springs):
+    assert "clock_drift" not in {doubt.cause for doubt in doubts(springs, late=0.1)}
+
+
+def test_noise_that_settings_state_ten_times_too_large(springs):
+    (doubt,) = doubts(springs, std=1e-2)
+    assert (doubt.cause, doubt.weight) == ("noise_overstated", "warning")
+    name, value = doubt.setting.split(": ")
+    assert name == "sensors.points_camera.std"
+    assert float(value) == pytest.approx(1e-3, rel=0.15)
+    assert np.isclose(doubt.evidence, 1e-2 / (5 * float(value)), rtol=0.05)

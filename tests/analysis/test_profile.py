@@ -4,19 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import casadi as ca
 import numpy as np
 import pytest
 from made_models import Formula, estimate, solution
+from twins import twin_recording
 
+from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.profile import (
     compute_profile_likelihood_interval,
     is_small_enough_for_profiles,
     with_profile_intervals,
 )
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
+from yid_ocp.parallel import Task, run_tasks
+from yid_ocp.problem import EstimationProblem
+from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.workflow.build_problem import load_problem
 
 OPEN = dict.fromkeys("ab", (-math.inf, math.inf))
 HALF = 1.959963984540054
@@ -35,89 +43,49 @@ def profiled(problem, name="a", std=None):
     return found
 
 
-# -- intervals --------------------------------------------------------------------------------------------------------
-
 ROWS = np.array([[1.0, 0.9], [0.3, 1.0], [0.5, 0.5]])
 STD = math.sqrt(np.linalg.inv(ROWS.T @ ROWS)[0, 0])
 
 
-@pytest.mark.parametrize(
-    ("rows", "start", "more", "lower", "upper"),
-    [
-        (lambda x: [2 * (x["a"] - 3)], {"a": 3.0}, {"bounds": OPEN}, 3 - HALF / 2, 3 + HALF / 2),
-        (
-            lambda x: [r[0] * (x["a"] - 1.0) + r[1] * (x["b"] + 2.0) for r in ROWS],
-            {"a": 1.0, "b": -2.0},
-            {"bounds": OPEN},
-            1 - HALF * STD,
-            1 + HALF * STD,
-        ),
-        (
-            lambda x: [2 * (x["a"] - 3) + 4.0, 2 * (x["a"] - 3) - 4.0, 2 * (x["a"] - 3)],
-            {"a": 3.0},
-            {"bounds": OPEN},
-            3 - HALF * 4 / math.sqrt(12),
-            3 + HALF * 4 / math.sqrt(12),
-        ),
-        (
-            lambda x: [x["a"] - 3, (x["a"] - 3) * math.sqrt(3.0), 50 * (x["a"] - 3)],
-            {"a": 3.0},
-            {"bounds": OPEN, "stated": 1, "weak": 1},
-            3 - HALF / 2,
-            3 + HALF / 2,
-        ),
-        (
-            lambda x: [0.02 * (x["a"] - 3), math.sqrt(12.0) * (x["a"] - 3)],
-            {"a": 3.0},
-            {"bounds": OPEN, "stated": 1, "noise": 0.01},
-            3 - HALF / 4,
-            3 + HALF / 4,
-        ),
-        (lambda x: [x["a"] - 3.0], {"a": 3.0}, {}, 3 - HALF, 3 + HALF),
-        (lambda x: [x["a"] * 1e3 - 3.0], {"a": 3e-3}, {}, (3 - HALF) / 1e3, (3 + HALF) / 1e3),
-        (lambda x: [5 * ca.log(x["a"] / 3.0)], {"a": 3.0}, {}, 3 * math.exp(-HALF / 5), 3 * math.exp(HALF / 5)),
-        (lambda x: [2 * (1 / x["a"] - 1 / 3.0)], {"a": 3.0}, {}, 1 / (1 / 3 + HALF / 2), None),
-        (lambda x: [x["a"] - 3.0], {"a": 3.0}, {"bounds": {"a": (2.5, 6.0)}}, None, 3 + HALF),
-        (lambda x: [x["a"] - 3.0], {"a": 3.0}, {"bounds": {"a": (-9.0, 4.0)}}, 3 - HALF, None),
-        (
-            lambda x: [x["a"] + x["b"] - 4.0, 0.1 * (x["b"] - 1.0)],
-            {"a": 3.0, "b": 1.0},
-            {"bounds": {"b": (0.5, 1.25), "a": OPEN["a"]}},
-            2.75 - math.sqrt(HALF**2 - 0.025**2),
-            3.5 + math.sqrt(HALF**2 - 0.05**2),
-        ),
-        (
-            lambda x: [x["a"] - 3.0],
-            {"a": 3.0},
-            {"bounds": OPEN, "fails": lambda v: abs(v["a"] - 3) > 2.2},
-            3 - HALF,
-            3 + HALF,
-        ),
-        (
-            lambda x: [0.5 * (x["a"] - 3.0), 1e4 * ca.fmax(x["a"] - 3.7, 0.0)],
-            {"a": 3.0},
-            {"bounds": OPEN},
-            3 - 2 * HALF,
-            3.7,
-        ),
-    ],
-    ids=[
-        "linear",
-        "others are refitted",
-        "a misfit widens it",
-        "stated priors count, weak ones do not",
-        "rows in metres",
-        "a positive unknown",
-        "another unit",
-        "lopsided",
-        "open on one side",
-        "a bound below",
-        "a bound above",
-        "others at their bounds",
-        "a failure beyond the end",
-        "a cliff",
-    ],
-)
+WIDE, THREE = {"bounds": OPEN}, {"a": 3.0}
+INTERVALS = {
+    "linear": (lambda x: [2 * (x["a"] - 3)], THREE, WIDE, 3 - HALF / 2, 3 + HALF / 2),
+    "others are refitted": (
+        lambda x: [r[0] * (x["a"] - 1.0) + r[1] * (x["b"] + 2.0) for r in ROWS],
+        *({"a": 1.0, "b": -2.0}, WIDE, 1 - HALF * STD, 1 + HALF * STD),
+    ),
+    "a misfit widens it": (
+        lambda x: [2 * (x["a"] - 3) + 4.0, 2 * (x["a"] - 3) - 4.0, 2 * (x["a"] - 3)],
+        *(THREE, WIDE, 3 - HALF * 4 / math.sqrt(12), 3 + HALF * 4 / math.sqrt(12)),
+    ),
+    "stated priors count, weak ones do not": (
+        lambda x: [x["a"] - 3, (x["a"] - 3) * math.sqrt(3.0), 50 * (x["a"] - 3)],
+        *(THREE, {**WIDE, "stated": 1, "weak": 1}, 3 - HALF / 2, 3 + HALF / 2),
+    ),
+    "rows in metres": (
+        lambda x: [0.02 * (x["a"] - 3), math.sqrt(12.0) * (x["a"] - 3)],
+        *(THREE, {**WIDE, "stated": 1, "noise": 0.01}, 3 - HALF / 4, 3 + HALF / 4),
+    ),
+    "a positive unknown": (lambda x: [x["a"] - 3.0], THREE, {}, 3 - HALF, 3 + HALF),
+    "another unit": (lambda x: [x["a"] * 1e3 - 3.0], {"a": 3e-3}, {}, (3 - HALF) / 1e3, (3 + HALF) / 1e3),
+    "lopsided": (lambda x: [5 * ca.log(x["a"] / 3.0)], THREE, {}, 3 * math.exp(-HALF / 5), 3 * math.exp(HALF / 5)),
+    "open on one side": (lambda x: [2 * (1 / x["a"] - 1 / 3.0)], THREE, {}, 1 / (1 / 3 + HALF / 2), None),
+    "a bound below": (lambda x: [x["a"] - 3.0], THREE, {"bounds": {"a": (2.5, 6.0)}}, None, 3 + HALF),
+    "a bound above": (lambda x: [x["a"] - 3.0], THREE, {"bounds": {"a": (-9.0, 4.0)}}, 3 - HALF, None),
+    "others at their bounds": (
+        lambda x: [x["a"] + x["b"] - 4.0, 0.1 * (x["b"] - 1.0)],
+        *({"a": 3.0, "b": 1.0}, {"bounds": {"b": (0.5, 1.25), "a": OPEN["a"]}}),
+        *(2.75 - math.sqrt(HALF**2 - 0.025**2), 3.5 + math.sqrt(HALF**2 - 0.05**2)),
+    ),
+    "a failure beyond the end": (
+        lambda x: [x["a"] - 3.0],
+        *(THREE, {**WIDE, "fails": lambda v: abs(v["a"] - 3) > 2.2}, 3 - HALF, 3 + HALF),
+    ),
+    "a cliff": (lambda x: [0.5 * (x["a"] - 3.0), 1e4 * ca.fmax(x["a"] - 3.7, 0.0)], *(THREE, WIDE, 3 - 2 * HALF, 3.7)),
+}
+
+
+@pytest.mark.parametrize(("rows", "start", "more", "lower", "upper"), INTERVALS.values(), ids=INTERVALS)
 def test_an_interval_is_where_chi2_rises_by_the_quantile(rows, start, more, lower, upper):
     problem = Formula(rows, start, **more)
     found = profiled(problem)
@@ -190,16 +158,6 @@ def test_a_better_fit_that_is_met_on_the_way_is_said_and_counts_as_the_best(star
     assert found.lower == pytest.approx(3 - HALF / 2, rel=0.04)
 
 
-# -- how far it steps -------------------------------------------------------------------------------------------------
-
-
-def steps(problem, std, unit):
-    """Values asked below and above the best fit, in a unit."""
-    profiled(problem, std=std)
-    moved = [(x[0] - problem.initial_unknowns[0]) / unit for x in problem.asked]
-    return [-d for d in moved if d < 0], [d for d in moved if d > 0]
-
-
 def test_refits_leave_little_on_the_table():
     """The other unknown follows the first on a curve, so that its tangent alone is not enough."""
 
@@ -214,20 +172,6 @@ def test_refits_leave_little_on_the_table():
     assert np.all(found.delta_chi2 >= exact - 1e-9)
 
 
-def test_edges_take_few_refits():
-    def rows(x):
-        return [0.5 * (x["a"] - 3.0), 1e4 * ca.fmax(x["a"] - 3.7, 0.0)]
-
-    below, above = steps(Formula(rows, {"a": 3.0}, bounds=OPEN), 2.0, 1.0)
-    assert len(below) == 1
-    assert 10 <= len(above) <= 16
-    fails = Formula(lambda x: [0.1 * (x["a"] - 3.0)], {"a": 3.0}, bounds=OPEN, fails=lambda v: v["a"] > 7.0)
-    below, above = steps(fails, 10.0, 10 * HALF)
-    assert below == pytest.approx([1.0])
-    # half the way to where it failed, time and again
-    assert above[:3] == pytest.approx([1.0, 1.0, 0.5], rel=1e-6)
-
-
 @pytest.mark.parametrize(("left", "refitted"), [(0.7e-3, False), (1.5e-3, True)])
 def test_a_refit_is_worth_a_thousandth_of_chi2(left, refitted):
     def rows(x):
@@ -240,17 +184,13 @@ def test_a_refit_is_worth_a_thousandth_of_chi2(left, refitted):
 
 
 @pytest.mark.parametrize(
-    ("parameters", "unknowns", "expected"),
-    [(12, 300, True), (13, 13, False), (1, 301, False), (1, 1, True)],
+    ("parameters", "unknowns", "expected"), [(12, 300, True), (13, 13, False), (1, 301, False), (1, 1, True)]
 )
 def test_intervals_are_worked_out_unasked_where_they_take_no_time(parameters, unknowns, expected):
     names = tuple(f"k{i}" for i in range(parameters))
     starts = tuple(f"start.q.joint[{i}]" for i in range(unknowns - parameters))
     problem = SimpleNamespace(unknown_names=names + starts, shared_parameters=names, local_parameters=())
     assert is_small_enough_for_profiles(problem) is expected
-
-
-# -- verdicts ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -294,3 +234,65 @@ def test_a_stiffness_that_is_known_to_be_small_is_found():
     found = judged(problem, estimate(0.05, 0.1))
     assert (found.verdict, found.std) == ("identifiable", 0.1)
     assert found.interval == (None, pytest.approx(0.05 + HALF / 10, rel=0.01))
+
+
+TWINS = 100
+SEEN = ("T1.bend", "T1.twist", "T2.bend", "T3.bend")
+TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
+
+
+def holds(interval: tuple[float | None, float | None], truth: float) -> bool:
+    lower, upper = interval
+    return (lower is None or lower <= truth) and (upper is None or truth <= upper)
+
+
+def judged_twin(config: Path, seed: int) -> dict[str, Any]:
+    """Of a twin: which of the intervals hold the truth, and which parameters are called identifiable."""
+    exact = config.parents[1] / "tests" / "data" / "clean" / "single_arm_vision_estimate.h5"
+    made = load_problem(config, ["problem.duration=3.0", f"recordings.estimate=[{exact}]"])
+    recording = twin_recording(made, np.array([TRUTH[name] for name in made.unknown_names]), seed)
+    problem = EstimationProblem(made.step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 10.0))
+    info = identifiability(problem, solve(problem, GaussNewton()), intervals=list(SEEN))
+    held = [holds(info.parameters[name].interval, TRUTH[name]) for name in SEEN]
+    return {
+        "held": held,
+        "identifiable": [name for name, entry in info.parameters.items() if entry.verdict == "identifiable"],
+    }
+
+
+def report(record_property, hits: dict[str, list[bool]]) -> float:
+    pooled = float(np.mean([hit for found in hits.values() for hit in found]))
+    record_property("coverage", pooled)
+    print(f"coverage {100 * pooled:.1f} %", {name: f"{sum(found)} of {len(found)}" for name, found in hits.items()})
+    return pooled
+
+
+@pytest.mark.slow
+def test_coverage_on_a_pendulum(pendulum, twin, record_property):
+    empty = pendulum()
+    truth = dict(zip(empty.unknown_names, empty.initial_unknowns, strict=True))
+    profile: dict[str, list[bool]] = {name: [] for name in truth}
+    gaussian: dict[str, list[bool]] = {name: [] for name in truth}
+    for seed in range(TWINS):
+        recording = twin(empty, empty.initial_unknowns, 1000 + seed)
+        problem = pendulum(recording, {"elbow.stiffness": 3.0, "elbow.damping": 0.1, "elbow.rest": 0.1})
+        info = identifiability(problem, solve(problem, GaussNewton()), intervals="all")
+        for name, value in truth.items():
+            entry = info.parameters[name]
+            profile[name].append(holds(entry.interval, value))
+            gaussian[name].append(abs(entry.value - value) <= 1.96 * entry.std)
+    assert 0.92 <= report(record_property, profile) <= 0.98
+    assert 0.92 <= report(record_property, gaussian) <= 0.98
+
+
+@pytest.mark.slow
+def test_coverage_on_one_arm_and_the_y(repository, tmp_path, record_property):
+    """43 coordinates, 3 s: bends to a percent, T1.twist and T3.bend so weakly that only profiles are honest."""
+    config = repository / "configs" / "single_arm_vision.yaml"
+    tasks = [Task(f"twin {seed}", {"config": config, "seed": seed}) for seed in range(TWINS)]
+    results = run_tasks(judged_twin, tasks, tmp_path)
+    assert [entry.error for entry in results if entry.error] == []
+    found = [entry.value for entry in results]
+    assert all({"T2.twist", "T3.twist"}.isdisjoint(entry["identifiable"]) for entry in found)
+    hits = {name: [entry["held"][i] for entry in found] for i, name in enumerate(SEEN)}
+    assert 0.92 <= report(record_property, hits) <= 0.98

@@ -42,18 +42,9 @@ def short_run(repository):
     return load_problem(repository / "configs" / "single_arm_vision.yaml", settings)
 
 
-# -- ranks and sets, of results as a table says ------------------------------------------------------------------------
-
-NAMES = {
-    "w": "weld",
-    "m": "motion",
-    "t": "travel",
-    "c": "camera:T1_marker",
-    "a": "arm:T2_marker",
-    "s": "rate:10",
-    "f": "rate:30",
-}
-LETTERS = {name: letter for letter, name in NAMES.items()}
+LETTERS = {"weld": "w", "motion": "m", "travel": "t", "camera:T1_marker": "c", "arm:T2_marker": "a"}
+LETTERS |= {"rate:10": "s", "rate:30": "f"}
+NAMES = {letter: name for name, letter in LETTERS.items()}
 
 
 def ranked(problem, considered, table, **more):
@@ -78,41 +69,23 @@ def words(results):
     return " ".join("".join(sorted(LETTERS[name] for name in entry.changes)) or "-" for entry in results)
 
 
-@pytest.mark.parametrize(
-    ("considered", "table", "smallest", "greedy", "count"),
-    [
-        ("wca", {"w": (3, 1.0), "c": (2, 5.0), "cw": (3, 9.0)}, "w", "w", 4),
-        ("wcas", {"w": (2, 1.0), "cw": (3, 1.0), "as": (3, 9.0), "acw": (3, 20.0)}, "as cw", "w cw", 11),
-        (
-            "wcas",
-            {"c": (1, 1.0), "a": (1, 2.0), "ac": (2, 1.0), "as": (2, 3.0), "acs": (3, 4.0)},
-            "acs",
-            "a as acs",
-            15,
-        ),
-        ("wcas", {"acsw": (3, 4.0)}, "", "", 15),
-        ("mt", {"m": (1, 1.0), "mt": (3, 9.0)}, "", "m", 3),
-        ("sf", {"f": (1, 1.0), "fs": (3, 9.0)}, "", "f", 3),
-        ("mf", {"m": (1, 1.0), "fm": (3, 9.0)}, "fm", "m fm", 4),
-        ("wc", {"": (3, 0.0), "w": (3, 5.0)}, "-", "", 3),
-        ("wc", {"": (2, 1.0), "w": (1, 5.0)}, "", "", 4),
-        ("wc", {"c": (1, 1.0), "cw": (1, 1.0)}, "", "c", 4),
-        ("", {}, "", "", 1),
-    ],
-    ids=[
-        "one does",
-        "two pairs do",
-        "three do",
-        "four would",
-        "one motion at a time",
-        "one rate at a time",
-        "a motion and a rate",
-        "nothing to find",
-        "never to the worse",
-        "until nothing is gained",
-        "no change",
-    ],
-)
+THREE = {"c": (1, 1.0), "a": (1, 2.0), "ac": (2, 1.0), "as": (2, 3.0), "acs": (3, 4.0)}
+SETS = {
+    "one does": ("wca", {"w": (3, 1.0), "c": (2, 5.0), "cw": (3, 9.0)}, "w", "w", 4),
+    "two pairs do": ("wcas", {"w": (2, 1.0), "cw": (3, 1.0), "as": (3, 9.0), "acw": (3, 20.0)}, "as cw", "w cw", 11),
+    "three do": ("wcas", THREE, "acs", "a as acs", 15),
+    "four would": ("wcas", {"acsw": (3, 4.0)}, "", "", 15),
+    "one motion at a time": ("mt", {"m": (1, 1.0), "mt": (3, 9.0)}, "", "m", 3),
+    "one rate at a time": ("sf", {"f": (1, 1.0), "fs": (3, 9.0)}, "", "f", 3),
+    "a motion and a rate": ("mf", {"m": (1, 1.0), "fm": (3, 9.0)}, "fm", "m fm", 4),
+    "nothing to find": ("wc", {"": (3, 0.0), "w": (3, 5.0)}, "-", "", 3),
+    "never to the worse": ("wc", {"": (2, 1.0), "w": (1, 5.0)}, "", "", 4),
+    "until nothing is gained": ("wc", {"c": (1, 1.0), "cw": (1, 1.0)}, "", "c", 4),
+    "no change": ("", {}, "", "", 1),
+}
+
+
+@pytest.mark.parametrize(("considered", "table", "smallest", "greedy", "count"), SETS.values(), ids=SETS)
 def test_the_fewest_changes_that_find_every_parameter(short_run, considered, table, smallest, greedy, count):
     found = ranked(short_run, considered, table)
     assert words(found.smallest_sufficient_sets) == smallest
@@ -166,9 +139,6 @@ def test_faster_cameras_than_there_was(held_tube, period, rates):
     assert sorted(name for entry in found.single_changes for name in entry.changes) == rates
 
 
-# -- what experiments would tell ---------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def tube_ranking(held_tube):
     heard = Heard()
@@ -199,20 +169,14 @@ def test_a_fit_that_is_worse_than_its_noise_informs_less(held_tube, tube_ranking
 
 
 @pytest.mark.parametrize(
-    ("name", "frames", "group", "times", "std"),
-    [
-        ("camera:T1_1_tip", ["T1_0_tip", "T1_1_tip"], "points_camera", 0.1 * np.arange(21), 2e-3),
-        ("rate:30", ["T1_0_tip"], "points_camera", np.arange(61) / 30, 2e-3),
-    ],
+    ("name", "frames", "times"),
+    [("camera:T1_1_tip", ["T1_0_tip", "T1_1_tip"], 0.1 * np.arange(21)), ("rate:30", ["T1_0_tip"], np.arange(61) / 30)],
 )
-def test_a_predicted_sensor_tells_what_it_tells_when_it_is_there(
-    held_tube, tube_ranking, name, frames, group, times, std
-):
+def test_a_predicted_sensor_tells_what_it_tells_when_it_is_there(held_tube, tube_ranking, name, frames, times):
     ranking, _ = tube_ranking
     predicted = next(entry for entry in ranking.single_changes if entry.changes == (name,))
-    seen = PointGroup(
-        group, frames, times, np.zeros((len(times), len(frames), 3)), std, sensor="camera", pose=np.eye(4)
-    )
+    nothing, how = np.zeros((len(times), len(frames), 3)), {"sensor": "camera", "pose": np.eye(4)}
+    seen = PointGroup("points_camera", frames, times, nothing, 2e-3, **how)
     recording = replace(held_tube.episodes[0].recording, points=(seen,))
     info = identifiability(EstimationProblem(held_tube.step, [recording], held_tube.free, held_tube.options))
     for parameter, entry in info.parameters.items():
@@ -262,9 +226,6 @@ def test_another_motion_comes_from_held_out_recordings_without_mujoco(short_run,
     assert [entry.changes for entry in ranking.single_changes] == [("rate:30",), ("travel",)]
     failed = ranking.single_changes[1]
     assert (failed.message, failed.verdicts, failed.gain) == ("MuJoCo is not installed", {}, -math.inf)
-
-
-# -- the paper's open question ----------------------------------------------------------------------------------------
 
 
 def at_truth(problem: EstimationProblem) -> np.ndarray:

@@ -117,9 +117,8 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
         rows = problem.residual_rows.data
         found = weighted.evaluate(problem.initial_unknowns)
         r, jacobian = found.residual[rows], found.jacobian[rows]
-        costs.append(
-            (r @ r, np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ r), np.linalg.inv(jacobian.T @ jacobian))
-        )
+        covariance = np.linalg.inv(jacobian.T @ jacobian)
+        costs.append((r @ r, covariance @ jacobian.T @ r, covariance))
     (one, step, covariance), (other, moved, _) = costs
     assert one == pytest.approx(other, rel=1e-4)
     np.testing.assert_allclose((moved - step) / np.sqrt(np.diag(covariance)), 0.0, atol=0.02)
@@ -132,10 +131,8 @@ def small_gap(problem, size=1.0):
     truth = replace(episode, torque=episode.torque + 0.3 * size * TORQUE * rng.standard_normal(episode.torque.shape))
     truth = replace(truth, tracking_feedback=None)
     result = problem.predictor.predict_episode(truth, *problem.split(problem.initial_unknowns, 0), False)
-    samples = tuple(
-        replace(s, value=y + s.std * rng.standard_normal(y.shape))
-        for s, y in zip(episode.measurements, result.predicted_outputs, strict=True)
-    )
+    pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
+    samples = tuple(replace(s, value=y + s.std * rng.standard_normal(y.shape)) for s, y in pairs)
     angles = result.rollout.state[:, :1] + size * ANGLE * rng.standard_normal((len(result.rollout.state), 1))
     angles[0] = episode.measured_driven_angles[0]
     feedback = episode.tracking_feedback
@@ -146,11 +143,20 @@ def small_gap(problem, size=1.0):
     )
 
 
-def test_without_errors_of_inputs_nothing_changes(urdf_folder):
+@pytest.fixture
+def driven(urdf_folder):
+    """driven(steps): a pendulum whose shoulder is driven, and what is recorded of it."""
     step = pendulum_step(urdf_folder, driven=("shoulder",))
-    made = taken(step, 3)
-    made = replace(made, joints=replace(made.joints, effort_std=0.0))
-    problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
+    return lambda steps=24: (step, taken(step, 3, steps=steps))
+
+
+def sprung(step, recording, **options):
+    return EstimationProblem(step, [recording], ("elbow.stiffness",), ProblemOptions(**TRACKED, **options))
+
+
+def test_without_errors_of_inputs_nothing_changes(urdf_folder, driven):
+    step, made = driven()
+    problem = sprung(step, replace(made, joints=replace(made.joints, effort_std=0.0)))
     assert not problem.has_process_noise
     assert problem_whitened_at(problem, problem.initial_unknowns) is problem
     paper = problem_of(urdf_folder, encoders=False, weighting="paper")
@@ -201,30 +207,22 @@ def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
     for i in range(len(x)):
         step = np.zeros(len(x))
         step[i] = 1e-5 * x[i]
-        ends = [
-            weighted.evaluate(x + sign * step, equilibrium_guesses=found.equilibrium_guesses).residual
-            for sign in (1, -1)
-        ]
-        numeric = (ends[0] - ends[1]) / (2 * step[i])
+        up, down = (weighted.evaluate(x + sign * step, True, found.equilibrium_guesses).residual for sign in (1, -1))
+        numeric = (up - down) / (2 * step[i])
         np.testing.assert_allclose(numeric, found.jacobian[:, i], atol=2e-5 * np.abs(found.jacobian[:, i]).max())
     cost, gradient, again = weighted.cost_and_gradient(x)
     assert (cost, again.jacobian) == (pytest.approx(found.cost), None)
     np.testing.assert_allclose(gradient, found.jacobian.T @ found.residual, rtol=1e-9)
 
 
-# -- which encoders are measurements, and what is known of noise -------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("arm", "use", "expected"), [(True, None, False), (False, None, True), (False, False, False), (False, True, True)]
 )
-def test_encoders_are_measurements_where_no_point_of_the_arm_is(urdf_folder, arm, use, expected):
-    step = pendulum_step(urdf_folder, driven=("shoulder",))
-    made = taken(step, 3)
+def test_encoders_are_measurements_where_no_point_of_the_arm_is(driven, arm, use, expected):
+    step, made = driven()
     group = replace(made.points[0], sensor="arm")
     made = replace(made, points=(group, made.points[1]) if arm else made.points[1:])
-    sensors = {} if use is None else {"joints.position": SensorOptions(use=use)}
-    problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(sensors=sensors, **TRACKED))
+    problem = sprung(step, made, sensors={} if use is None else {"joints.position": SensorOptions(use=use)})
     found = [s for s in problem.episodes[0].measurements if s.sensor.group_name == "joints.position"]
     assert bool(found) == expected
     assert problem.episodes[0].input_errors.has_encoder_measurements == expected
@@ -234,42 +232,35 @@ def test_encoders_are_measurements_where_no_point_of_the_arm_is(urdf_folder, arm
         np.testing.assert_allclose(found[0].std, 1e-3)
 
 
-def test_encoders_beside_points_of_the_arm_are_refused(urdf_folder):
-    step = pendulum_step(urdf_folder, driven=("shoulder",))
-    made = taken(step, 3)
+def test_encoders_beside_points_of_the_arm_are_refused(driven):
+    step, made = driven()
     made = replace(made, points=(replace(made.points[0], sensor="arm"),))
-    options = ProblemOptions(sensors={"joints.position": SensorOptions(use=True)}, **TRACKED)
     with pytest.raises(ConfigError, match=r"points_arm.*both") as caught:
-        EstimationProblem(step, [made], ("elbow.stiffness",), options)
+        sprung(step, made, sensors={"joints.position": SensorOptions(use=True)})
     assert "sensors.points_arm.use: false" in caught.value.hint
 
 
 @pytest.mark.parametrize("said", [0.02, None])
-def test_noise_that_nobody_states_is_read_from_the_recording(urdf_folder, said, caplog):
-    step = pendulum_step(urdf_folder, driven=("shoulder",))
-    made = taken(step, 3, steps=400)
+def test_noise_that_nobody_states_is_read_from_the_recording(driven, said, caplog):
+    step, made = driven(400)
     rng = np.random.default_rng(1)
     noisy = made.joints.effort + 0.02 * rng.standard_normal(made.joints.effort.shape)
-    made = replace(made, joints=replace(made.joints, effort=noisy, effort_std=said))
     with caplog.at_level("WARNING"):
-        problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
+        problem = sprung(step, replace(made, joints=replace(made.joints, effort=noisy, effort_std=said)))
     assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(0.02, rel=0.15)
     assert ("neither recorded nor configured" in caplog.text) == (said is None)
 
 
-def test_torques_beside_encoders_are_never_taken_as_exact(urdf_folder):
-    step = pendulum_step(urdf_folder, driven=("shoulder",))
-    made = taken(step, 3)
-    made = replace(made, joints=replace(made.joints, effort_std=0.0), points=made.points[1:])
-    problem = EstimationProblem(step, [made], ("elbow.stiffness",), ProblemOptions(**TRACKED))
+def test_torques_beside_encoders_are_never_taken_as_exact(driven):
+    step, made = driven()
+    problem = sprung(step, replace(made, joints=replace(made.joints, effort_std=0.0), points=made.points[1:]))
     assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(1e-3 * np.std(made.joints.effort))
 
 
-def test_a_step_over_several_samples_averages_their_noise(urdf_folder):
-    step = pendulum_step(urdf_folder, driven=("shoulder",))
-    made = taken(step, 3, steps=48)
+def test_a_step_over_several_samples_averages_their_noise(driven):
+    step, made = driven(48)
     group = replace(made.joints, t=1.0 + 0.5 * (made.joints.t - 1.0))
-    problem = EstimationProblem(step, [replace(made, joints=group)], ("elbow.stiffness",), ProblemOptions(**TRACKED))
+    problem = sprung(step, replace(made, joints=group))
     errors = problem.episodes[0].input_errors
     assert errors.torque_std[0] == pytest.approx(0.3 * math.sqrt(0.5))
     assert problem.episodes[0].grid.time_step == H

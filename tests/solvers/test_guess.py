@@ -1,11 +1,22 @@
-"""Where methods with node states begin."""
+"""Where methods with node states begin, and derivatives of whole problems: adjoint = forward = finite differences."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from yid_ocp.solvers.initial_guess import guess_node_states
+from yid_ocp.data import JointGroup, Recording
+from yid_ocp.effects import make_effect
+from yid_ocp.integrator.step import compile_step, simulate
+from yid_ocp.model import System
+from yid_ocp.model.servos_and_springs import RobotJointSpring
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.solvers import GaussNewton, Status, solve
+from yid_ocp.solvers.initial_guess import guess_node_states, unknowns_with_active_effects
+from yid_ocp.solvers.multiple_shooting import _ShootingIntervals
 
 START = np.array([5.0, 4.0])
 
@@ -59,3 +70,116 @@ def test_what_fits_is_the_rollout_and_what_does_not_is_rest_where_the_arm_was(pr
     found = guess_node_states(problem, nodes, START, strays)
     np.testing.assert_allclose(found.node_states[0][:, driven], episode.measured_driven_angles, atol=1e-12)
     assert np.abs(rolled.state[:, driven] - episode.measured_driven_angles).max() > 1e-4
+
+
+@pytest.mark.parametrize("weighting", ["whitened", "paper"])
+def test_gradients_of_the_cost_agree(make_problem, weighting):
+    problem = make_problem(
+        duration=1.0, weighting=weighting, huber_threshold=2.0 if weighting == "whitened" else np.inf
+    )
+    x = problem.initial_unknowns * np.array([5.0, 4.0, 3.0, 2.0, 3.0, 2.0])
+    now = problem.evaluate(x)
+    forward = now.jacobian.T @ now.residual
+    cost, adjoint, _ = problem.cost_and_gradient(x)
+    assert cost == pytest.approx(now.cost, rel=1e-8)
+    np.testing.assert_allclose(adjoint, forward, rtol=1e-5, atol=1e-7 * np.abs(forward).max())
+    for i in (0, 2):
+        step = np.zeros_like(x)
+        step[i] = 1e-4 * x[i]
+        ends = [problem.evaluate(x + sign * step, derivatives=False).cost for sign in (1, -1)]
+        assert (ends[0] - ends[1]) / (2 * step[i]) == pytest.approx(adjoint[i], rel=1e-4)
+
+
+@pytest.mark.parametrize(("interval", "initial_state"), [(1, "equilibrium"), (5, "equilibrium"), (4, "estimated")])
+def test_condensed_derivatives_match_differences(make_problem, interval, initial_state):
+    """Of the residual by the unknowns, node states moved along, and by closing the defects."""
+    problem = make_problem(duration=0.15, initial_state=initial_state)
+    intervals = _ShootingIntervals(problem, interval)
+    rng = np.random.default_rng(1)
+    x, nodes = intervals.initial_guess(4 * problem.initial_unknowns)
+    nodes = [state + 1e-4 * rng.normal(size=state.shape) for state in nodes]
+    now = intervals.linearize(x, nodes)
+    assert now.defect > 1e-5
+    open_defects = replace(now, node_slopes=tuple((by_x, 0.0 * by_defect) for by_x, by_defect in now.node_slopes))
+    held = replace(now, node_slopes=tuple((0.0 * by_x, by_defect) for by_x, by_defect in now.node_slopes))
+    direction = rng.normal(size=len(x)) * np.maximum(np.abs(x), 1e-3)
+
+    def residual(part, step, size):
+        return intervals.linearize(x + size * step, intervals.moved(nodes, part, step, size)).residual
+
+    size = 1e-5
+    along = (residual(open_defects, direction, size) - residual(open_defects, direction, -size)) / (2 * size)
+    expected = now.jacobian @ direction
+    np.testing.assert_allclose(expected, along, rtol=1e-4, atol=1e-4 * np.abs(along).max())
+    size, none = 1e-3, np.zeros_like(x)
+    closing = (residual(held, none, size) - residual(held, none, -size)) / (2 * size)
+    np.testing.assert_allclose(now.by_defect, closing, rtol=1e-4, atol=1e-4 * np.abs(closing).max())
+
+
+H, N_STEPS, STD = 0.01, 150, 0.02
+JOINTS = ("shoulder", "elbow")
+
+
+@pytest.fixture(scope="module")
+def moved(urdf_folder):
+    """A double pendulum moved as measured, with an effect's values at its elbow; what its joints need is seen."""
+
+    def make(kind, truth, free, seed=0):
+        robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+        plain = System.build(robot, springs={"shoulder": RobotJointSpring(6.0, 0.1)}, prescribed=JOINTS)
+        system = plain.with_effects([make_effect(kind, "elbow", plain)])
+        step = compile_step(system, H, use_compiler=False)
+        t = H * np.arange(N_STEPS + 1)
+        path = np.stack([0.6 * np.sin(2.1 * t), 0.9 + 0.3 * np.sin(3.3 * t + 0.4)], axis=1)
+        theta = system.parameters.vector({f"{kind}@elbow.{name}": value for name, value in truth.items()})
+        sizes = step.sizes
+        begin = np.concatenate([path[0], np.zeros(sizes["nx"] - 2)])
+        effort = simulate(step, theta, begin, N_STEPS, np.zeros((N_STEPS, 0)), path).effort
+        noise = np.random.default_rng(seed).normal(scale=STD, size=(N_STEPS + 1, 2))
+        recorded = np.vstack([effort, effort[-1]]) + noise
+        group = JointGroup(JOINTS, t, path, effort=recorded, effort_std=STD, position_std=0.0)
+        options = ProblemOptions(path_cutoff=np.inf)
+        names = [f"{kind}@elbow.{name}" for name in free]
+        return EstimationProblem(step, [Recording(group, name="twin")], ["shoulder.stiffness", *names], options)
+
+    return make
+
+
+@pytest.mark.parametrize(("stiffness", "rest_angle"), [(8.0, -1.5), (25.0, 0.3)])
+def test_a_spring_relaxed_elsewhere_is_found_from_its_neutral_value(moved, stiffness, rest_angle):
+    problem = moved("joint_spring", {"stiffness": stiffness, "rest_angle": rest_angle}, ("stiffness", "rest_angle"))
+    assert problem.initial_unknowns[1] == 0.0
+    solution = solve(problem, GaussNewton())
+    assert solution.status == Status.CONVERGED
+    for name, truth in (("stiffness", stiffness), ("rest_angle", rest_angle)):
+        entry = solution.parameters[f"joint_spring@elbow.{name}"]
+        assert entry.verdict == "identifiable", name
+        assert abs(entry.value - truth) < 4 * entry.std, name
+
+
+def test_an_amplitude_seen_at_its_neutral_value_begins_there(moved):
+    problem = moved("joint_viscous", {"b": 0.3}, ("b",))
+    np.testing.assert_array_equal(
+        unknowns_with_active_effects(problem, problem.initial_unknowns), problem.initial_unknowns
+    )
+    fixed = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ())
+    np.testing.assert_array_equal(unknowns_with_active_effects(fixed, fixed.initial_unknowns), fixed.initial_unknowns)
+
+
+def test_an_effect_that_was_given_a_value_begins_there(moved):
+    problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
+    begun = problem.with_parameter_values({"joint_spring@elbow.stiffness": 2.0})
+    np.testing.assert_array_equal(unknowns_with_active_effects(begun, begun.initial_unknowns), begun.initial_unknowns)
+
+
+def test_a_start_that_cannot_be_rolled_out_is_drawn_back(moved, monkeypatch):
+    problem = moved("joint_spring", {"stiffness": 8.0, "rest_angle": 1.4}, ("stiffness", "rest_angle"))
+    whole, plain = unknowns_with_active_effects(problem, problem.initial_unknowns), problem.evaluate
+
+    def stiff(x, derivatives=True, warm=None):
+        found = plain(x, derivatives, warm)
+        return found if x[1] < 0.6 * whole[1] else type(found)(np.inf, found.residual, None, False, "it snaps", ())
+
+    monkeypatch.setattr(problem, "evaluate", stiff)
+    drawn = unknowns_with_active_effects(problem, problem.initial_unknowns)
+    assert drawn[1] == pytest.approx(0.5 * whole[1])

@@ -151,11 +151,10 @@ def check_robot_held_point_clock(
 
 def _drift_issue(found: _ClockError, group: str, limit: float, severity: Severity) -> Issue:
     late, drift, whole = found.delay, found.drift, found.whole_drift
-    words = (
-        f"{group} is stamped {1e3 * (late - 0.5 * whole):+.3g} ms from the joints at its beginning, "
-        f"{1e3 * (late + 0.5 * whole):+.3g} ms at its end: its clock runs {1e3 * abs(drift):.2g} ± "
-        f"{1e3 * found.drift_std:.1g} parts per thousand too {'fast' if drift > 0 else 'slowly'}"
-    )
+    begin, end = (f"{1e3 * (late + sign * 0.5 * whole):+.3g} ms" for sign in (-1, 1))
+    size, how = f"{1e3 * abs(drift):.2g} ± {1e3 * found.drift_std:.1g}", "fast" if drift > 0 else "slowly"
+    words = f"{group} is stamped {begin} from the joints at its beginning, {end} at its end"
+    words = f"{words}: its clock runs {size} parts per thousand too {how}"
     advice, setting = timestamp_correction_advice(late, drift, 0.5 * sum(found.span)), f"sensors.{group}.use: false"
     return Issue("clock_drift", words, severity, abs(whole) / limit, advice, "", group, "t", setting=setting)
 

@@ -353,7 +353,9 @@ def _discrepancy(experiment: str, name: str, entry: ParameterEstimate, truth: fl
     value, ensemble = PAPER_ESTIMATES[experiment][name], _load_torque_ensemble()[experiment]
     stopped, offsets = ensemble["none"][name][0], ensemble["offsets"][name]
     interval = None if entry.verdict != "weak" or entry.interval in (None, (None, None)) else entry.interval
-    if entry.verdict == "not_identifiable" or (entry.verdict != "identifiable" and _holds(entry, value)):
+    lower, upper = entry.interval or (entry.value - 2 * entry.std, entry.value + 2 * entry.std)
+    holds = (lower is None or lower <= value) and (upper is None or value <= upper)
+    if entry.verdict == "not_identifiable" or (entry.verdict != "identifiable" and holds):
         known = f"in such an experiment it {VERDICT_PREDICATES[entry.verdict]}"
         if interval is not None:
             return f"hardly informed; {known}, {interval_text(*interval)}, where the value lies"
@@ -380,8 +382,3 @@ def is_within_ensemble_range(published: float, values: Sequence[float]) -> bool:
 
 def _near(value: float, truth: float) -> bool:
     return abs(value - truth) <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(truth)
-
-
-def _holds(entry: ParameterEstimate, value: float) -> bool:
-    lower, upper = entry.interval or (entry.value - 2 * entry.std, entry.value + 2 * entry.std)
-    return (lower is None or lower <= value) and (upper is None or value <= upper)

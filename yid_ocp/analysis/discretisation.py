@@ -104,9 +104,8 @@ def discretisation_estimate_shifts(
 ) -> dict[str, float] | str:
     """Shift of each shared free parameter by one Gauss-Newton step of a finer model from the coarse unknowns x (nx,).
 
-    Data, bounds and priors are those of the coarse problem, whose evaluation is `at_x`. With `model_difference_only`
-    its prediction replaces the data, so that away from an estimate only the difference between the two models counts.
-    In the coarse parameters' units; a message where the step cannot be made.
+    Data, bounds and priors are those of the coarse problem, whose evaluation is `at_x`; its prediction replaces the
+    data with `model_difference_only`, for points away from an estimate. A message where the step cannot be made.
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
@@ -234,16 +233,17 @@ def min_grasp_closure_errors(system: System, posture: Mapping[str, float], theta
         full[free] = x
         return np.array(ca.densify(function(full)[part]))
 
+    # a little stiffness keeps the search from winding the object up
+    def gaps(x: Array) -> Array:
+        return np.concatenate([phi_at(x, 0).ravel(), 1e-4 * x])
+
+    def slopes(x: Array) -> Array:
+        return np.vstack([phi_at(x, 1), 1e-4 * np.eye(len(free))])
+
     best: Array | None = None
     for seed in range(4):
         start = np.random.default_rng(seed).normal(scale=0.1, size=len(free))
-        # a little stiffness keeps the search from winding the object up
-        found = scipy.optimize.least_squares(
-            lambda x: np.concatenate([phi_at(x, 0).ravel(), 1e-4 * x]),
-            start,
-            lambda x: np.vstack([phi_at(x, 1), 1e-4 * np.eye(len(free))]),
-            max_nfev=100,
-        )
+        found = scipy.optimize.least_squares(gaps, start, slopes, max_nfev=100)
         gap = phi_at(found.x, 0).ravel()
         if best is None or np.linalg.norm(gap) < np.linalg.norm(best):
             best = gap

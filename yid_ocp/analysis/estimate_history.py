@@ -2,11 +2,8 @@
 
 For estimates x_i with covariances C_i of the same parameters, their mean is x = (sum C_i^-1)^-1 sum C_i^-1 x_i. Where
 nothing changed, chi2 = sum (x_i - x)' C_i^-1 (x_i - x) has (k - 1) n degrees of freedom. Where it is larger, the
-standard deviations of the mean are widened by sqrt(chi2/dof), Birge's ratio.
-
-References
-----------
-Birge (1932), Physical Review 40:207, doi:10.1103/PhysRev.40.207.
+standard deviations of the mean are widened by sqrt(chi2/dof), Birge's ratio (Birge 1932, Physical Review 40:207,
+doi:10.1103/PhysRev.40.207).
 """
 
 from __future__ import annotations

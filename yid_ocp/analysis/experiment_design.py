@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -123,8 +124,7 @@ def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
     return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
 
 
-@dataclass(frozen=True)
-class _ObservableFrame:
+class _ObservableFrame(NamedTuple):
     """A frame that a camera, or also an arm, could measure; `added_frame` where it must be added to the mechanism."""
 
     name: str
@@ -253,14 +253,9 @@ class CandidateExperimentBuilder:
         moves = bool(system.driven) and not system.servos
         measured = any(s.sensor.effort_joints for e in episodes for s in e.measurements)
         robot = (system.driven or system.prescribed) and episodes[0].recording.joints
-        applies = {
-            "weld": any(grasp.kind != "weld" for grasp in system.grasps),
-            "second_arm": setting.two_arm_system is not None,
-            "motion": moves,
-            "travel": moves,
-            "torque": bool(robot) and not measured,
-        }
-        return [name for name, does in applies.items() if does]
+        loose, second = any(grasp.kind != "weld" for grasp in system.grasps), setting.two_arm_system is not None
+        applies = {"weld": loose, "second_arm": second, "motion": moves, "travel": moves}
+        return [name for name, does in (applies | {"torque": bool(robot) and not measured}).items() if does]
 
     def _build(self, mechanics: frozenset[str]) -> CandidateExperiment:
         setting, base = self.setting, self.setting.problem
@@ -380,8 +375,7 @@ class CandidateExperimentBuilder:
         layout = self.build_experiment(others)
         if isinstance(layout, str):
             raise SolverError(layout)
-        problem, n = layout.problem, system.n_coordinates
-        theta, offset = problem.split(layout.x, 0)
+        problem, n, (theta, offset) = layout.problem, system.n_coordinates, layout.problem.split(layout.x, 0)
         start = problem.initial_state(problem.episodes[0], theta, offset)
         if start.failure_message:
             raise SolverError(start.failure_message)
@@ -453,11 +447,9 @@ def _noise_as_recorded(base: System, system: System, episode: Episode) -> Sequen
     errors = episode.input_errors
     if errors is None:
         return (0.0, 0.0, 0.0)
-    place = {joint: i for i, joint in enumerate(base.driven)}
-    return [
-        np.array([std[place[joint]] if joint in place else np.median(std) for joint in system.driven])
-        for std in (errors.angle_std, errors.torque_std, errors.torque_bias_std)
-    ]
+    known = np.stack([errors.angle_std, errors.torque_std, errors.torque_bias_std])
+    columns = dict(zip(base.driven, known.T, strict=True))
+    return list(np.stack([columns.get(joint, np.median(known, axis=1)) for joint in system.driven], axis=1))
 
 
 def _travel(system: System, values: Mapping[str, float], episode: Episode) -> float:

@@ -176,9 +176,6 @@ def _load_function(problem: EstimationProblem) -> ca.Function:
 
 def without_held_out(problem: EstimationProblem) -> EstimationProblem:
     """The problem that estimates on its held-out recordings too."""
-    return problem.with_episodes(
-        (*problem.episodes, *(replace(held, initial_state_shared_with=None) for held in problem.held_out)),
-        (),
-        (*problem.whitening_filters, *problem.held_out_whitening_filters),
-        (),
-    )
+    added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)
+    filters = (*problem.whitening_filters, *problem.held_out_whitening_filters)
+    return problem.with_episodes((*problem.episodes, *added), (), filters, ())

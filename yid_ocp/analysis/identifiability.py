@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import threadpoolctl
@@ -270,9 +270,8 @@ def with_nuisance_unknowns(
 
 def transfer_unknowns_by_name(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
     """Unknown vector of another problem: values of the same names, its own initial values for the rest."""
-    known = dict(zip(names, x, strict=True))
-    own = zip(other.unknown_names, other.initial_unknowns, strict=True)
-    return np.array([known.get(name, initial) for name, initial in own])
+    known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
+    return np.array([known[name] for name in other.unknown_names])
 
 
 @dataclass(frozen=True)
@@ -381,8 +380,7 @@ def _sparse_basis(vectors: Array) -> list[Array]:
     return [row / np.linalg.norm(row) for row in rows]
 
 
-@dataclass(frozen=True)
-class _Component:
+class _Component(NamedTuple):
     """One parameter's coefficient in a direction of relative parameter changes, with its value and unit."""
 
     name: str
@@ -404,11 +402,9 @@ _COMBINATIONS: tuple[_Combination, ...] = (
 
 def _components(view: _Sensitivities, vector: Array) -> list[_Component]:
     """The parameters that make up a direction."""
-    return [
-        _Component(name, float(part), float(view.x[index]), view.unit(name))
-        for name, part, index in zip(view.names, vector, view.chosen, strict=True)
-        if abs(part) > 0.05 * np.max(np.abs(vector))
-    ]
+    units = map(view.unit, view.names)
+    parts = zip(view.names, vector.tolist(), view.x[view.chosen].tolist(), units, strict=True)
+    return [_Component(*part) for part in parts if abs(part[1]) > 0.05 * np.max(np.abs(vector))]
 
 
 def _unseen_words(view: _Sensitivities, vector: Array) -> str:
@@ -428,8 +424,7 @@ def _hiding_nuisances(view: _Sensitivities, vector: Array) -> str:
     """Which nuisances hide a direction."""
     others = [name for i, name in enumerate(view.problem.unknown_names) if i not in set(view.chosen)]
     column = (view.by_alone @ vector)[:, None]
-    groups = {"the unknown start": "start.", "where the grasp sits": _GRASP_OFFSET_PREFIX}
-    for words, prefix in groups.items():
+    for words, prefix in (("the unknown start", "start."), ("where the grasp sits", _GRASP_OFFSET_PREFIX)):
         at = [i for i, name in enumerate(others) if name.startswith(prefix)]
         if at and np.linalg.norm(_orthogonal_part(column, view.nuisance[:, at])) * MAX_WEAK_RELATIVE_STD < 1.0:
             return words
@@ -484,9 +479,8 @@ def _combination(view: _Sensitivities, first: _Component, second: _Component) ->
     """Words on the plain combination of two parameters that the data determine, also at a finite change, if any."""
     direction = np.array([first.coefficient, second.coefficient])
     direction /= np.linalg.norm(direction)
-    a, b = first.value, second.value
+    (a, b), tried = (first.value, second.value), list[tuple[float, str]]()
     new_a = a * _FINITE_CHANGE_FACTOR
-    tried: list[tuple[float, str]] = []
     for words, slope_at, partner, same_unit in _COMBINATIONS:
         slope = np.array(slope_at(a, b))
         mismatch = 1.0 - abs(float(slope @ direction)) / float(np.linalg.norm(slope))

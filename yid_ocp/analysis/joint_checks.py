@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -326,8 +327,7 @@ class _Data:
         return tuple(frame for frame in frames if self.arm.is_frame_determined_by_angles(frame))
 
 
-@dataclass(frozen=True)
-class _Fit:
+class _Fit(NamedTuple):
     """What a fit of each joint's effort says, shape (k,)."""
 
     inverse: Array  # 1/g

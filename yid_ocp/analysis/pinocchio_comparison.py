@@ -52,12 +52,11 @@ class _PinocchioComparison:
     @property
     def words(self) -> str:
         """A sentence on the agreement or on each difference."""
+        parts = {"mass matrix": self.mass, "weight": self.weight, "inverse dynamics": self.motion}
         if self.agrees_within_rounding:
-            largest = max(self.mass, self.weight, self.motion)
             said = f"{self.of}: mass matrix, weight and inverse dynamics are Pinocchio's"
-            return f"{said} within {largest:.1g} of the largest entry"
-        parts = (("mass matrix", self.mass), ("weight", self.weight), ("inverse dynamics", self.motion))
-        wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts if not size <= _RELATIVE_TOLERANCE]
+            return f"{said} within {max(parts.values()):.1g} of the largest entry"
+        wrong = [f"{name} by {100 * size:.2g} %" for name, size in parts.items() if not size <= _RELATIVE_TOLERANCE]
         return f"{self.of} differs from Pinocchio's: {', '.join(wrong)} of the largest entry"
 
 
@@ -91,7 +90,11 @@ def compare_urdf_with_pinocchio(
         at = pin.neutral(model)
         for i, name in enumerate(model.names):
             if i and name not in joints:
-                _place(at, model.joints[i], locked.get(name, _nearest_to_zero(model, model.joints[i])))
+                joint, value = model.joints[i], 0.0
+                if joint.nq == 1:  # where nothing is said, at zero or at the bound next to it
+                    limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+                    value = float(np.clip(0.0, *limits))
+                _place(at, joint, locked.get(name, value))
         model = pin.buildReducedModel(model, [i for i in range(1, model.njoints) if model.names[i] not in joints], at)
     model.gravity.linear = gravity
     posture = np.zeros(len(mechanism.joints))
@@ -116,13 +119,6 @@ def _without(path: Path, links: Sequence[str]) -> str:
 def _link(joint: ElementTree.Element, end: str) -> str:
     named = joint.find(end)
     return "" if named is None else named.get("link", "")
-
-
-def _nearest_to_zero(model: Any, joint: Any) -> float:
-    """Where a joint is locked that nothing is said of: at zero, or at the bound next to it."""
-    if joint.nq != 1:
-        return 0.0
-    return float(np.clip(0.0, model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]))
 
 
 def _place(configuration: Array, joint: Any, value: float) -> None:

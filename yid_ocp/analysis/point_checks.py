@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -39,8 +40,7 @@ _PATH_SAMPLE_RATE = 50.0  # rate at which the way of the held points is worked o
 _LENGTH_RTOL = 0.2  # part by which lengths that cannot change may seem to
 
 
-@dataclass(frozen=True)
-class _Change:
+class _Change(NamedTuple):
     """What would have to be done to measured points, and how far they then are from the model [m]."""
 
     cause: str

@@ -6,7 +6,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -166,8 +166,7 @@ def is_small_enough_for_profiles(problem: EstimationProblem) -> bool:
     return few and len(problem.unknown_names) <= _MAX_UNKNOWNS
 
 
-@dataclass(frozen=True)
-class _Point:
+class _Point(NamedTuple):
     """A refit at one value: coordinates, chi2 above the first one, residual rows and their Jacobian."""
 
     value: float
@@ -204,7 +203,9 @@ class _Walk:
     def end(self, sign: int, size: float) -> float | None:
         """Where the profile crosses the level on one side; None where it does not."""
         inside, s, centre = self.points[0], self.centre[self.index], self.centre[self.index]
-        limit = self._limit(sign)
+        reach = _MAX_LOG_DISTANCE if self.logarithmic else 1e3 * float(self.problem.unknown_scales[self.index])
+        bound = float((self.upper if sign > 0 else self.lower)[self.index])
+        limit = sign * min(sign * bound, sign * float(centre) + reach)
         barrier: float | None = None  # beyond it no rollout succeeds
         step, side = _TARGET_HEIGHT * size, "above" if sign > 0 else "below"
         for _ in range(_MAX_PROFILE_POINTS):
@@ -244,11 +245,6 @@ class _Walk:
 
     def _value(self, s: float) -> float:
         return float(np.exp(s)) if self.logarithmic else s
-
-    def _limit(self, sign: int) -> float:
-        reach = _MAX_LOG_DISTANCE if self.logarithmic else 1e3 * float(self.problem.unknown_scales[self.index])
-        bound = float((self.upper if sign > 0 else self.lower)[self.index])
-        return sign * min(sign * bound, sign * float(self.centre[self.index]) + reach)
 
     def _added(self, point: _Point) -> float:
         """Root of delta chi2 at a point, which is noted."""

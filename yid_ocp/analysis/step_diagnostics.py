@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -219,8 +219,7 @@ def _summarize_rows(names: Sequence[str]) -> str:
     return ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
 
 
-@dataclass(frozen=True)
-class _WhitenedSensor:
+class _WhitenedSensor(NamedTuple):
     """One sensor at the rest, whitened: derivatives of its readings by state, effort and parameters."""
 
     name: str
@@ -284,8 +283,7 @@ def _answers(
 _ZERO_RTOL = 1e-14  # of the largest entry: rounding
 
 
-@dataclass(frozen=True)
-class NamedIndexRange:
+class NamedIndexRange(NamedTuple):
     """A named range of row or column indices."""
 
     name: str
@@ -424,8 +422,7 @@ def _mask(pattern: ca.Sparsity) -> BoolArray:
     return mask
 
 
-@dataclass(frozen=True)
-class _NlpStage:
+class _NlpStage(NamedTuple):
     """Sparsity of one stage of the NLP, the same for all; the start depends on all free parameters."""
 
     constraint_mask: BoolArray  # one step's constraints by (theta_free, x_k, x_{k+1}, lam_k)
@@ -446,11 +443,7 @@ class _NlpStage:
 
 
 def nlp_stage_sparsity(
-    symbols: StepSymbols,
-    free: Sequence[str],
-    sensors: Sequence[Sensor],
-    followed: Sequence[int],
-    loose: Sequence[int],
+    symbols: StepSymbols, free: Sequence[str], sensors: Sequence[Sensor], followed: Sequence[int], loose: Sequence[int]
 ) -> _NlpStage:
     """Sparsity of one stage of the NLP with a node at every step, in the order of `solvers.symbolic_transcription`.
 

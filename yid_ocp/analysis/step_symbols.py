@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 
@@ -64,8 +65,7 @@ _LATEX_TEMPLATES: dict[int, _OperationTemplate] = _TEXT_TEMPLATES | {
 _FUNCTION_NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}
 
 
-@dataclass(frozen=True)
-class _SymbolName:
+class _SymbolName(NamedTuple):
     """Name of a variable in plain text and in LaTeX."""
 
     text: str

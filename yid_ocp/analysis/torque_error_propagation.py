@@ -3,11 +3,8 @@
 Torques are wrong in every recorded sample and by a constant, angles that a tracking filter follows in every step: some
 thousands of unknowns in a recording, of which sensors see no more than smooth motions. With G their effect on all
 readings in units of the finest noise, the left singular vectors of G whose singular values are not small represent
-them; the neglected rest would add less than `_NEGLIGIBLE_STD` squared to any reading's variance.
-
-References
-----------
-Halko, Martinsson and Tropp (2011), SIAM Review 53:2, doi:10.1137/090771806 (singular vectors from random samples).
+them, from random samples (Halko, Martinsson and Tropp 2011, SIAM Review 53:2, doi:10.1137/090771806); the neglected
+rest would add less than `_NEGLIGIBLE_STD` squared to any reading's variance.
 """
 
 from __future__ import annotations

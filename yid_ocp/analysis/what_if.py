@@ -227,10 +227,8 @@ class _Outcomes:
         setting, episode = self.setting, self.setting.problem.episodes[0]
         camera, arm = setting.camera_sample_times_and_std(episode)[0], setting.arm_sample_times_and_std(episode)[0]
         views = setting.existing_sensor_observations(episode)
-        looked, felt = (
-            {view.frame for view in views if group is not None and view.point_group == group.name}
-            for group in (camera, arm)
-        )
+        groups = ("" if group is None else group.name for group in (camera, arm))
+        looked, felt = ({view.frame for view in views if view.point_group == name} for name in groups)
         names = self.builder.applicable_mechanical_changes()
         changes = [ExperimentChange(name, MECHANICAL_EXPERIMENT_CHANGES[name], name) for name in names]
         for sight in observable_frames(setting.problem.system):

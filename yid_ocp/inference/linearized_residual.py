@@ -44,18 +44,12 @@ def nominal_trajectory(
 ) -> NominalTrajectory:
     """Trajectory of an episode about which its residual is linearized."""
     own, rest, sizes = predictor.theta_with_episode_values(episode, theta), result.equilibrium, predictor.step.sizes
-    none = np.zeros((sizes["nx"], sizes["nu"]))
-    by_angles = none if rest is None else rest.state_by_known_coordinates[:, : sizes["nu"]]
-    return NominalTrajectory(
-        predictor.model_functions,
-        own,
-        result.rollout,
-        [predictor.delay_corrected_measurements(samples, own) for samples in episode.measurements],
-        episode.tracking_feedback,
-        predictor.node_values(result.rollout),
-        by_angles,
-        none if rest is None else rest.state_by_torque,
-    )
+    by_angles = by_torque = np.zeros((sizes["nx"], sizes["nu"]))
+    if rest is not None:
+        by_angles, by_torque = rest.state_by_known_coordinates[:, : sizes["nu"]], rest.state_by_torque
+    samples = [predictor.delay_corrected_measurements(samples, own) for samples in episode.measurements]
+    about = samples, episode.tracking_feedback, predictor.node_values(result.rollout)
+    return NominalTrajectory(predictor.model_functions, own, result.rollout, *about, by_angles, by_torque)
 
 
 @dataclass(frozen=True)
@@ -83,11 +77,10 @@ class ResidualDerivativesAtNodes:
             function = course.model_functions.compiled_sensor_function(samples.sensor)
             read = function(course.node_values.at(used), theta)
             if read.needs_neighbours:
-                raise DataError(
-                    f"'{samples.sensor.group_name}' depends on velocities, accelerations or constraint forces, "
-                    "which cannot be weighted beside noise that drives the motion",
-                    hint=f"set sensors.{samples.sensor.group_name}.use: false, or prescribe the arms' motion",
-                )
+                name = samples.sensor.group_name
+                message = f"'{name}' depends on velocities, accelerations or constraint forces"
+                message += ", which cannot be weighted beside noise that drives the motion"
+                raise DataError(message, hint=f"set sensors.{name}.use: false, or prescribe the arms' motion")
             slopes = np.zeros((*read.output.shape, nx))
             slopes[:, :, :n], slopes[:, :, 2 * n :] = read.by_q, read.by_z
             sample, column = np.nonzero(samples.used_output_mask)

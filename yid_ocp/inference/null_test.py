@@ -146,10 +146,8 @@ def residuals_exceed_noise(
     tests: Sequence[NullTestResult], limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA
 ) -> bool:
     """Whether residuals of one model, fitted or held out, exceed noise, both significantly and by a relevant size."""
-    return (
-        min_bonferroni_p_value(tests) < limits.significance_level
-        and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2
-    )
+    significant = min_bonferroni_p_value(tests) < limits.significance_level
+    return significant and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2
 
 
 def min_bonferroni_p_value(tests: Sequence[NullTestResult]) -> float:

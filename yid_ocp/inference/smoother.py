@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -35,6 +36,10 @@ from yid_ocp.inference.whitening import FilterStateTransition, KalmanStep, kalma
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
+
+_Models = Sequence[LinearResidualModel]
+_Groups = Sequence[SmoothedUnknownGroup]
+_Variances = dict[SmoothedUnknownGroup, float]  # [squared reference]
 
 _MAX_ITERATIONS = 12  # fixed-point iterations on the standard deviations
 _VARIANCE_BOUNDS = (1e-6, 1e7)  # range of the variances, in units of the squared reference
@@ -92,8 +97,7 @@ class SmootherResult:
         return "both" if self.log_evidence["both"] - self.log_evidence[alone] > self.min_log_bayes_factor else alone
 
 
-@dataclass(frozen=True)
-class _Update:
+class _Update(NamedTuple):
     """One interval of the filter, as its backward pass needs it: prediction `mean`, covariance `p` and innovations."""
 
     step: KalmanStep
@@ -102,8 +106,7 @@ class _Update:
     white: Array
 
 
-@dataclass(frozen=True)
-class _Filtered:
+class _Filtered(NamedTuple):
     """The filter of one recording at given variances; its updates where they are kept."""
 
     model: LinearResidualModel
@@ -113,8 +116,7 @@ class _Filtered:
     updates: Sequence[_Update]
 
 
-@dataclass(frozen=True)
-class _Smoothed:
+class _Smoothed(NamedTuple):
     """The disturbance smoother over one recording; disturbances are of unit variance before they are scaled."""
 
     score: Array  # of the disturbances, shape (J, nd, 1 + ntheta)
@@ -142,9 +144,8 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
         design = np.hstack([interval.state_jacobian, interval.unknown_jacobian[:, used]])
         products += interval.unreachable_products
         move = np.hstack([interval.state_transition, interval.unknown_input_matrix[:, used]])
-        step, later, own = kalman_step_and_covariance(
-            p, design, FilterStateTransition(move, np.full(nd, model.interval_correlation))
-        )
+        transition = FilterStateTransition(move, np.full(nd, model.interval_correlation))
+        step, later, own = kalman_step_and_covariance(p, design, transition)
         if math.isinf(own):
             return _Filtered(model, begin, products, math.inf, ())
         white, after = step.update(mean, interval.negative_residual_jacobian)
@@ -190,7 +191,7 @@ class _State:
     log_evidence: float
 
 
-def _run(models: Sequence[LinearResidualModel], variance: Mapping[SmoothedUnknownGroup, float]) -> _State:
+def _run(models: _Models, variance: _Variances) -> _State:
     """All recordings at given variances; without smoothed unknowns where rounding shows."""
 
     def run(model: LinearResidualModel) -> tuple[_Filtered, _Smoothed | None]:
@@ -215,7 +216,7 @@ def _judged(products: Array, log_determinant: float) -> tuple[float, Array, tupl
     return -0.5 * (quadratic + log_determinant + determinant), shift, factor
 
 
-def _scores(models: Sequence[LinearResidualModel], state: _State) -> dict[SmoothedUnknownGroup, tuple[float, float]]:
+def _scores(models: _Models, state: _State) -> dict[SmoothedUnknownGroup, tuple[float, float]]:
     """|score|^2 of every group's unknowns and its expectation, whatever their variance is."""
     found: dict[SmoothedUnknownGroup, tuple[float, float]] = {}
     for model, done in zip(models, state.recordings, strict=True):
@@ -228,9 +229,7 @@ def _scores(models: Sequence[LinearResidualModel], state: _State) -> dict[Smooth
     return found
 
 
-def _refined(
-    models: Sequence[LinearResidualModel], variance: dict[SmoothedUnknownGroup, float]
-) -> tuple[dict[SmoothedUnknownGroup, float], _State]:
+def _refined(models: _Models, variance: _Variances) -> tuple[_Variances, _State]:
     """Variances of the groups at work by MacKay's fixed point: s^2 <- s^2 |score|^2 / its expectation."""
     state = _run(models, variance)
     for _ in range(_MAX_ITERATIONS):
@@ -244,12 +243,8 @@ def _refined(
 
 
 def _selected(
-    models: Sequence[LinearResidualModel],
-    sources: Sequence[SmoothedUnknownGroup],
-    variance: dict[SmoothedUnknownGroup, float],
-    state: _State,
-    limits: SmootherThresholds,
-) -> tuple[dict[SmoothedUnknownGroup, float], _State]:
+    models: _Models, sources: _Groups, variance: _Variances, state: _State, limits: SmootherThresholds
+) -> tuple[_Variances, _State]:
     """Add group after group, that which raises the evidence most, while it rises by more than chance."""
     while sum(v > 0 for v in variance.values()) < limits.max_unknown_groups:
         found = _scores(models, state)
@@ -267,11 +262,7 @@ def _selected(
     return variance, state
 
 
-def _largest_evidences(
-    models: Sequence[LinearResidualModel],
-    variance: Mapping[SmoothedUnknownGroup, float],
-    sources: Sequence[SmoothedUnknownGroup],
-) -> list[tuple[float, float]]:
+def _largest_evidences(models: _Models, variance: _Variances, sources: _Groups) -> list[tuple[float, float]]:
     """`_largest_evidence` of several groups, each on top of the same variances."""
     if not sources:
         return []
@@ -349,7 +340,7 @@ def select_and_smooth_unknowns(
         nothing = _run(models, none)
         sides = {"both": sources, "plant": tuple(s for s in sources if s.kind != "bias")}
         sides["sensor"] = tuple(s for s in sources if s.kind == "bias")
-        found: dict[str, tuple[dict[SmoothedUnknownGroup, float], _State]] = {}
+        found: dict[str, tuple[_Variances, _State]] = {}
         for side, own in sides.items():
             done = [entry for entry in found.values() if {s for s, v in entry[0].items() if v} <= set(own)]
             found[side] = done[0] if done else _selected(models, own, none, nothing, limits)
@@ -359,20 +350,13 @@ def select_and_smooth_unknowns(
         before, after, taken, samples = _explained(models, variance, nothing, state)
         degrees = max(float(samples) - len(nothing.shift), 1.0)
         drop, alternatives = _alternatives(models, variance, state, limits)
-        return SmootherResult(
-            tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True)),
-            variance,
-            drop,
-            # what unknowns of the reference size add to r'r on average is the variance of their scores
-            {s: math.sqrt(limits.detectable_chi2 / max(v, 1e-300)) for s, (_, v) in _scores(models, nothing).items()},
-            before,
-            after,
-            degrees,
-            max(degrees - taken, 1.0),
-            {"none": 0.0} | gain,
-            limits.min_log_bayes_factor,
-            alternatives,
-        )
+        traces = tuple(_trace(model, done, state) for model, done in zip(models, state.recordings, strict=True))
+        # what unknowns of the reference size add to r'r on average is the variance of their scores
+        scores = {source: max(score, 1e-300) for source, (_, score) in _scores(models, nothing).items()}
+        detectable = {source: math.sqrt(limits.detectable_chi2 / score) for source, score in scores.items()}
+        explained, evidence = (before, after, degrees, max(degrees - taken, 1.0)), {"none": 0.0} | gain
+        least = limits.min_log_bayes_factor
+        return SmootherResult(traces, variance, drop, detectable, *explained, evidence, least, alternatives)
 
 
 def force_log_likelihood_coefficients(
@@ -394,10 +378,8 @@ def force_log_likelihood_coefficients(
         jacobian = np.hstack([interval.negative_residual_jacobian, seen])
         rest = np.pad(interval.unreachable_products, (0, count))
         intervals.append(replace(interval, negative_residual_jacobian=jacobian, unreachable_products=rest))
-    products = _forwards(
-        replace(model, intervals=tuple(intervals)), model.unknown_variances_from_groups(variance), False
-    ).products
-    split = 1 + parameters
+    known, split = model.unknown_variances_from_groups(variance), 1 + parameters
+    products = _forwards(replace(model, intervals=tuple(intervals)), known, False).products
     free = products[1:split, 1:split] + np.eye(parameters) / 9.0
     cross = products[split:, 1:split]
     weighed = np.linalg.solve(free, np.column_stack([products[1:split, 0], cross.T]))
@@ -413,9 +395,7 @@ def _trace(model: LinearResidualModel, done: _Smoothed, state: _State) -> Smooth
     return SmoothedUnknowns(model.recording, model.interval_edges, *named, smoothed, np.sqrt(np.maximum(spread, 0.0)))
 
 
-def _explained(
-    models: Sequence[LinearResidualModel], variance: Mapping[SmoothedUnknownGroup, float], plain: _State, state: _State
-) -> tuple[float, float, float, int]:
+def _explained(models: _Models, variance: _Variances, plain: _State, state: _State) -> tuple[float, float, float, int]:
     """r'r without and with the unknowns, degrees of freedom that they take, and the number of samples."""
     before = after = taken = 0.0
     samples = 0
@@ -432,11 +412,8 @@ def _explained(
 
 
 def _alternatives(
-    models: Sequence[LinearResidualModel],
-    variance: dict[SmoothedUnknownGroup, float],
-    state: _State,
-    limits: SmootherThresholds,
-) -> tuple[dict[SmoothedUnknownGroup, float], dict[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]]]:
+    models: _Models, variance: _Variances, state: _State, limits: SmootherThresholds
+) -> tuple[_Variances, dict[SmoothedUnknownGroup, tuple[SmoothedUnknownGroup, ...]]]:
     """Fall of the log evidence without each group, and those that would keep most of it, or all but what is chance."""
     drop, found = dict.fromkeys(variance, 0.0), {}
     for source in [s for s, v in variance.items() if v]:

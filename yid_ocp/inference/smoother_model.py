@@ -16,7 +16,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -27,12 +27,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualDerivativesAtNodes, nominal_trajectory
-from yid_ocp.integrator.step import (
-    AdditionalLoadDerivatives,
-    active_state_mask,
-    applied_joint_torque,
-    linearized_steps,
-)
+from yid_ocp.integrator.step import AdditionalLoadDerivatives, active_state_mask, applied_joint_torque, linearized_steps
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo
@@ -79,8 +74,7 @@ class SmoothedUnknownGroup:
     is_confounded_with_bias: bool = False
 
 
-@dataclass(frozen=True)
-class _LinearizedEpisode:
+class _LinearizedEpisode(NamedTuple):
     """An episode of a problem and the trajectory about which the smoother's model of it is linear."""
 
     problem: EstimationProblem
@@ -92,8 +86,7 @@ class _LinearizedEpisode:
         return self.problem.system
 
 
-@dataclass(frozen=True)
-class _SmootherUnknowns:
+class _SmootherUnknowns(NamedTuple):
     """Unknown forces at coordinates, offsets of constraints, pushes on segments, biases of (samples, column)."""
 
     names: tuple[str, ...]
@@ -368,16 +361,10 @@ def _recording(
         intervals.append(_compressed(observed[rows], moved[:, :ns], by_unknown, state, drive))
     span = h * float(np.median(np.diff(edges)))
     decay = math.exp(-span / _CORRELATION_TIME)
-    return LinearResidualModel(
-        course.episode.name,
-        tuple(intervals),
-        h * edges,
-        *(unknowns.names, unknowns.sources, unknowns.reference),
-        at_rest,
-        np.zeros(ns) if rests else _loose_start(course)[moving],
-        decay,
-        _torque_noise(course, unknowns, span, decay),
-    )
+    told = h * edges, unknowns.names, unknowns.sources, unknowns.reference
+    start = at_rest, np.zeros(ns) if rests else _loose_start(course)[moving]
+    noise = _torque_noise(course, unknowns, span, decay)
+    return LinearResidualModel(course.episode.name, tuple(intervals), *told, *start, decay, noise)
 
 
 def _torque_noise(course: _LinearizedEpisode, unknowns: _SmootherUnknowns, span: float, decay: float) -> Array:

@@ -88,15 +88,13 @@ def assess_goodness_of_fit(
         return GoodnessOfFit(math.nan, math.nan, False)
     residual = evaluation.residual
     if problem.options.weighting == "paper":
-        parts = [
-            ((predicted - samples.value) / samples.std)[samples.used_output_mask]
-            for episode, result in zip(problem.episodes, evaluation.episode_predictions, strict=True)
-            for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True)
-        ]
-        residual = np.concatenate(parts) if parts else np.zeros(0)
-    found = run_null_test(
-        residual_channel_samples(problem), residual / limits.noise_fraction, len(problem.unknown_names)
-    )
+        parts = [np.zeros(0)]
+        for episode, result in zip(problem.episodes, evaluation.episode_predictions, strict=True):
+            for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
+                parts.append(((predicted - samples.value) / samples.std)[samples.used_output_mask])
+        residual = np.concatenate(parts)
+    series = residual_channel_samples(problem)
+    found = run_null_test(series, residual / limits.noise_fraction, len(problem.unknown_names))
     explains = not residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_no_serious_data_issues)
 
@@ -246,10 +244,8 @@ def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]
 
 def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> float:
     """Cost of data and stated priors in units of the noise."""
-    weak, stated = (
-        0.5 * float(np.sum(evaluation.residual[rows] ** 2))
-        for rows in (problem.residual_rows.weak_priors, problem.residual_rows.stated_priors)
-    )
+    rows = problem.residual_rows
+    weak, stated = (0.5 * float(np.sum(evaluation.residual[r] ** 2)) for r in (rows.weak_priors, rows.stated_priors))
     return (evaluation.cost - weak - stated) / problem.data_residual_noise_std**2 + stated
 
 
@@ -386,8 +382,10 @@ def parameter_estimates(
         elif side:
             # the slope of the cost, in units of the noise that the misfit makes
             residual, jacobian = linearization_without_weak_priors(problem, evaluation)
-            pull = abs(float(jacobian[:, at] @ residual)) / max(1.0, _chi2_per_dof(problem, evaluation))
-            interval = _one_sided_interval(value, std, side, pull)
+            pull = std * abs(float(jacobian[:, at] @ residual)) / max(1.0, _chi2_per_dof(problem, evaluation))
+            # on one side 95 %: pull d/std + d^2/(2 std^2) = 2.71/2 at a distance d from the bound
+            reach = std * (math.sqrt(pull**2 + _CHI2_95_ONE_SIDED) - pull)
+            interval = (value, value + reach) if side < 0 else (value - reach, value)
         initial = float(problem.initial_unknowns[at])
         result[name] = ParameterEstimate(value, std, entry.unit, initial, low, high, True, said, interval)
     return result
@@ -395,16 +393,8 @@ def parameter_estimates(
 
 def estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
     """Copies of estimates with the verdict not_trusted, but for fixed and not identifiable parameters."""
-    return {
-        name: replace(entry, verdict="not_trusted") if entry.free and entry.verdict != "not_identifiable" else entry
-        for name, entry in known.items()
-    }
-
-
-def _one_sided_interval(value: float, std: float, side: int, pull: float) -> ConfidenceInterval:
-    """95 % interval of a parameter at its bound: pull d + d^2/(2 std^2) = 2.71/2 at a distance d from it."""
-    reach = std * (math.sqrt((pull * std) ** 2 + _CHI2_95_ONE_SIDED) - pull * std)
-    return (value, value - side * reach) if side < 0 else (value - side * reach, value)
+    doubted = {name for name, entry in known.items() if entry.free and entry.verdict != "not_identifiable"}
+    return {name: replace(e, verdict="not_trusted") if name in doubted else e for name, e in known.items()}
 
 
 VERDICT_PREDICATES: Mapping[str, str] = {

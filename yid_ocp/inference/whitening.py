@@ -34,6 +34,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg.lapack
@@ -42,7 +43,6 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualDerivativesAtNodes, nominal_trajectory
 from yid_ocp.integrator.step import LinearizedStep, active_state_mask, linearized_steps
-from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import applied_torque_error_feedthrough
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
@@ -51,9 +51,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.evaluation import ResidualWhitener
 from yid_ocp.problem.measurements import subtract_estimated_biases
 
-_MIN_TORQUE_GAIN = (
-    0.1  # ratio of acting to recorded torque at which errors of one are converted into those of the other
-)
+_MIN_TORQUE_GAIN = 0.1  # acting over recorded torque at which errors of one are converted into those of the other
 _MAX_ROLLOUTS = 6  # each about the torque offset estimated from the one before
 _TORQUE_BIAS_TOLERANCE = 0.05  # change of the torque offset, in stated standard deviations, below which these end
 
@@ -140,8 +138,7 @@ def kalman_step_and_covariance(
     return KalmanStep(observation, whitening, projected, transition), later, log_determinant
 
 
-@dataclass(frozen=True)
-class _FilterStep:
+class _FilterStep(NamedTuple):
     """One step of a frozen filter of (d, w, b)."""
 
     rows: IntArray  # of the residual
@@ -154,8 +151,7 @@ class _FilterStep:
         return bool(self.kalman.transition.decay[0])
 
 
-@dataclass(frozen=True)
-class _SmoothedInputErrors:
+class _SmoothedInputErrors(NamedTuple):
     """Smoothed input errors of a recording."""
 
     torque_bias: Array  # b, shape (nu,) [N m]
@@ -255,7 +251,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
         here, rows = next(steps, None), rows_of_node[k]
         move, effort, shaken = np.eye(len(kept), len(kept) + 2 * nu), None, None
         if here is not None:
-            move, effort, shaken = _error_step(here, kept, course.tracking_feedback, momentum, errors, k)
+            move, effort, shaken = _error_step(here, kept, course, momentum, errors, k)
         observe = slopes.after[rows] @ move
         by_torque = observe[:, len(kept) : len(kept) + nu].copy()
         observe[:, : len(kept)] += slopes.before[rows]
@@ -276,12 +272,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
 
 
 def _error_step(
-    here: LinearizedStep,
-    kept: IntArray,
-    feedback: TrackingFeedback | None,
-    momentum: Array,
-    errors: InputErrorModel,
-    k: int,
+    here: LinearizedStep, kept: IntArray, course: NominalTrajectory, momentum: Array, errors: InputErrorModel, k: int
 ) -> tuple[Array, Array | None, Array | None]:
     """How (d, w, b) comes through step k: d after it (ns, na), prescribed efforts at the node before it, noise of d.
 
@@ -289,6 +280,7 @@ def _error_step(
     """
     by_state, effort_by_state, shaken = here.state_by_state, here.effort_by_state, None
     by_error, effort_by_error = here.state_by_torque[kept], here.effort_by_torque
+    feedback = course.tracking_feedback
     if feedback is not None and not errors.has_encoder_measurements:
         by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
         by_state[:, feedback.state_indices] -= here.state_by_torque @ feedback.gain[k]
@@ -350,9 +342,8 @@ def _about_smoothed(
     errors = _behind_effects(predictor, episode, own, errors)
     if errors.has_encoder_measurements and feedback is not None:
         inputs = predictor.corrected_inputs_with_momentum_shift(episode, own, (), result.rollout.state[0])
-        guided = inputs.corrected_feedback(
-            feedback, predictor.system.driven_coordinate_indices, episode.measured_driven_angles
-        )
+        driven = predictor.system.driven_coordinate_indices
+        guided = inputs.corrected_feedback(feedback, driven, episode.measured_driven_angles)
         assert guided is not None
         true = (result.rollout.state - found.state_error)[:-1, feedback.state_indices]
         errors = replace(errors, smoothed_reference=true - (guided.reference - feedback.reference))
@@ -372,10 +363,8 @@ def _behind_effects(
         seen = np.abs(by_reading) > _MIN_TORQUE_GAIN
         read = np.where(seen, read, 0.0) / np.where(seen, by_reading, 1.0)
     plain = errors.with_torque_bias_only
-    none, without = (
-        predictor.corrected_inputs(replace(episode, input_errors=own), theta, ()).torque
-        for own in (plain, replace(plain, recorded_torque_noise=read))
-    )
+    both = (replace(episode, input_errors=own) for own in (plain, replace(plain, recorded_torque_noise=read)))
+    none, without = (predictor.corrected_inputs(own, theta, ()).torque for own in both)
     return replace(errors, recorded_torque_noise=read, transmitted_torque_noise=none - without)
 
 
@@ -443,11 +432,10 @@ def problem_without_input_errors(problem: EstimationProblem) -> EstimationProble
 def _with_errors(
     problem: EstimationProblem, changed: Callable[[InputErrorModel], InputErrorModel | None]
 ) -> EstimationProblem:
-    own, held = (
-        [replace(e, input_errors=e.input_errors and changed(e.input_errors)) for e in group]
-        for group in (problem.episodes, problem.held_out)
-    )
-    return problem.with_episodes(own, held)
+    def without(episode: Episode) -> Episode:
+        return replace(episode, input_errors=episode.input_errors and changed(episode.input_errors))
+
+    return problem.with_episodes(list(map(without, problem.episodes)), list(map(without, problem.held_out)))
 
 
 def estimate_recording_torque_biases(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
@@ -489,10 +477,8 @@ def _settled(
     predictor: EpisodePredictor, whitening: WhiteningFilter, episode: Episode, theta: Array, start: Array, frozen: Array
 ) -> WhiteningFilter:
     # what an effect on inputs takes from a torque, its offset no longer has to: that is known without a rollout
-    now, before = (
-        predictor.corrected_inputs(episode, predictor.theta_with_episode_values(episode, t), ()).torque
-        for t in (theta, frozen)
-    )
+    both = (predictor.theta_with_episode_values(episode, t) for t in (theta, frozen))
+    now, before = (predictor.corrected_inputs(episode, own, ()).torque for own in both)
 
     def about(offset: Array) -> WhiteningFilter:
         return replace(whitening, input_errors=replace(whitening.input_errors, torque_bias=offset))

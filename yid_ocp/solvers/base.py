@@ -370,23 +370,12 @@ class _MultiStartSearch:
         result, finish, problem = self._best.result, self._best.evaluation, self._best.weighted
         fit = assess_goodness_of_fit(problem, finish, limits)
         covariance = misfit_widened_covariance(problem, finish, fit)
-        status, message = self._status_and_message()
-        return Solution(
-            status,
-            message,
-            problem.unknown_names,
-            result.x,
-            covariance,
-            parameter_estimates(problem, result.x, finish, covariance, fit),
-            finish.cost,
-            fit,
-            tuple(entry for one in self._fits for entry in one.history),
-            sum(one.n_evaluations for one in self._fits),
-            time.perf_counter() - self._begun,
-            finish if finish.ok else None,
-            self._solver.name,
-            problem,
-        )
+        estimates = parameter_estimates(problem, result.x, finish, covariance, fit)
+        found = *self._status_and_message(), problem.unknown_names, result.x, covariance, estimates, finish.cost, fit
+        history = tuple(entry for one in self._fits for entry in one.history)
+        count, seconds = sum(one.n_evaluations for one in self._fits), time.perf_counter() - self._begun
+        at_end = finish if finish.ok else None
+        return Solution(*found, history, count, seconds, at_end, self._solver.name, problem)
 
     def _status_and_message(self) -> tuple[Status, str]:
         result, finish, solver = self._best.result, self._best.evaluation, self._solver
@@ -413,11 +402,7 @@ def _noting(callback: IterationCallback | None, note: str) -> IterationCallback 
 
 
 def _fit_from(
-    problem: EstimationProblem,
-    solver: Solver,
-    x: Array,
-    callback: IterationCallback | None,
-    known: Sequence[_Fit] = (),
+    problem: EstimationProblem, solver: Solver, x: Array, callback: IterationCallback | None, known: Sequence[_Fit] = ()
 ) -> _Fit:
     """The fit of one start, by shorter horizons where the rollout fails there."""
     history: list[Iterate] = []
@@ -461,9 +446,8 @@ def _fit_from(
 
 def _is_at(fit: _Fit, x: Array) -> bool:
     """Whether a point lies within the noise of a fit: its chi2 there, to second order, is the fit's and less than 1."""
-    if not fit.evaluation.ok or fit.evaluation.jacobian is None:
-        return False
-    return float(np.sum((fit.evaluation.jacobian @ (x - fit.result.x)) ** 2)) < 1.0
+    slopes = fit.evaluation.jacobian if fit.evaluation.ok else None
+    return slopes is not None and float(np.sum((slopes @ (x - fit.result.x)) ** 2)) < 1.0
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:

@@ -47,13 +47,10 @@ class GaussNewton(CheckedSolver):
     """Minimise 1/2 |r(x)|^2 by bounded, damped linear least-squares steps.
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
-    falls by a fair part of what the linear model promised. A short step, or one that damping keeps from promising
-    anything, is no end (`is_stationary_point`). Many steps that are worth nothing beside the noise are one: where the
-    valley is rough (friction that turns, fast waves over many seconds) the linear model promises what no step keeps.
-
-    References
-    ----------
-    Nocedal and Wright (2006), Numerical Optimization, chapter 10, doi:10.1007/978-0-387-40065-5.
+    falls by a fair part of what the linear model promised (Nocedal and Wright 2006, Numerical Optimization, chapter 10,
+    doi:10.1007/978-0-387-40065-5). A short step, or one that damping keeps from promising anything, is no end
+    (`is_stationary_point`). Many steps that are worth nothing beside the noise are one: where the valley is rough
+    (friction that turns, fast waves over many seconds) the linear model promises what no step keeps.
     """
 
     max_iterations: Annotated[int, Ge(1), OptionInfo("limit on accepted steps")] = 60
@@ -154,8 +151,6 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
 class SingleShooting(CheckedSolver):
     """Minimise the cost by SciPy's L-BFGS-B on unknowns scaled to order one.
 
-    References
-    ----------
     Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
     """
 
@@ -210,11 +205,10 @@ class SingleShooting(CheckedSolver):
 class SteepestDescent(CheckedSolver):
     """Projected steepest descent: x <- P(x - s g), P the projection on the bounds, s by Armijo backtracking.
 
-    The gradient comes from the adjoint. Unscaled on purpose: this is what the paper did.
-
-    The first length tried in an iteration is twice the last accepted one, as in the paper, or Barzilai and Borwein's
-    from the change of the gradient (`spectral`), which needs far fewer iterations; most of these pay only a few steps
-    later and want a `nonmonotone_memory` of about 10.
+    The gradient comes from the adjoint. Unscaled on purpose: this is what the paper did. The first length tried in an
+    iteration is twice the last accepted one, as in the paper, or Barzilai and Borwein's from the change of the gradient
+    (`spectral`), which needs far fewer iterations; most of these pay only a few steps later and want a
+    `nonmonotone_memory` of about 10.
 
     References
     ----------

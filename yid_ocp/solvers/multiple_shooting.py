@@ -118,10 +118,6 @@ class MultipleShooting(CheckedSolver):
         """Minimize the problem's cost from `start` with IPOPT, or by condensed Gauss-Newton steps."""
         if self.condensing:
             return self._by_condensing(problem, start, IterationRecorder(callback))
-        self._check_ipopt_settings()
-        return self._by_ipopt(problem, start, IterationRecorder(callback))
-
-    def _check_ipopt_settings(self) -> None:
         told: tuple[str, ...] = ()
         if self.hessian not in ("gauss_newton", "exact"):
             hint = "limited-memory updates cannot learn thousands of node states in a few dozen iterations"
@@ -134,6 +130,7 @@ class MultipleShooting(CheckedSolver):
             told = f"node_interval = {self.node_interval} without condensing", "node_interval", "1", hint
         if told:
             raise SolverError(told[0], where=f"solver.{told[1]}", allowed=told[2], hint=told[3])
+        return self._by_ipopt(problem, start, IterationRecorder(callback))
 
     def _by_ipopt(self, problem: EstimationProblem, start: Array, recorder: IterationRecorder) -> SolverResult:
         program = transcribe(problem, start)
@@ -163,29 +160,19 @@ class MultipleShooting(CheckedSolver):
 
     def _solver_options(self, cost_factor: float) -> dict[str, Any]:
         """Options of CasADi's IPOPT interface."""
+        told = {"max_iter": self.max_iterations, "tol": self.tolerance, "mu_init": self.mu_init}
+        acceptable = {"tol": 1e-3, "iter": 4, "constr_viol_tol": 1e-6, "obj_change_tol": 1e-5}
         ipopt = {
-            "obj_scaling_factor": cost_factor,
-            "print_level": 0,
-            "sb": "yes",
-            "max_iter": self.max_iterations,
-            "tol": self.tolerance,
-            "mu_init": self.mu_init,
-            "nlp_scaling_method": "none",
+            **{"obj_scaling_factor": cost_factor, "nlp_scaling_method": "none", "print_level": 0, "sb": "yes"},
             # the Hessian is positive definite by construction: MUMPS, which counts wrong signs among nearly
             # vanishing pivots, would have IPOPT regularise and factorise again
             "neg_curv_test_tol": 1e-11 if self.hessian == "gauss_newton" else 0.0,
             # measured on 50 variables and 500 steps: a sixth of the time of MUMPS's own choice
-            "mumps_scaling": 8,
-            "mumps_pivot_order": 0,
-            "mumps_permuting_scaling": 0,
-            "bound_relax_factor": 0.0,
-            "acceptable_tol": 1e-3,
-            "acceptable_iter": 4,
-            "acceptable_constr_viol_tol": 1e-6,
-            "acceptable_obj_change_tol": 1e-5,
-            "fixed_variable_treatment": "make_parameter",
+            **{"mumps_scaling": 8, "mumps_pivot_order": 0, "mumps_permuting_scaling": 0},
+            **{"bound_relax_factor": 0.0, "fixed_variable_treatment": "make_parameter"},
+            **{f"acceptable_{name}": value for name, value in acceptable.items()},
         }
-        return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **self.ipopt}}
+        return {**QUIET_NLPSOL_OPTIONS, "no_nlp_grad": True, "ipopt": {**ipopt, **told, **self.ipopt}}
 
     def _ipopt_status(self, returned: str, defect: float) -> tuple[Status, str]:
         closed = f"largest defect {defect:.1e}"
@@ -393,11 +380,9 @@ class _ShootingIntervals:
 
     def moved(self, nodes: list[Array], now: _Linearization, step: Array, factor: float) -> list[Array]:
         """Node states after a part of a step of the unknowns that also closes as large a part of the defects."""
-        columns = self.problem.unknowns.unknown_indices_of_recording
-        return [
-            state + factor * (by_x @ step[columns(i)] + by_defect)
-            for i, (state, (by_x, by_defect)) in enumerate(zip(nodes, now.node_slopes, strict=True))
-        ]
+        columns = map(self.problem.unknowns.unknown_indices_of_recording, range(len(nodes)))
+        parts = zip(nodes, now.node_slopes, columns, strict=True)
+        return [state + factor * (by_x @ step[own] + by_defect) for state, (by_x, by_defect), own in parts]
 
     def linearize(self, x: Array, nodes: list[Array]) -> _Linearization | str:
         """Residual and derivatives about a point; the message of a rollout that failed."""

@@ -12,7 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -84,8 +84,7 @@ class ProgramVectorLayout:
         return index
 
 
-@dataclass(frozen=True)
-class _UserTerms:
+class _UserTerms(NamedTuple):
     """User-defined objective term and constraint rows of a program."""
 
     objective: ca.MX

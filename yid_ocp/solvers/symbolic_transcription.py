@@ -15,8 +15,9 @@ the states of their recording, with their standard deviations as priors: at the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -46,6 +47,8 @@ def transcribe(
 ) -> NonlinearProgram:
     """Transcribe an estimation problem into a nonlinear program with a node at every step.
 
+    The equations: Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
+
     Parameters
     ----------
     initial_unknowns : array_like, optional, shape (nx,)
@@ -65,10 +68,6 @@ def transcribe(
     SolverError
         An effect on recorded inputs or times is at work, a free parameter has a known value in a recording, or two
         recordings have one name.
-
-    References
-    ----------
-    Johnson and Murphey (2009), IEEE Trans. Robotics 25(6):1249, doi:10.1109/TRO.2009.2032955.
     """
     problem = _about_zero(problem)
     _check_transcribable(problem)
@@ -129,8 +128,7 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
     return x
 
 
-@dataclass(frozen=True)
-class _Places:
+class _Places(NamedTuple):
     """Places of a recording's unknowns and inputs; `errors` of each step's torque, `first` of the first angles."""
 
     free: IntArray
@@ -155,8 +153,7 @@ class _Places:
         return np.hstack([self.torque.T, self.gain.T, self.reference.T])
 
 
-@dataclass(frozen=True, eq=False)
-class _FreeParameterSymbols:
+class _FreeParameterSymbols(NamedTuple):
     """Symbols of the parameters theta: of free ones, nominal values of all, and theta, free symbols where free."""
 
     names: tuple[str, ...]
@@ -165,8 +162,7 @@ class _FreeParameterSymbols:
     theta: ca.SX
 
 
-@dataclass(frozen=True, eq=False)
-class _DrivenStage:
+class _DrivenStage(NamedTuple):
     """One stage as a function of local variables v = (free, x_k, x_{k+1}, lam_k, errors) and data (ubar, K, xbar).
 
     `function` gives the stage's rows; `effort` of prescribed joints and `torque` of driven ones have their slopes by v.
@@ -256,35 +252,28 @@ class _Maker:
         self._w.name("theta", theta[:, None], problem.shared_parameters)
         constraints: list[ProgramTerm] = []
         residuals: list[ResidualTerm] = []
-        ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
+        at_ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
         for i, episode in enumerate(problem.episodes):
             at = problem.unknowns.unknown_indices_of_recording(i)[shared : shared + len(problem.local_parameters)]
             local = self._w.extend(x[at], low[at], high[at])
             self._w.name(f"local[{episode.name}]", local[:, None], problem.local_parameters)
             columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
-            ridge.append(local)
+            at_ridge.append(local)
             places, errors = self._laid_out(i, found, np.concatenate([theta, local]))
             begun, prior = self._begun(episode, places)
-            constraints += [begun, self._moved(episode, places)]
+            named, at_steps = self._stage.residual_names, (places.stages(), places.inputs(), places.theta)
+            stages = ProgramTerm(f"step[{episode.name}]", named, self._driven(episode).function, *at_steps)
+            constraints += [begun, stages]
             used = [samples for samples in episode.measurements if samples.n_residuals]
             residuals += [*(self._sampled(episode, samples, places) for samples in used), *prior, *errors]
         residuals += self._priors(columns)
-        index = np.concatenate(ridge)
         order = [k for k, _ in sorted(columns.items(), key=lambda entry: entry[1])]
         lower, upper, start = (np.concatenate(part) for part in (self._w.lower, self._w.upper, self._w.values))
-        return NonlinearProgram(
-            self._w.blocks,
-            self._p.blocks,
-            tuple(constraints),
-            tuple(residuals),
-            lower,
-            upper,
-            start,
-            np.concatenate([np.zeros(0), *self._p.values]),
-            RidgeRegularization(index, problem.unknown_scales[order], MIN_RIDGE_FACTOR),
-            ca.MX.sym("w", self._w.size),
-            ca.MX.sym("p", self._p.size),
-        )
+        ridge = RidgeRegularization(np.concatenate(at_ridge), problem.unknown_scales[order], MIN_RIDGE_FACTOR)
+        vectors = lower, upper, start, np.concatenate([np.zeros(0), *self._p.values])
+        terms = tuple(constraints), tuple(residuals)
+        symbols = ca.MX.sym("w", self._w.size), ca.MX.sym("p", self._p.size)
+        return NonlinearProgram(self._w.blocks, self._p.blocks, *terms, *vectors, ridge, *symbols)
 
     def _laid_out(self, i: int, found: NodeStateGuess, free: IntArray) -> tuple[_Places, list[ResidualTerm]]:
         """The unknowns of a recording at their guess and what drives it; priors of errors."""
@@ -347,7 +336,8 @@ class _Maker:
         errors, steps, name = episode.input_errors, episode.grid.steps, episode.name
         if errors is None:
             return np.zeros((steps, 0), np.int64), np.zeros(0, np.int64), []
-        driven, nu = self._problem.system.driven, self._sizes["nu"]
+        driven, nu, v = self._problem.system.driven, self._sizes["nu"], ca.SX.sym("v", self._sizes["nu"])
+        itself = LocalVariableFunction("itself", [v, ca.SX(0, 1), ca.SX(0, 1)], v)
         sample, of_step = np.unique(errors.sample_of_step, return_inverse=True)
         spread = errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         wanted = [("torque_error", errors.torque_std, len(sample)), ("torque_offset", errors.torque_bias_std, 1)]
@@ -362,18 +352,13 @@ class _Maker:
             self._w.name(f"{label}[{name}]", places[label].T, driven)
             weight = self._p.add(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
             data = np.zeros((count, 0), np.int64)
-            term = ProgramTerm(f"{label}[{name}]", driven, _itself(nu), places[label], data, weight[:0, 0])
+            term = ProgramTerm(f"{label}[{name}]", driven, itself, places[label], data, weight[:0, 0])
             priors.append(ResidualTerm(term, ca.DM.eye(nu * count), np.tile(weight[:, 0], count)))
         offset = np.broadcast_to(places["torque_offset"], (steps, nu))
         per_step = [places["torque_error"][of_step.ravel()], offset]
         per_step += [places["angle_error"]] if "angle_error" in places else []
         first = places.get("first_angle_error", np.zeros((1, 0), np.int64))[0]
         return np.hstack(per_step), first, priors
-
-    def _moved(self, episode: Episode, places: _Places) -> ProgramTerm:
-        """Every step's equations."""
-        at = places.stages(), places.inputs(), places.theta
-        return ProgramTerm(f"step[{episode.name}]", self._stage.residual_names, self._driven(episode).function, *at)
 
     def _begun(self, episode: Episode, places: _Places) -> tuple[ProgramTerm, list[ResidualTerm]]:
         """What fixes the first state, and the prior of what is free of it."""
@@ -534,11 +519,6 @@ def _kind(episode: Episode) -> tuple[bool, bool]:
     """Whether a recording's stage is under the tracking filter, and whether errors of torques are unknowns."""
     feedback, errors = episode.tracking_feedback, episode.input_errors
     return feedback is not None and not (errors and errors.has_encoder_measurements), errors is not None
-
-
-def _itself(size: int) -> LocalVariableFunction:
-    v = ca.SX.sym("v", size)
-    return LocalVariableFunction("itself", [v, ca.SX(0, 1), ca.SX(0, 1)], v)
 
 
 def _constant(matrix: scipy.sparse.sparray | scipy.sparse.spmatrix) -> ca.DM:
