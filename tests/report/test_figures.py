@@ -110,14 +110,11 @@ def test_a_recording_alone_is_a_scene_where_it_has_places(single_arm):
 @pytest.fixture
 def drawn(monkeypatch):
     """Figures that were saved."""
-    figures, save = [], Figure.savefig
-
-    def keep(self, *arguments, **settings):
-        figures.append(self)
-        return save(self, *arguments, **settings)
-
-    monkeypatch.setattr(Figure, "savefig", keep)
-    return figures
+    saved, save = [], Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda self, *given, **more: (saved.append(self), save(self, *given, **more))
+    )
+    return saved
 
 
 def pattern(height=6, width=8, **more):
@@ -145,11 +142,9 @@ def test_a_picture_shows_the_pattern_with_its_names(drawn, tmp_path):
     assert [label.get_text() for label in axes.get_xticklabels()] == list(entry.column_labels)
     assert [label.get_text() for label in axes.get_yticklabels()] == list(entry.row_labels)
     np.testing.assert_array_equal(axes.get_yticks(), np.arange(6))
-    lines = [line.get_xydata() for line in axes.lines]
-    across = [float(line[0, 1]) for line in lines if line[0, 1] == line[1, 1]]
-    along = [float(line[0, 0]) for line in lines if line[0, 0] == line[1, 0]]
     # an empty block has no line of its own
-    assert (across, along) == ([3.5], [4.5])
+    (along, _), (_, across) = (line.get_data() for line in axes.lines)
+    assert (list(along), list(across)) == ([4.5, 4.5], [3.5, 3.5])
     top, right = axes.child_axes
     assert [label.get_text() for label in top.get_xticklabels()] == ["q1", "lam"]
     assert list(top.get_xticks()) == [2.0, 6.0]
@@ -207,10 +202,9 @@ def test_a_map_keeps_its_groups_together_and_its_gaps_empty():
     values = np.array([1.0, np.nan, -4000.0])
     rows = [TimeHeatMapRow(name, group, values, ["", "", ""]) for name, group in (("x", "a"), ("y", "a"), ("z", "b"))]
     figure = figures.time_heat_map_figure(np.array([0.0, 0.1, 0.2, 0.3]), rows, "deviations")
-    heat = figure.data[0]
-    assert heat.z[0][1] is None
+    [heat] = figure.data
+    assert (heat.z[0][1], len(heat.x)) == (None, 4)
     assert heat.zmax == -heat.zmin > 0
-    assert len(heat.x) == 4
     assert "1000" in heat.colorbar.ticktext
     assert [a.text for a in figure.layout.annotations] == ["color: deviations", "a", "b"]
     assert len(figure.layout.shapes) == 1
@@ -237,9 +231,8 @@ def test_long_curves_are_thinned_and_gaps_stay():
     t = np.linspace(0.0, 10.0, 50_000)
     measured = np.sin(t)
     measured[:10_000] = np.nan
-    figure = figures.time_plots_figure(
-        figures.prediction_and_residual_plots("x", "m", t, measured, 0 * t + 1e-3, {"predicted": np.sin(t)})
-    )
+    plots = figures.prediction_and_residual_plots("x", "m", t, measured, 0 * t + 1e-3, {"predicted": np.sin(t)})
+    figure = figures.time_plots_figure(plots)
     assert max(len(trace.x) for trace in figure.data) <= figures._MAX_CURVE_POINTS
     assert np.isnan(figure.data[0].y[0])
 

@@ -1,19 +1,35 @@
-"""Every command's page: it says what the terminal says, and browsers draw it on any screen, in light and dark."""
+"""Pages: of a result alone, of a solve and of a diagnosis; each says what the terminal says, in any browser."""
 
 from __future__ import annotations
 
+import base64
+import gzip
 import html
+import importlib
 import json
+import logging
 import re
 import shutil
 import subprocess
+import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import plotly.offline
 import pytest
 
+from yid_ocp.diagnosis import Thresholds, diagnose
+from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, _Overspeed
+from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
+from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
-from yid_ocp.report.html import _script_name, _shared_script, write_shared_plotly_script
+from yid_ocp.report.html import _script_name, _shared_script, write_report, write_shared_plotly_script
+from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import SUMMARY_BY_FORMAT
+from yid_ocp.workflow.build_problem import load_problem
+from yid_ocp.workflow.diagnose import _held_out_predictions
+from yid_ocp.workflow.solve import solve_result
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 COMMANDS = {
@@ -25,7 +41,7 @@ COMMANDS = {
     "diagnose": ("--set", "diagnosis.candidates=[joint_coulomb, effort_offset]", "--set", "diagnosis.max_effects=1"),
     "compare": ("--set", "compare.methods={gauss_newton: {}, single_shooting: {}}"),
 }
-SIZES = [(1400, "light"), (400, "dark")]
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open pages with")
 PROBE = """
 <script>
 addEventListener("load", async () => {
@@ -60,8 +76,191 @@ addEventListener("load", async () => {
 
 
 def text_of(page: str) -> str:
-    body = re.sub(r"<script.*?</script>", "", page[page.index("<body>") :], flags=re.DOTALL)
+    body = re.sub(r"<script.*?</script>", "", page.split("<body>")[1], flags=re.DOTALL)
     return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", body)).split())
+
+
+def written(findings: ReportData, folder: Path) -> str:
+    assert write_report(folder / "r.html", findings)
+    return (folder / "r.html").read_text(encoding="utf-8")
+
+
+# -- of a solve -------------------------------------------------------------------------------------------------------
+
+
+def findings(solved, **changes) -> ReportData:
+    problem, solution, *_ = solved
+    made = {"command": "yid-ocp solve p.yaml", "date": "2026-01-02 03:04:05+00:00"}
+    result = solve_result(problem, solution, []) | made | {"inputs": {"a": "0" * 64}, "versions": {"python": "3"}}
+    return ReportData("run <one>", "A & B.", result | changes, problem, solution)
+
+
+def test_a_whole_report_is_one_self_contained_page(solved_pendulum, tmp_path):
+    page = written(findings(solved_pendulum), tmp_path)
+    body = page[page.index("<body>") :]
+    assert not re.search(r"<(script|link|img)[^>]+(src|href)=", page)
+    packed = re.search(r'id="packed">([^<]+)</script>', page).group(1)
+    assert gzip.decompress(base64.b64decode(packed)).decode() == plotly.offline.get_plotlyjs()
+    assert len(page) < 2.5e6
+    assert "<title>run &lt;one&gt;</title>" in page
+    assert "A &amp; B." in body
+    order = ("verdict", "scene", "estimates", "fit", "search", "numbers", "inputs")
+    assert tuple(re.findall(r'<section id="(\w+)">', body)) == order
+    for known in ("yid-ocp solve p.yaml", "2026-01-02 03:04:05+00:00", "0" * 64, "python 3", "joints.effort.shoulder"):
+        assert known in body
+    assert '<p class="said">3 of 3' in body
+    opened = []
+    for end, tag in re.findall(r"<(/?)([a-z]\w*)", re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)):
+        if end:
+            assert opened.pop() == tag
+        elif tag not in ("meta", "br", "img", "link", "input", "hr"):
+            opened.append(tag)
+    assert opened == []
+
+
+def test_a_failed_solve_gets_no_verdicts(solved_pendulum, tmp_path):
+    problem, solution, _ = solved_pendulum
+    failed = replace(solution, evaluation=None, cost=float("nan"))
+    data = findings((problem, failed), status="failed", message="step 3 did not converge")
+    body = written(data, tmp_path).split("<body>")[1]
+    assert '<p class="said">failed: step 3 did not converge' in body
+    assert 'class="verdict' not in body
+    assert '<section id="fit">' not in body
+
+
+def test_sections_may_have_nothing_to_say():
+    empty = ReportData("x", "", {"format": "other/1"})
+    assert render_sections(empty, environment=None) == []
+
+
+def test_a_new_section_is_a_file_and_a_template(solved_pendulum, tmp_path, monkeypatch):
+    (tmp_path / "weather_section.py").write_text(
+        "from yid_ocp.report.sections import register_report_section\n\n\n"
+        "@register_report_section('weather', 15, 'The weather')\n"
+        "def prepare(findings):\n"
+        "    return {'sky': 'blue & dry'} if 'parameters' in findings.result else None\n"
+    )
+    (tmp_path / "weather.html").write_text("<p>The sky was {{ sky }}.</p>")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(REPORT_SECTIONS, "_entries", dict(REPORT_SECTIONS._entries))
+    importlib.import_module("weather_section")
+    monkeypatch.delitem(sys.modules, "weather_section")
+    body = written(findings(solved_pendulum), tmp_path).split("<body>")[1]
+    assert "<h2>The weather</h2>" in body
+    assert "The sky was blue &amp; dry." in body
+    assert body.index('id="verdict"') < body.index('id="weather"') < body.index('id="fit"')
+    assert REPORT_SECTIONS["weather"].prepare_context(ReportData("x", "", {"format": "other/1"})) is None
+
+
+def test_every_template_has_its_section(repository):
+    templates = {path.stem for path in (repository / "yid_ocp" / "report" / "templates").glob("*.html")}
+    assert templates - {"page", "blocks", "figures"} < set(REPORT_SECTIONS)
+
+
+def test_without_the_extra_there_is_a_notice_and_no_report(solved_pendulum, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("yid_ocp.report.html.util.find_spec", lambda name: None)
+    with caplog.at_level(logging.WARNING):
+        assert not write_report(tmp_path / "r.html", findings(solved_pendulum))
+    assert "yid-ocp[report]" in caplog.text
+    assert not (tmp_path / "r.html").exists()
+
+
+def test_a_report_that_cannot_be_written(solved_pendulum, tmp_path):
+    with pytest.raises(OutputError, match="does not exist"):
+        write_report(tmp_path / "no" / "r.html", findings(solved_pendulum))
+
+
+# -- of a diagnosis ---------------------------------------------------------------------------------------------------
+
+KNOWN = {"command": "yid-ocp diagnose 'a b.yaml'", "next_plan": None, "versions": {"python": "3"}, "date": "today"}
+CHAPTERS = ("gap", "where", "which", "alike", "curves", "absorbed")
+
+
+@pytest.fixture(scope="module")
+def found(rubbing, solved_pendulum):
+    """Findings on a pendulum: friction in the elbow that is named, that no candidate explains, and none at all."""
+    problem, limits = load_problem(rubbing), Thresholds(max_effects=1)
+    return {
+        "effect": diagnose(problem, ["joint_coulomb", "effort_offset"], thresholds=limits),
+        "unknown": diagnose(problem, ["effort_offset"], thresholds=limits),
+        "no_gap": diagnose(solved_pendulum[0], ["joint_coulomb", "effort_offset"], thresholds=limits),
+    }
+
+
+def page_of(finding, folder) -> str:
+    result = json.loads(json.dumps(finding.to_dict() | KNOWN))
+    more = {"finding": finding, "predictions": _held_out_predictions(finding)}
+    return written(ReportData("run", "", result, section_data=more), folder)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "chapters"),
+    [
+        ("effect", CHAPTERS),
+        ("unknown", ("gap", "where", "which", "alike", "curves")),
+        ("no_gap", ("gap", "which", "alike", "curves")),
+    ],
+)
+def test_every_verdict_has_its_chapters(found, verdict, chapters, tmp_path):
+    finding = found[verdict]
+    assert finding.verdict == verdict
+    page = page_of(finding, tmp_path)
+    assert tuple(re.findall(r'<h3 id="(\w+)">', page)) == chapters
+    text = text_of(page)
+    assert text.index(" ".join(finding.to_dict()["summary"].split())) < text.index("How large the gap is")
+    assert text.index("How large the gap is") < text.index("yid-ocp diagnose 'a b.yaml'")
+    assert page.count('<div class="plot"') >= len(chapters)
+    assert "nan" not in text
+
+
+def test_the_words_beside_the_pictures_say_what_is_seen(found, tmp_path):
+    [first, *others] = found["effect"].nominal_changes
+    moved = replace(first, value_after=2 * first.value_before)
+    text = text_of(page_of(replace(found["effect"], nominal_changes=(moved, *others)), tmp_path))
+    assert "The error of joints.effort.elbow changes most" in text
+    assert "A gap would have shown at" in text
+    assert "By evidence the gap lies in the mechanics or what the effort sensors read" in text
+    assert "Closed by joint_coulomb@elbow" in text
+    assert "the surest value is that of elbow" in text
+    assert f"{moved.name} goes from" in text
+
+
+def test_a_map_without_a_sure_value_shows_what_was_expected_beforehand(found, tmp_path):
+    finding = found["effect"]
+    smoothed = finding.smoother_result
+    trace = smoothed.smoothed_unknowns[0]
+    prior = np.sqrt([smoothed.group_variance[source] for source in trace.unknown_groups])
+    vague = replace(trace, posterior_std=np.broadcast_to(0.9 * prior, trace.posterior_std.shape))
+    page = page_of(replace(finding, smoother_result=replace(smoothed, smoothed_unknowns=(vague,))), tmp_path)
+    assert "value in standard deviations expected beforehand" in page
+    assert "take the picture for a hint only" in text_of(page)
+
+
+def test_a_result_alone_gives_words_and_tables(found, tmp_path):
+    result = found["effect"].to_dict() | KNOWN
+    page = written(ReportData("run", "", result), tmp_path).split("<body>")[1]
+    assert "joint_coulomb@elbow" in page
+    assert '<div class="plot"' not in page
+
+
+def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
+    t = np.linspace(0, 2, 21)
+    pulse = DetectedForcePulse(0.5, 1.0, 0.7, False, 0.05, 1e-9)
+    event = DisturbanceEvent("run", "elbow", "elbow", "force", 0.5, 1.0, 0.7, pulse.impulse, 0.0125, "N m", pulse)
+    events = EventSet(
+        (event,),
+        (_Overspeed("run", "elbow", 1.5),),
+        (ForceEstimate("run", "elbow", "elbow", "N m", t, pulse.filtered_force_at(t), np.eye(21), 0.1 + 0 * t, 0 * t),),
+    )
+    page = page_of(replace(found["no_gap"], events=events), tmp_path)
+    assert 'id="events"' in page
+    text = text_of(page)
+    assert f"{pulse.impulse:.3g} ± {0.0125:.2g}" in text
+    assert "From 1.5 s on nothing is judged in run" in text
+    assert 'id="events"' not in page_of(found["no_gap"], tmp_path)
+
+
+# -- of every command -------------------------------------------------------------------------------------------------
 
 
 def opened(page: Path, width: int, scheme: str, folder: Path) -> dict:
@@ -117,13 +316,13 @@ def test_a_page_says_what_the_terminal_says(solved_page):
     assert_same_words("\n".join([*said, "run folder: x"]), text_of(solved_page.read_text(encoding="utf-8")))
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open pages with")
-@pytest.mark.parametrize(("width", "scheme"), SIZES)
+@needs_browser
+@pytest.mark.parametrize(("width", "scheme"), [(1400, "light"), (400, "dark")])
 def test_a_browser_draws_a_page_without_a_complaint(solved_page, width, scheme, tmp_path):
     check_in_browser(solved_page, width, scheme, tmp_path)
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium to open pages with")
+@needs_browser
 def test_a_page_finds_the_script_that_its_folder_shares(solved_page, tmp_path):
     page = tmp_path / "runs" / "one" / "report.html"
     page.parent.mkdir(parents=True)
