@@ -39,6 +39,7 @@ _LAYOUT: dict[str, Any] = {
     "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": MEASURED_COLOR, "activecolor": LINE_COLORS[0]},
 }
 _MIN_CLOSURE_PERCENT = -50.0  # lower end of an axis of closures [%]
+_Curve = tuple[Sequence[float], Sequence[float]]
 
 
 def _line_color(i: int) -> str:
@@ -65,16 +66,13 @@ def _styled_figure(height: int, x: str, y: str, base: Figure | None = None) -> F
     return figure
 
 
-def _add_curves(
-    figure: Figure,
-    curves: Iterable[tuple[str, Sequence[float], Sequence[float]]],
-    later_dash: str = "solid",
-) -> None:
-    """Add one line with markers for each (name, x, y), each in its own color; `later_dash` once the colors repeat."""
-    for i, (name, x, y) in enumerate(curves):
+def _add_curves(figure: Figure, curves: Iterable[tuple[str, _Curve]], later_dash: str = "solid") -> Figure:
+    """Add one line with markers for each name and (x, y), each in its own color; `later_dash` once they repeat."""
+    for i, (name, (x, y)) in enumerate(curves):
         line = {"color": _line_color(i), "dash": "solid" if i < len(LINE_COLORS) else later_dash}
         if len(x):
             figure.add_scatter(x=list(x), y=list(y), mode="lines+markers", name=name, line=line)
+    return figure
 
 
 def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> Figure:
@@ -83,8 +81,7 @@ def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> Figure:
     figure.update_yaxes(**_POWERS)
     ends = [i for i in range(1, len(costs) + 1) if i == len(costs) or notes[i] != notes[i - 1]]
     spans = zip([0, *ends], ends, strict=False)
-    _add_curves(figure, ((notes[i] or "whole recordings", range(i, j), costs[i:j]) for i, j in spans))
-    return figure
+    return _add_curves(figure, ((notes[i] or "whole recordings", (range(i, j), costs[i:j])) for i, j in spans))
 
 
 @dataclass(frozen=True)
@@ -129,10 +126,8 @@ def prediction_and_residual_plots(
         for name, y in lines.items()
     }
     noise = float(np.median(std[seen])) if seen.any() else 0.0
-    above = TimePlotData(f"{title} [{unit}]", drawn, t, measured)
-    return above, TimePlotData(
-        f"residual [{shown}]", left, band_half_height=2 * factor * noise or None, is_low_row=True
-    )
+    above, band = TimePlotData(f"{title} [{unit}]", drawn, t, measured), 2 * factor * noise or None
+    return above, TimePlotData(f"residual [{shown}]", left, band_half_height=band, is_low_row=True)
 
 
 def time_plots_figure(
@@ -150,9 +145,7 @@ def time_plots_figure(
     inner = sum(heights) + _ROW_GAP * (len(curves) - 1)
     # all at once: a figure that grows by one trace after the other is checked anew each time
     axes: dict[str, Any] = {}
-    traces: list[dict[str, Any]] = []
-    shapes: list[dict[str, Any]] = []
-    titles: list[dict[str, Any]] = []
+    traces, shapes, titles = list[dict[str, Any]](), list[dict[str, Any]](), list[dict[str, Any]]()
     told: set[str] = set()
     top, last = 1.0, str(len(curves)) if len(curves) > 1 else ""
     for row, (curve, height) in enumerate(zip(curves, heights, strict=True), start=1):
@@ -162,15 +155,14 @@ def time_plots_figure(
         domain = [max(top - height / inner, 0.0), top]
         axes[f"yaxis{number}"] = {"anchor": f"x{number}", "domain": domain, "nticks": 4, **_AXIS_STYLE}
         at = {"type": "scatter", "xaxis": f"x{number}", "yaxis": f"y{number}"}
-        if len(curve.t):
-            marker = {"color": dots, "size": 3 if len(curve.t) > 60 else 6}
-            shown = {"name": "measured", "showlegend": "measured" not in told, "legendgroup": "measured"}
-            traces.append({**_thinned(curve.t, curve.measured), "mode": "markers", "marker": marker, **shown, **at})
-            told.add("measured")
+        dot = {"color": dots, "size": 3 if len(curve.t) > 60 else 6}
+        drawn = [("measured", curve.t, curve.measured, {"mode": "markers", "marker": dot})] if len(curve.t) else []
         for name, (t, value) in curve.lines.items():
             # what is measured seldom may have neighbours on neither side
             mode = "lines+markers" if curve.is_low_row and len(t) <= 60 else "lines"
             style = {"mode": mode, "line": {"color": colors[name], "width": 1.5}, "marker": {"size": 4}}
+            drawn.append((name, t, value, style))
+        for name, t, value, style in drawn:
             shown = {"name": name, "showlegend": name not in told, "legendgroup": name}
             traces.append({**_thinned(t, value), **style, **shown, **at})
             told.add(name)
@@ -180,7 +172,7 @@ def time_plots_figure(
             mark = _shade(number, (begin, end), (0, 1), along_time=True)
             shapes.append(mark | {"fillcolor": AFTER_COLOR, "opacity": 0.2})
         # beside a low row a turned title has no room, and collides with that of the next one
-        titles.append(_axis_title(curve, top))
+        titles.append({**_axis_title(curve.axis_title, top), "font": {"size": 12}})
         top -= (height + _ROW_GAP) / inner
     axes[f"xaxis{last}"]["title"] = {"text": "time [s]"}
     figure = go.Figure(traces, {**_LAYOUT, **axes, "shapes": shapes, "annotations": titles})
@@ -196,9 +188,10 @@ def _shade(number: str, x: tuple[float, float], y: tuple[float, float], *, along
     return {"type": "rect", "xref": domain[0], "yref": domain[1], **corners, **_SHADE}
 
 
-def _axis_title(curve: TimePlotData, y: float) -> dict[str, Any]:
+def _axis_title(text: str, y: float) -> dict[str, Any]:
+    """A text above the left end of an axis."""
     at = {"x": 0, "xref": "paper", "xanchor": "left", "y": y, "yref": "paper", "yanchor": "bottom"}
-    return {"text": curve.axis_title, "showarrow": False, "font": {"size": 12}, **at}
+    return {"text": text, "showarrow": False, **at}
 
 
 def lines_over_time_figure(curve: TimePlotData) -> Figure:
@@ -213,7 +206,7 @@ def lines_over_time_figure(curve: TimePlotData) -> Figure:
     # the legend below takes as many rows as the screen is narrow
     below = {"orientation": "h", "y": -0.22, "yanchor": "top", "x": 0, "font": {"size": 11}}
     figure.update_layout(legend=below, margin={"t": 30})
-    return figure.add_annotation(_axis_title(curve, 1))
+    return figure.add_annotation(_axis_title(curve.axis_title, 1), font={"size": 12})
 
 
 def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> Figure:
@@ -232,14 +225,11 @@ def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> Figure
     return figure.add_scatter(**normal, mode="lines", line=line, name="standard normal")
 
 
-def excess_cost_over_time_figure(
-    costs: Mapping[str, tuple[Sequence[float], Sequence[float]]],
-) -> Figure:
+def excess_cost_over_time_figure(costs: Mapping[str, _Curve]) -> Figure:
     """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
     figure.update_yaxes(**_POWERS)
-    _add_curves(figure, ((name, seconds, relative_excess_costs(cost)) for name, (seconds, cost) in costs.items()))
-    return figure
+    return _add_curves(figure, ((name, (t, relative_excess_costs(cost))) for name, (t, cost) in costs.items()))
 
 
 def relative_excess_costs(costs: Sequence[float]) -> list[float]:
@@ -274,10 +264,9 @@ def rate_intervals_figure(
     return figure.update_yaxes(range=[-0.03, 1.03])
 
 
-def profile_likelihood_figure(curves: Mapping[str, tuple[Sequence[float], Sequence[float]]], level: float) -> Figure:
+def profile_likelihood_figure(curves: Mapping[str, _Curve], level: float) -> Figure:
     """Profile-likelihood figure: increase of chi2 over the parameter's value relative to the estimate."""
-    figure = _styled_figure(380, "value over best value", "chi2 above the best")
-    _add_curves(figure, ((name, ratio, delta) for name, (ratio, delta) in curves.items()), "dash")
+    figure = _add_curves(_styled_figure(380, "value over best value", "chi2 above the best"), curves.items(), "dash")
     figure.add_hline(y=level, line={"color": _TEXT_COLOR, "dash": "dot"}, annotation_text="95 %")
     figure.update_xaxes(type="log", range=[-1.0, 1.0])
     return figure.update_yaxes(range=[-0.2, 2.5 * level])
@@ -353,34 +342,31 @@ def parameter_values_by_source_figure(
     return figure.update_yaxes(tickvals=list(range(len(names))), ticktext=names, range=ends, automargin=True)
 
 
-def _heat_figure(
-    height: int, names: tuple[Sequence[str], Sequence[str]], parts: Array, titles: tuple[str, str], tickangle: int
-) -> Figure:
-    """Figure of numbers between 0 and 1 for each pair of a row's and a column's name."""
-    rows, columns = (list(own) for own in names)
-    figure = _styled_figure(height, titles[1], titles[0])
+def _heat_figure(figure: Figure, rows: Sequence[str], columns: Sequence[str], parts: Array, tickangle: int) -> Figure:
+    """Figure with numbers between 0 and 1 for each pair of a row's and a column's name."""
     figure.add_heatmap(
-        x=columns, y=rows, z=parts.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
+        x=list(columns), y=list(rows), z=parts.tolist(), zmin=0.0, zmax=1.0, showscale=False, xgap=1, ygap=1,
         colorscale=_SEQUENTIAL_COLORSCALE, texttemplate="%{text}",
     )  # fmt: skip
     every = {"type": "category", "tickmode": "array", "title_standoff": 6, "showgrid": False, "automargin": True}
-    figure.update_xaxes(tickangle=tickangle, tickvals=columns, **every)
-    return figure.update_yaxes(autorange="reversed", tickvals=rows, **every)
+    figure.update_xaxes(tickangle=tickangle, tickvals=list(columns), **every)
+    return figure.update_yaxes(autorange="reversed", tickvals=list(rows), **every)
 
 
 def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts: Array) -> Figure:
     """Confusion-matrix figure of counts of what was said of what is true, colored by the fraction of their row."""
     parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
-    figure = _heat_figure(200 + 24 * len(rows), (rows, columns), parts, ("true", "said first"), -50)
+    figure = _heat_figure(_styled_figure(200 + 24 * len(rows), "said first", "true"), rows, columns, parts, -50)
     text = [[f"{n:.0f}" if n else "" for n in line] for line in counts]
     return figure.update_traces(text=text, hovertemplate="%{y}: said %{x}<extra></extra>")
 
 
 def explained_fraction_matrix_figure(names: Sequence[str], values: Array) -> Figure:
     """Heat-map figure of explained fractions `values` (n, n), row explained by column, shown in per cent."""
-    figure = _heat_figure(190 + 27 * len(names), (names, names), values, ("trace of", "explained by [%]"), -40)
+    figure = _styled_figure(190 + 27 * len(names), "explained by [%]", "trace of")
     text = [[f"{100 * v:.0f}" if v >= 0.095 else "" for v in line] for line in values]
-    return figure.update_traces(text=text, hovertemplate="%{y} explained by %{x}: %{z:.2f}<extra></extra>")
+    hover = "%{y} explained by %{x}: %{z:.2f}<extra></extra>"
+    return _heat_figure(figure, names, names, values, -40).update_traces(text=text, hovertemplate=hover)
 
 
 @dataclass(frozen=True)
@@ -460,9 +446,7 @@ def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str
         colorscale=_DIVERGING_COLORS, colorbar=bar,
     )  # fmt: skip
     figure.update_layout(plot_bgcolor=_GRID_COLOR, margin={"r": 150, "t": 40})
-    figure.add_annotation(
-        x=0, xref="paper", xanchor="left", y=1, yref="paper", yanchor="bottom", text=f"color: {axis}", showarrow=False
-    )
+    figure.add_annotation(**_axis_title(f"color: {axis}", 1))
     figure.update_xaxes(showgrid=False, range=[float(edges[0]), float(edges[-1])])
     figure.update_yaxes(
         showgrid=False, range=[len(rows) - 0.5, -0.5], tickvals=list(range(len(rows))),

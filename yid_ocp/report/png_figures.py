@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -36,8 +37,8 @@ def draw_method_convergence(path: Path, comparison: MethodComparison) -> None:
         history = [entry for entry in run.solution.history if np.isfinite(entry.cost) and not entry.note]
         if history:
             relative = relative_excess_costs([entry.cost for entry in history])
-            by_iteration.plot(range(len(history)), relative, marker=".", label=run.method)
-            by_time.plot([entry.seconds for entry in history], relative, marker=".", label=run.method)
+            for axes, places in ((by_iteration, range(len(history))), (by_time, [entry.seconds for entry in history])):
+                axes.plot(places, relative, marker=".", label=run.method)
     for axes, label in ((by_iteration, "iteration"), (by_time, "wall time [s]")):
         if axes.get_xlim()[1] > 2.0:  # below that it is linear all over, and has no ticks of its own
             axes.set_xscale("symlog", linthresh=1.0)
@@ -149,9 +150,8 @@ def _inches(count: int) -> float:
 def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
     from matplotlib.colors import ListedColormap
 
-    shown, marked = pattern.nonzero_mask.astype(int), pattern.marked_mask
-    height, width = shown.shape
-    title = f"{pattern.title}\n{height} x {width}, {pattern.n_nonzeros} entries can differ from zero"
+    shown, marked, width = pattern.nonzero_mask.astype(int), pattern.marked_mask, pattern.nonzero_mask.shape[1]
+    title = f"{pattern.title}\n{len(shown)} x {width}, {pattern.n_nonzeros} entries can differ from zero"
     if marked is not None:
         shown[pattern.nonzero_mask & marked] = 2
         title += f"\ndark: {np.count_nonzero(shown == 2)} {pattern.mark_label}"
@@ -163,13 +163,12 @@ def _draw_pattern(axes: Axes, pattern: SparsityPattern) -> None:
         (axes.xaxis, top, pattern.column_labels, pattern.column_blocks, axes.axvline),
         (axes.yaxis, right, pattern.row_labels, pattern.row_blocks, axes.axhline),
     ):
-        for block in blocks[1:]:
-            if block.stop > block.start:
-                line(block.start - 0.5, color=_BLOCK_EDGE_COLOR, linewidth=0.7)
+        named = [block for block in blocks if block.stop > block.start]
+        for block in (block for block in named if block is not blocks[0]):
+            line(block.start - 0.5, color=_BLOCK_EDGE_COLOR, linewidth=0.7)
         places, names = _ticks(labels, blocks)
         axis.set_ticks(places, labels=names, fontsize=5.5)
         axis.set_tick_params(length=2)
-        named = [block for block in blocks if block.stop > block.start]
         middles = [0.5 * (block.start + block.stop - 1) for block in named]
         side.set_ticks(middles, labels=[block.name for block in named], fontsize=8, color=_BLOCK_EDGE_COLOR)
         # names of narrow neighbours would be written over each other
@@ -184,11 +183,9 @@ def _ticks(labels: Sequence[str], spans: Sequence[NamedIndexRange]) -> tuple[lis
         return [float(i) for i in range(len(labels))], list(labels)
     places, names = [], []
     for span in spans:
-        owners = [labels[i].replace(".", "_").partition("_")[0] for i in range(span.start, span.stop)]
-        at = span.start
-        for owner, group in groupby(owners):
-            count = len(list(group))
-            places.append(at + 0.5 * (count - 1))
+        owners = [(labels[i].replace(".", "_").partition("_")[0], i) for i in range(span.start, span.stop)]
+        for owner, group in groupby(owners, key=itemgetter(0)):
+            indices = [i for _, i in group]
+            places.append(0.5 * (indices[0] + indices[-1]))
             names.append(owner)
-            at += count
     return places, names
