@@ -173,15 +173,14 @@ def recording_animation(title: str, system: System, theta: Array, recording: Rec
 def _measured_motion(told: ModelTrajectory, recording: Recording, t: Array) -> _AnimatedMotion:
     """Recorded arms and points at times t; a point stays for half a period after it was measured."""
     system, joints = told.system, recording.joints
-    recorded = [] if joints is None else [name for name in joints.names if name in system.mechanism.joint_names]
     moved = {*system.driven, *system.prescribed}
     sticks: list[_Stick] = []
     places = np.full((len(t), 0, 3), np.nan)
-    if joints is not None and moved and moved <= {*recorded} and joints.position is not None:
+    if joints is not None and joints.position is not None and moved and moved <= {*joints.names}:
         q = told._q_at(t)
-        for name in recorded:
-            column = joints.position[:, joints.names.index(name)]
-            q[:, system.mechanism.joint_index(name)] = np.interp(t, joints.t, column)
+        for name, column in zip(joints.names, joints.position.T, strict=True):
+            if name in system.mechanism.joint_names:
+                q[:, system.mechanism.joint_index(name)] = np.interp(t, joints.t, column)
         moved_arms = _model_motion(told, q)
         sticks, places = [own for own in moved_arms.sticks if not own.is_object_part], moved_arms.positions
     seen: dict[str, Array] = {}
@@ -195,10 +194,9 @@ def _measured_motion(told: ModelTrajectory, recording: Recording, t: Array) -> _
             fresh[name] = now | fresh.get(name, False)
             seen[name] = own if name not in seen else np.where(np.isfinite(seen[name]), seen[name], own)
     indices = {name: places.shape[1] + i for i, name in enumerate(seen)}
-    if not seen:
-        return _AnimatedMotion("measured", sticks, places, indices)
-    places = np.concatenate([places, np.stack(list(seen.values()), axis=1)], axis=1)
-    return _AnimatedMotion("measured", sticks, places, indices, np.stack(list(fresh.values()), axis=1))
+    places = np.concatenate([places, *(own[:, None] for own in seen.values())], axis=1)
+    now_measured = np.stack(list(fresh.values()), axis=1) if fresh else None
+    return _AnimatedMotion("measured", sticks, places, indices, now_measured)
 
 
 def _spacing(t: Array) -> float:

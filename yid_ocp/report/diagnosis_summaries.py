@@ -159,14 +159,15 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         ("their 95 % intervals that hold the truth", sure["interval_coverage"]),
         ("time of one diagnosis", _number(result["seconds"], ".0f", " s")),
     ]
-    head = ("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")
-    sizes: TableRows = [head]
+    sizes: TableRows = [
+        ("size / detectable", "cases", "gap seen", "kind and place first", "alone or in a set of three")
+    ]
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
         sizes.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
+    kinds = result["experiments"].items()
     experiments: TableRows = [("experiment", "cases", "false alarms", "right")]
-    for name, own in result["experiments"].items():
-        experiments.append((name, str(own["cases"]), _rate(own["false_alarms"]), _rate(own["right"])))
+    experiments += [(n, str(own["cases"]), _rate(own["false_alarms"]), _rate(own["right"])) for n, own in kinds]
     told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
     cases: TableRows = [(*told, "not separable", "place", "closure", "best", "time")]
     for entry in result["marks"]:
@@ -222,9 +223,10 @@ def batch_summary(result: Mapping[str, Any]) -> SummaryParts:
             if own["value"] is not None:
                 found.setdefault(name, []).append(own)
     names = sorted(found, key=lambda name: -len(found[name]))
-    units = {name: entries[-1]["unit"] for name, entries in found.items()}
+    units = {name: found[name][-1]["unit"] for name in names}
+    heads = [(name, f"{name} [{units[name]}]" if units[name] else name) for name in names]
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
-    few, every = ([*_batch_rows(runs, names[:count], units)] for count in (_MAX_TERMINAL_PARAMETERS, None))
+    few = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
     yield SummaryTable(few, "Runs", is_key_table=True, links=links)
     spread: TableRows = [("parameter", "runs", "smallest", "median", "largest", "unit")]
     for name in names:
@@ -234,29 +236,25 @@ def batch_summary(result: Mapping[str, Any]) -> SummaryParts:
             spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), found[name][0]["unit"]))
     yield SummaryTable(spread, "Parameters over all runs")
     if len(names) > _MAX_TERMINAL_PARAMETERS:
+        every = [*_batch_rows(runs, dict(heads))]
         yield SummaryTable(every, "Runs with all parameters", is_page_only=True, links=links)
     ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
     said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
     said += [f"{entry['name']}: {entry['message'].splitlines()[0]}." for entry in runs if not entry["ok"]]
-    alike = result["history"]
-    if alike is not None:
+    if (alike := result["history"]) is not None:
         yield SummaryTable([*_consistency_rows(alike)], "Each run against the others")
         drifted, wrong = _drifted_and_distrusted(alike)
-        verb = "is" if len(drifted) == 1 else "are"
-        same = "No parameter differs among the runs by more than they state."
-        said.append(f"{', '.join(drifted)} {verb} not the same in all runs." if drifted else same)
+        changed = f"{', '.join(drifted)} {'is' if len(drifted) == 1 else 'are'} not the same in all runs."
+        said.append(changed if drifted else "No parameter differs among the runs by more than they state.")
         said += [f"Distrust {', '.join(wrong)}: without it the others agree, or agree far better."] if wrong else []
     yield from (SummaryStatement(text, "verdict") for text in said)
 
 
-def _batch_rows(
-    runs: Sequence[Mapping[str, Any]], names: Sequence[str], units: Mapping[str, str]
-) -> Iterator[Sequence[str]]:
-    heads = [f"{name} [{units[name]}]" if units[name] else name for name in names]
-    yield "run", "status", "chi2/n", "effects", *heads, "time"
+def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> Iterator[Sequence[str]]:
+    yield "run", "status", "chi2/n", "effects", *heads.values(), "time"
     for entry in runs:
         cells = []
-        for own in (entry["parameters"].get(name, {"value": None}) for name in names):
+        for own in (entry["parameters"].get(name, {"value": None}) for name in heads):
             if own["value"] is None:
                 cells.append("")
             elif own["verdict"] in _FOUND_VERDICTS:

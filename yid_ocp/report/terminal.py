@@ -72,10 +72,8 @@ def register_summary(result_format: str) -> Callable[[Callable[[Mapping[str, Any
     def enter(make: Callable[[Mapping[str, Any]], SummaryParts]) -> _Summary:
         @functools.wraps(make)
         def summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
-            blocks = [SummaryStatement(part) if isinstance(part, str) else part for part in make(result)]
-            return [
-                block for block in blocks if (len(block.rows) > 1 if isinstance(block, SummaryTable) else block.text)
-            ]
+            blocks = (SummaryStatement(part) if isinstance(part, str) else part for part in make(result))
+            return [own for own in blocks if (len(own.rows) > 1 if isinstance(own, SummaryTable) else own.text)]
 
         SUMMARY_BY_FORMAT[result_format] = summary
         return summary
@@ -128,18 +126,17 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryParts:
 
 def misfit_summary_blocks(fit: Mapping[str, Any]) -> SummaryParts:
     """Conclusions on a poor fit: a model-free guess predicts better, or the model does not explain the recordings."""
-    worse, said = fit.get("worse_than_guess", ()), []
+    worse = fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
         own, other = (
             " ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess")
         )
-        where = f"{entry['channel']} of {entry['recording']}"
-        said.append(f"worse than a guess without a model: {where}, {own} against {other} ({entry['baseline']})")
-    if len(worse) > MAX_CHANNELS_SHOWN_SINGLY:
-        said.append(f"and so for {len(worse) - MAX_CHANNELS_SHOWN_SINGLY} more channels, in result.json")
+        text = f"{entry['channel']} of {entry['recording']}, {own} against {other} ({entry['baseline']})"
+        yield SummaryStatement(f"worse than a guess without a model: {text}", "conclusion")
+    left = len(worse) - MAX_CHANNELS_SHOWN_SINGLY
+    yield SummaryStatement(f"and so for {left} more channels, in result.json" if left > 0 else "", "conclusion")
     if not fit["explains"]:
-        said.append(goodness_of_fit_message(fit["chi2_per_dof"], False))
-    yield from (SummaryStatement(text, "conclusion") for text in said)
+        yield SummaryStatement(goodness_of_fit_message(fit["chi2_per_dof"], False), "conclusion")
 
 
 def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
@@ -148,9 +145,9 @@ def discretisation_shift_sentences(result: Mapping[str, Any]) -> list[str]:
     for key, words in (("links", "twice the links"), ("time_step", "half the time step")):
         tried = {name: own for name, own in result.get("discretisation", {}).items() if own[key] is not None}
         moved = {n: own for n, own in tried.items() if own["std"] is not None and abs(own[key]) > own["std"]}
-        changes = [f"{name} by {own[key]:+.2g} (± {own['std']:.2g} from the data)" for name, own in moved.items()]
+        changes = ", ".join(f"{n} by {own[key]:+.2g} (± {own['std']:.2g} from the data)" for n, own in moved.items())
         if moved:
-            said.append(f"with {words} these move by more than the data's standard deviation: {', '.join(changes)}")
+            said.append(f"with {words} these move by more than the data's standard deviation: {changes}")
         elif tried:
             said.append(f"with {words} no estimate moves by more than its standard deviation")
     return said
@@ -185,9 +182,8 @@ def summary_terminal_lines(blocks: Sequence[SummaryBlock]) -> list[str]:
     result: list[str] = []
     for block in blocks:
         if isinstance(block, SummaryTable):
-            if not block.is_page_only:
-                space = [""] if result and result[-1] else []
-                result += [*space, *aligned_table_lines(block.rows), ""]
+            space = [""] if result and result[-1] else []
+            result += [] if block.is_page_only else [*space, *aligned_table_lines(block.rows), ""]
         elif isinstance(block, CodeBlock):
             result += [f"  {line}" for line in block.text.splitlines()]
         elif block.text.endswith("."):
@@ -201,10 +197,9 @@ def summary_terminal_lines(blocks: Sequence[SummaryBlock]) -> list[str]:
 
 def recording_summary_lines(recording: Recording) -> list[str]:
     """Text lines on the contents of a recording."""
-    rows: TableRows = [("group", "samples", "names")]
-    for group in recording.all_groups:
-        rows.append((group.name, str(len(group.t)), ", ".join(group.names)))
-    return [*aligned_table_lines(rows), "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
+    rows = [(group.name, str(len(group.t)), ", ".join(group.names)) for group in recording.all_groups]
+    table = aligned_table_lines([("group", "samples", "names"), *rows])
+    return [*table, "", f"{recording.duration:g} s", *_note_lines(recording.notes)]
 
 
 def third_party_file_summary_lines(contents: FilePreview) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -25,18 +25,12 @@ _MAX_MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them al
 _MAX_CHANNELS = 3  # held-out channels
 _NOMINAL_LABEL, _EXTENDED_LABEL = "nominal model", "with the effects"
 _MODEL_COLORS = {_NOMINAL_LABEL: figures.BEFORE_COLOR, _EXTENDED_LABEL: figures.AFTER_COLOR}
-_EVENT_COLORS = {
-    "event": figures.AFTER_COLOR,
-    **dict.fromkeys(("allowed", "allowed, other side"), figures.MEASURED_COLOR),
-}
-
-
-class _Chapter(NamedTuple):
-    """A titled part of the section: sentences, of which empty ones are not shown, and titled figures."""
-
-    title: str
-    sentences: Sequence[str]
-    figures: Sequence[tuple[str, Any]]
+_EVENT_COLORS = {"event": figures.AFTER_COLOR} | dict.fromkeys(
+    ("allowed", "allowed, other side"), figures.MEASURED_COLOR
+)
+_TitledFigures = list[tuple[str, Any]]
+_Chapter = tuple[str, Sequence[str], _TitledFigures]
+"""Title, sentences, of which empty ones are not shown, and figures with their titles."""
 
 
 @register_report_section("diagnosis", 5, "The gap and what makes it")
@@ -90,12 +84,12 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
             "noise alone)."
         )
     words = (_NOMINAL_LABEL, _EXTENDED_LABEL, "noise alone")
-    return _Chapter("How large the gap is", sentences, _before_after_figures(rows, "held-out error (rms)", words))
+    return "How large the gap is", sentences, _before_after_figures(rows, "held-out error (rms)", words)
 
 
 def _before_after_figures(
     rows: Sequence[tuple[str, str, ValueBeforeAfter]], axis: str, words: tuple[str, str, str]
-) -> list[tuple[str, Any]]:
+) -> _TitledFigures:
     return figures_by_unit(rows, lambda own, unit: figures.values_before_after_figure(own, f"{axis} [{unit}]", words))
 
 
@@ -140,7 +134,7 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         sentences.append("No group of unknowns explains the residual better than chance, so there is no map.")
     if len(smoothed.smoothed_unknowns) > _MAX_MAPS:
         sentences.append(f"{len(smoothed.smoothed_unknowns) - _MAX_MAPS} more recordings are in trajectories.h5.")
-    return _Chapter("Where it is, and when", sentences, maps)
+    return "Where it is, and when", sentences, maps
 
 
 def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: list[int]) -> tuple[Any, str]:
@@ -224,12 +218,12 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         plot = TimePlotData(title, lines, force.t, force.max_likelihood_forces, marked_intervals=spans)
         by_recording.setdefault(force.recording, []).append(plot)
     shown = _recording_figures(by_recording, "", figures.BEFORE_COLOR, _EVENT_COLORS)
-    return _Chapter("What happened beside it", sentences, shown)
+    return "What happened beside it", sentences, shown
 
 
 def _recording_figures(
     plots: Mapping[str, Sequence[TimePlotData]], words: str, dots: str, lines: Mapping[str, str]
-) -> list[tuple[str, Any]]:
+) -> _TitledFigures:
     return [(f"Recording {name}{words}", figures.time_plots_figure(own, dots, lines)) for name, own in plots.items()]
 
 
@@ -267,7 +261,7 @@ def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     # beside each other on a phone there is room for a word
     axes = ("closed [%]", "promised [%]" if percent else "promised [1]")
     title = "What each effect could explain" if finding.verdict == "no_gap" else "Which effect makes it"
-    return _Chapter(title, sentences, [("", figures.candidate_ranking_figure(entries, *axes))])
+    return title, sentences, [("", figures.candidate_ranking_figure(entries, *axes))]
 
 
 def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
@@ -288,7 +282,7 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
         f"Alike: {listed}." if close else f"No two of them are alike; the closest are {said[0][1]}.",
     ]
     figure = figures.explained_fraction_matrix_figure(names, values)
-    return _Chapter("What could be mistaken for what", sentences, [("", figure)])
+    return "What could be mistaken for what", sentences, [("", figure)]
 
 
 # -- curves and parameters --------------------------------------------------------------------------------------------
@@ -330,7 +324,7 @@ def _curves(
         f"The {min(count, _MAX_CHANNELS)} held-out coordinates or joints that {what}, measured and predicted; below "
         "each the error, with two standard deviations of the noise shaded: what is right stays within."
     ]
-    return _Chapter("Measured and predicted", sentences, shown)
+    return "Measured and predicted", sentences, shown
 
 
 def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
@@ -350,4 +344,4 @@ def _absorbed(finding: DiagnosisResult) -> _Chapter | None:
         "standard deviations, cut where they leave the picture.",
         f"{said}." if said else "None of them moves by more than a tenth.",
     ]
-    return _Chapter("What the stiffnesses had absorbed", sentences, shown)
+    return "What the stiffnesses had absorbed", sentences, shown
