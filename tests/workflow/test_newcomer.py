@@ -6,6 +6,7 @@ The bag comes from MuJoCo, its chain finer than any model's.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -177,8 +178,10 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def carried_out(name: str, *words: str) -> dict[str, Any]:
-    """Run a command into the folder `name`; contents of its result."""
+    """Run a command into the folder `name`; contents of its result; prints how long it took."""
+    begun = time.process_time()
     assert main([*words, "--out", name]) == 0
+    print(f"{words[0]}: {time.process_time() - begun:.1f} s of CPU")
     file = Path(name) / "result.json"
     return json.loads(file.read_text()) if file.is_file() else {}
 
