@@ -87,12 +87,8 @@ def test_inverse_dynamics_are_those_of_a_point_on_the_link(mass, point) -> None:
 
 def _slope(found, q, v, theta) -> np.ndarray:
     """d(v' M v)/dq by central differences."""
-    result = []
-    for i in range(len(q)):
-        step = np.eye(len(q))[i] * 1e-6
-        above, below = (v @ np.array(found(q + s * step, v, theta)[0]) @ v for s in (1, -1))
-        result.append((above - below) / 2e-6)
-    return np.array(result)
+    ends = [[v @ np.array(found(q + way, v, theta)[0]) @ v for way in sign * np.eye(len(q))] for sign in (1e-6, -1e-6)]
+    return np.subtract(*ends) / 2e-6
 
 
 def test_the_link_keeps_mass_and_inertia_wherever_a_search_goes() -> None:
@@ -133,9 +129,8 @@ def test_moments_beyond_reach_do_not_act_and_what_acts_is_reported() -> None:
     assert far["mass"].std == 0.01
     given = nominal.with_effects([make_effect("payload", "hand", nominal, {"mass": 1.0, "my": 3.0, "mz": 4.0})])
     body = merge_bodies(given.mechanism.joints[2].bodies)
-    first = ca.Function("first", [given.parameters.symbols], [body.mass * body.center_of_mass])(
-        given.parameters.vector()
-    )
+    moments = ca.Function("moments", [given.parameters.symbols], [body.mass * body.center_of_mass])
+    first = moments(given.parameters.vector())
     own = merge_bodies(nominal.mechanism.joints[2].bodies)
     added = np.array(first).ravel() - np.array(ca.DM(own.mass * own.center_of_mass)).ravel()
     acting = np.array([far[name].value for name in ("mx", "my", "mz")])

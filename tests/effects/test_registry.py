@@ -57,9 +57,8 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
         system, place = places[kind]
         effect = make_effect(kind, place, system)
         for quantity in effect.definitions:
-            assert re.search(rf"\b{quantity.reported_name_and_unit[0]}\b", row[2]), (
-                f"{kind}: {quantity.reported_name_and_unit[0]} not in {row[2]}"
-            )
+            name, _ = quantity.reported_name_and_unit
+            assert re.search(rf"\b{name}\b", row[2]), f"{kind}: {name} not in {row[2]}"
 
 
 def test_every_kind_describes_itself(one_arm) -> None:

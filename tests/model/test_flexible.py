@@ -30,9 +30,8 @@ from yid_ocp.workflow.build import build_system, divided_link_parameter_scale
 
 def stiffness(item):
     """Stiffness and damping of every coordinate by joint name."""
-    rows = numbers(
-        ca.vertcat(*(ca.horzcat(s.stiffness, s.damping) for s in item.elastic_joints)), item.mechanism.parameters
-    )
+    both = ca.vertcat(*(ca.horzcat(s.stiffness, s.damping) for s in item.elastic_joints))
+    rows = numbers(both, item.mechanism.parameters)
     return {spring.joint_name: tuple(row) for spring, row in zip(item.elastic_joints, rows, strict=True)}
 
 
@@ -79,11 +78,9 @@ def test_rigidity_becomes_stiffness_by_the_lengths_about_a_joint():
 
 
 def test_branches_at_inner_links():
-    trunk = Segment("P", 0.6, 0.3, 0.01, links=3)
     turn = rotation_from_rpy(math.pi / 2, 0.0, 0.0)
-    item = flexible_object(
-        [trunk, Segment("a", 0.2, 0.1, 0.01, links=2, parent="P", parent_link_index=0, rest_rotation=turn)]
-    )
+    branch = Segment("a", 0.2, 0.1, 0.01, links=2, parent="P", parent_link_index=0, rest_rotation=turn)
+    item = flexible_object([Segment("P", 0.6, 0.3, 0.01, links=3), branch])
     joint = item.mechanism.joints[item.mechanism.joint_index("a_0_x")]
     assert item.mechanism.joint_names[joint.parent_index] == "P_0_z"
     np.testing.assert_allclose(positions(item, ["w_a", "w_P"]), [[0, -0.2, 0.2], [0, 0, 0.6]], atol=1e-15)

@@ -39,15 +39,13 @@ def made(urdf_folder) -> Recording:
     pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pip install pin")
     model = pin.buildModelFromUrdf(str(urdf_folder / "double_pendulum.urdf"))
     data, start, (q, v, a) = model.createData(), pin.neutral(model), moved()
-    effort = np.array(
-        [pin.rnea(model, data, pin.integrate(model, start, x), *row) for x, *row in zip(q, v, a, strict=True)]
-    )
+    states = zip(q, v, a, strict=True)
+    effort = np.array([pin.rnea(model, data, pin.integrate(model, start, x), *row) for x, *row in states])
     effort += v * list(TRUTH.values())
     current = effort / list(CONSTANTS.values())
     current += NOISE * np.random.default_rng(0).standard_normal(current.shape)
-    motors = ChannelGroup(
-        "motors_left", ("elbow", "shoulder"), T, {"current": current[:, ::-1]}, {"current_std": NOISE}
-    )
+    names, values = ("elbow", "shoulder"), {"current": current[:, ::-1]}
+    motors = ChannelGroup("motors_left", names, T, values, {"current_std": NOISE})
     return Recording(JointGroup(PENDULUM, T, q, position_std=0.0), name="arm", channel_groups=(motors,))
 
 

@@ -36,10 +36,8 @@ def system() -> System:
     upper = Joint("left_a", "revolute", -1, Placement.identity(), (0.0, 1.0, 0.0), (body,))
     lower = Joint("left_b", "revolute", 0, along, (1.0, 0.0, 0.0), (body,))
     robot = Mechanism("arm", (upper, lower), {"left_gripper": Frame(1, along)})
-    segments = (
-        Segment("T1", 0.4, 0.08, 0.03, 2),
-        Segment("T2", 0.3, 0.04, 0.01, 1, parent="T1", rest_rotation=rotation_from_rpy(-0.8, 0.0, 0.0)),
-    )
+    turn = rotation_from_rpy(-0.8, 0.0, 0.0)
+    segments = (Segment("T1", 0.4, 0.08, 0.03, 2), Segment("T2", 0.3, 0.04, 0.01, 1, parent="T1", rest_rotation=turn))
     return System.build(robot, objects=[(flexible_object(segments), None, None)], prescribed=robot.joint_names)
 
 
@@ -98,15 +96,10 @@ def test_derivatives_agree_with_differences(whole: System, sensor: Sensor) -> No
     exact = {name: np.array(ca.densify(value)) for name, value in function(**at).items()}
     chosen = [whole.parameters.index(name) for name in NAMES]
     columns = {"q": range(n), "z": range(1), "load": range(n), "theta": chosen}
-    step = 1e-6
     for which, indices in columns.items():
-        differences = []
-        for index in indices:
-            above, below = ({name: x.copy() for name, x in at.items()} for _ in range(2))
-            above[which][index] += step
-            below[which][index] -= step
-            ahead, behind = (np.array(function(**x)["y"]).ravel() for x in (above, below))
-            differences.append((ahead - behind) / (2 * step))
+        ways = 1e-6 * np.eye(len(at[which]))[list(indices)]
+        ends = [[function(**(at | {which: at[which] + s * w}))["y"] for w in ways] for s in (1, -1)]
+        differences = np.subtract(*(np.array([np.array(y).ravel() for y in end]) for end in ends)) / 2e-6
         np.testing.assert_allclose(exact[f"by_{which}"], np.transpose(differences), rtol=1e-7, atol=1e-8)
     assert np.abs(exact["by_z"]).max() > 0.01, "the memory of an effect is seen"
 
@@ -201,9 +194,8 @@ def test_rates_and_constraint_forces_are_read_along_a_rollout(urdf_folder):
     speed = np.gradient(rollout.state[:, 1], H) * np.cos(rollout.state[:, 0]) / scale
     change = np.pad(np.diff(rollout.state[:, 1], 2), 1, mode="edge") / (H * scale) ** 2 * rollout.state[:, 0]
     force = np.append(rollout.multipliers[:, 0], rollout.multipliers[-1, 0]) / H / scale
-    expected = np.stack(
-        [np.interp([3, 7.5, 20, 40], np.arange(41), series) for series in (speed, change, force)], axis=1
-    )
+    series = (speed, change, force)
+    expected = np.stack([np.interp([3, 7.5, 20, 40], np.arange(41), values) for values in series], axis=1)
     np.testing.assert_allclose(prediction.predicted_outputs[0], expected, rtol=1e-9, atol=1e-12)
     rows, gradient = problem.residual_rows.data, problem.cost_and_gradient(x)[1]
     np.testing.assert_allclose(gradient, evaluation.jacobian.T @ evaluation.residual, rtol=1e-6)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,18 @@ from yid_ocp.virtual.mujoco_simulation import (
     settle_to_equilibrium,
     simulate_in_mujoco,
 )
+
+
+@pytest.fixture(scope="module")
+def runs() -> Runs:
+    """runs(arms, time step [s], duration [s]): the paper's system, one second where nothing else is said."""
+
+    @cache
+    def run(arms: int, step: float, duration: float = 1.0) -> SimulationResult:
+        motion = random_multisine_motion(SYSTEMS[arms], TRUTH, seed=SEEDS[arms])
+        return simulate_in_mujoco(SYSTEMS[arms], TRUTH, motion, SimulationOptions(duration, time_step=step))
+
+    return run
 
 
 @pytest.mark.parametrize("arms", [1, 2])
@@ -270,11 +283,9 @@ def test_torques_are_off_by_a_constant_and_by_white_noise(runs: Runs) -> None:
 
 
 def test_experiments_that_do_not_fit_are_refused() -> None:
-    brief = SimulationOptions(0.1, time_step=1e-3)
+    brief, of_two = SimulationOptions(0.1, time_step=1e-3), ArmSensorNoise(effort_std=(0.1, 0.2))
     with pytest.raises(ConfigError, match="2 standard deviations for 7 joints"):
-        run_virtual_experiment(
-            SYSTEMS[1], None, VirtualExperiment(None, None, brief, ArmSensorNoise(effort_std=(0.1, 0.2)))
-        )
+        run_virtual_experiment(SYSTEMS[1], None, VirtualExperiment(None, None, brief, of_two))
     with pytest.raises(ConfigError, match="arms = 3"):
         baxter_foam_y_system(3)
 

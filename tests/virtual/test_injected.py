@@ -14,25 +14,9 @@ from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
 from yid_ocp.model.system import MidpointState
+from yid_ocp.virtual import injected
 from yid_ocp.virtual.experiment import VirtualExperiment, recording_with_sensor_error
-from yid_ocp.virtual.injected import (
-    _CORD_LENGTH,
-    _CREASE_ANGLE,
-    _DRIFT_TIME,
-    _FORCES,
-    _MAGNET_DISTANCE,
-    _MAGNET_POLE_SIZE,
-    _MUJOCO_MODEL_KINDS,
-    _SENSOR_ERROR_KINDS,
-    _SLIP_TIMES,
-    _WALL_DISTANCE,
-    _WARM_UP_TIME,
-    INJECTABLE_EFFECT_KINDS,
-    OUT_OF_LIBRARY_EFFECTS,
-    InjectedEffect,
-    _InjectedTerms,
-    run_experiment_with_effects,
-)
+from yid_ocp.virtual.injected import OUT_OF_LIBRARY_EFFECTS, InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
@@ -56,11 +40,11 @@ def passive(effects, q, v):
     model = mujoco.MjModel.from_xml_string(single_arm_xml())
     order = [model.joint(name).id for name in SYSTEM.mechanism.joint_names]
     data = mujoco.MjData(model)
-    injected = _InjectedTerms(SYSTEM, TRUTH, effects)
-    injected.edit_model(model)
-    injected.start_motion(data)
+    terms = injected._InjectedTerms(SYSTEM, TRUTH, effects)
+    terms.edit_model(model)
+    terms.start_motion(data)
     data.qpos[order], data.qvel[order] = q, v
-    mujoco.set_mjcb_passive(injected.add_forces)
+    mujoco.set_mjcb_passive(terms.add_forces)
     try:
         mujoco.mj_forward(model, data)
     finally:
@@ -77,12 +61,11 @@ def symbolic(kind, location, values, q, v):
     reaction = ca.SX.sym("r", SYSTEM.n_constraints)
     kinematics, nominal = (forward_kinematics(system.mechanism, sq) for system in (changed, SYSTEM))
     terms = effect.step_terms(MidpointState(changed, kinematics, sq, sv, none, none, u, reaction, {}, ca.SX(1)))
-    weights = (
-        rigid_body_lagrangian_derivatives(k, 0 * sv, SYSTEM.gravity).lagrangian_by_q for k in (kinematics, nominal)
-    )
+    rigid = (rigid_body_lagrangian_derivatives(k, 0 * sv, SYSTEM.gravity) for k in (kinematics, nominal))
+    weight, usual = (terms_at_rest.lagrangian_by_q for terms_at_rest in rigid)
     closed = terms.force_with_derivatives
     forces = (terms.generalized_force, terms.dissipative_force, None if closed is None else closed.force)
-    total = ca.gradient(terms.lagrangian, sq) + next(weights) - next(weights)
+    total = ca.gradient(terms.lagrangian, sq) + weight - usual
     total += sum((force for force in forces if force is not None), ca.SX(0))
     function = ca.Function("f", [sq, sv, changed.parameters.symbols], [total])
     return np.array(ca.densify(function(q, v, changed.parameters.vector(TRUTH)))).ravel()
@@ -114,9 +97,8 @@ def reading(duration=1.0) -> Recording:
     effort = np.cos(3 * t)[:, None] * np.arange(1, len(names) + 1)
     pose = np.eye(4)
     pose[:3, 3] = [2.0, 0.0, 0.0]
-    camera = PointGroup(
-        "points_camera", ("w_T1",), t, np.tile([0.5, 0.1, 0.2], (101, 1, 1)), sensor="camera", pose=pose
-    )
+    points = np.tile([0.5, 0.1, 0.2], (101, 1, 1))
+    camera = PointGroup("points_camera", ("w_T1",), t, points, sensor="camera", pose=pose)
     return Recording(JointGroup(names, t, position, effort=effort), (camera,), name="r")
 
 
@@ -150,9 +132,8 @@ def test_errors_of_cameras_are_those_of_the_table():
     def seen(kind, **values):
         return recording_with_sensor_error(recording, SYSTEM, kind, "camera", values).points[0]
 
-    assert seen("camera_translation", x=0.01, y=0.0, z=-0.01).position == pytest.approx(
-        true + np.array([0.01, 0.0, -0.01])
-    )
+    shifted = seen("camera_translation", x=0.01, y=0.0, z=-0.01).position
+    assert shifted == pytest.approx(true + np.array([0.01, 0.0, -0.01]))
     centre = np.array([2.0, 0.0, 0.0])
     assert seen("camera_scale", scale=1.02).position == pytest.approx(centre + 1.02 * (true - centre))
     turned = seen("camera_rotation", rx=0.0, ry=0.0, rz=0.1).position - centre
@@ -178,12 +159,15 @@ def test_an_effect_acts_on_a_whole_recording_and_leaves_no_trace_of_itself():
 
 
 def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
-    assert len(set(INJECTABLE_EFFECT_KINDS)) == len(INJECTABLE_EFFECT_KINDS)
-    assert set(INJECTABLE_EFFECT_KINDS) <= set(EFFECTS)
+    assert len(set(injected.INJECTABLE_EFFECT_KINDS)) == len(injected.INJECTABLE_EFFECT_KINDS)
+    assert set(injected.INJECTABLE_EFFECT_KINDS) <= set(EFFECTS)
     assert not set(OUT_OF_LIBRARY_EFFECTS) & set(EFFECTS)
     tested_elsewhere = {"rotor_inertia", "standard_linear_solid", "hysteresis", *TWINS}
-    assert {label.partition("@")[0] for label in SIZES} | tested_elsewhere == {*_MUJOCO_MODEL_KINDS, *_FORCES}
-    assert set(_SENSOR_ERROR_KINDS) <= set(INJECTABLE_EFFECT_KINDS)
+    assert {label.partition("@")[0] for label in SIZES} | tested_elsewhere == {
+        *injected._MUJOCO_MODEL_KINDS,
+        *injected._FORCES,
+    }
+    assert set(injected._SENSOR_ERROR_KINDS) <= set(injected.INJECTABLE_EFFECT_KINDS)
 
 
 def test_a_kind_that_cannot_be_done_is_refused():
@@ -200,7 +184,7 @@ class Bench:
     def __init__(self, kind, location, size, running=True):
         self.model = mujoco.MjModel.from_xml_string(single_arm_xml())
         self.data = mujoco.MjData(self.model)
-        self.terms = _InjectedTerms(SYSTEM, TRUTH, [InjectedEffect(kind, location, {"size": size})])
+        self.terms = injected._InjectedTerms(SYSTEM, TRUTH, [InjectedEffect(kind, location, {"size": size})])
         self.terms.edit_model(self.model)
         if running:
             self.terms.start_motion(self.data)
@@ -232,16 +216,12 @@ def joints_of(segment, *axes):
 
 def slope(bench, potential, q, step=1e-6):
     """- dV/dq by differences."""
-    found = np.zeros(len(q))
-    for i in range(len(q)):
-        ends = []
-        for sign in (1, -1):
-            moved = q.copy()
-            moved[i] += sign * step
-            bench.at(moved)
-            ends.append(potential(bench))
-        found[i] = -(ends[0] - ends[1]) / (2 * step)
-    return found
+
+    def energy(x):
+        bench.at(x)
+        return potential(bench)
+
+    return np.array([energy(q - way) - energy(q + way) for way in step * np.eye(len(q))]) / (2 * step)
 
 
 TIP = joints_of("T3", 2)[-1]
@@ -254,21 +234,23 @@ def moved(bench, joint):
 
 def cord(joint, hung):
     anchor = np.array([0.0, 0.0, hung])
-    return lambda bench: 0.5 * 20.0 * max(np.linalg.norm(moved(bench, joint) - anchor) - _CORD_LENGTH, 0.0) ** 2
+    return lambda bench: (
+        0.5 * 20.0 * max(np.linalg.norm(moved(bench, joint) - anchor) - injected._CORD_LENGTH, 0.0) ** 2
+    )
 
 
 def pole(bench):
-    away = np.array([_MAGNET_DISTANCE, 0.0, 0.0]) - moved(bench, TIP)
-    return 0.5 * 0.3 * _MAGNET_POLE_SIZE * math.log(away @ away + _MAGNET_POLE_SIZE**2)
+    away = np.array([injected._MAGNET_DISTANCE, 0.0, 0.0]) - moved(bench, TIP)
+    return 0.5 * 0.3 * injected._MAGNET_POLE_SIZE * math.log(away @ away + injected._MAGNET_POLE_SIZE**2)
 
 
 def soft_wall(bench):
-    return 0.5 * 30.0 * max(moved(bench, TIP)[1] - _WALL_DISTANCE, 0.0) ** 2
+    return 0.5 * 30.0 * max(moved(bench, TIP)[1] - injected._WALL_DISTANCE, 0.0) ** 2
 
 
 def creased(bench):
     bent = bench.data.qpos[bench.address(*SYSTEM.segment_layout("T1").link_joints[1][:2])]
-    return -0.5 * 12.0 * max(np.linalg.norm(bent) - _CREASE_ANGLE, 0.0) ** 2
+    return -0.5 * 12.0 * max(np.linalg.norm(bent) - injected._CREASE_ANGLE, 0.0) ** 2
 
 
 def crossed(bench):
@@ -283,8 +265,8 @@ def lopsided(bench):
 @pytest.mark.parametrize(
     ("kind", "place", "size", "potential"),
     [
-        ("tether", "T3", 20.0, cord(TIP, -_CORD_LENGTH)),
-        ("tether", "left_w0", 20.0, cord("left_w0", _CORD_LENGTH)),
+        ("tether", "T3", 20.0, cord(TIP, -injected._CORD_LENGTH)),
+        ("tether", "left_w0", 20.0, cord("left_w0", injected._CORD_LENGTH)),
         ("magnet", "T3", 0.3, pole),
         ("wall", "T3", 30.0, soft_wall),
         ("crease", "T1", 12.0, creased),
@@ -309,7 +291,7 @@ def test_a_drifting_stiffness_softens_with_time():
     bench = Bench("stiffness_drift", "T1", 0.4)
     at = bench.address(*joints_of("T1", 0, 1, 2))
     stiffness = np.array([22.0, 22.0, 13.6] * 4)
-    half = bench.force(q, time=_DRIFT_TIME / 2)
+    half = bench.force(q, time=injected._DRIFT_TIME / 2)
     assert half[at] == pytest.approx(0.2 * stiffness * q[at])
     assert np.count_nonzero(half) == len(at)
     assert not bench.force(q, time=0.0).any()
@@ -329,7 +311,10 @@ def test_a_cold_gear_brakes_until_it_is_warm():
     bench = Bench("warming_gear", "left_s1", 3.0)
     v = np.ones(bench.model.nv)
     [at] = bench.address("left_s1")
-    forces = [bench.force(np.zeros(bench.model.nv), v, time)[at] for time in (0.0, _WARM_UP_TIME, 10 * _WARM_UP_TIME)]
+    forces = [
+        bench.force(np.zeros(bench.model.nv), v, time)[at]
+        for time in (0.0, injected._WARM_UP_TIME, 10 * injected._WARM_UP_TIME)
+    ]
     assert forces == pytest.approx([-3.0, -3.0 / math.e, 0.0], abs=2e-4)
 
 
@@ -358,7 +343,7 @@ def test_a_slipping_grasp_has_moved_along_the_tube_after_every_slip():
     site = bench.model.site("grasp_left_held").id
     begin = bench.model.site_pos[site].copy()
     moved = []
-    for time in (_SLIP_TIMES[0] - 0.01, 0.5 * sum(_SLIP_TIMES), _SLIP_TIMES[1] + 1.0):
+    for time in (injected._SLIP_TIMES[0] - 0.01, 0.5 * sum(injected._SLIP_TIMES), injected._SLIP_TIMES[1] + 1.0):
         bench.force(np.zeros(bench.model.nv), time=time)
         moved.append(bench.model.site_pos[site] - begin)
     assert np.array(moved) == pytest.approx(np.array([[0, 0, 0], [0, 0, -0.008], [0, 0, -0.016]]), abs=1e-12)
