@@ -73,11 +73,7 @@ class _DistortedReading(EffectBase):
 
 @EFFECTS.register("encoder_offset")
 class EncoderOffset(_DistortedReading):
-    """Measured angle = true angle + offset.
-
-    The model's coordinate stays the true angle: prescribed paths, start postures and what a tracking filter follows are
-    the readings less the offset.
-    """
+    """Measured angle = true angle + offset, which is taken off paths, start postures and what a filter follows."""
 
     equation = "measured angle = true + offset"
     required_excitation = "how it stands against gravity"
@@ -177,10 +173,7 @@ class EffortGain(_DistortedEffort):
     )
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """A start with the opposite sign of scale where the estimate of 1/scale is at least 1 away from 1; else None.
-
-        Compared efforts are linear in scale, torques that drive in 1/scale: a flipped sign is two away either way.
-        """
+        # compared efforts are linear in scale, torques that drive in 1/scale: a flipped sign is two away either way
         [name] = self.parameters.names
         value = start.get(name, 1.0)
         if abs(value - 1) < 1:
@@ -340,8 +333,7 @@ class ServoDelay(_ServoChange):
 class ServoSaturation(_ServoChange):
     """An additional torque limit of a servo: demand / (1 + |demand/limit|^16)^(1/16).
 
-    Kept inside as limit^-16, which adds to the model's own limit, is neutral at zero and has a slope there: of the
-    largest torques first. From a tenth beside the limit on it is within 1.2 % of a clip.
+    Kept inside as limit^-16, which adds to the model's own limit, is neutral at zero and has a slope there.
     """
 
     equation = "torque = demand / (1 + (demand/limit)^16)^(1/16)"

@@ -164,10 +164,7 @@ class Payload(EffectBase):
         return (mass, *moments)
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """A start with the opposite sign of mass, at the distance `_MAX_PAYLOAD_DISTANCE`; None where the mass is zero.
-
-        Near zero mass no second moment distinguishes the two signs.
-        """
+        # near zero mass no second moment distinguishes the two signs
         mass, *moments = (start.get(f"{self.label}.{quantity.name}", 0.0) for quantity in self.definitions)
         opposite = -math.copysign(np.linalg.norm(moments) / _MAX_PAYLOAD_DISTANCE, mass)
         other = float(np.clip(opposite, self.definitions[0].lower, self.definitions[0].upper))
@@ -368,13 +365,9 @@ def _on_bodies(
     """Generalized force of wrenches that depend only on their body's motion, with its derivatives.
 
     With W_j and K_j the sum of wrenches, and of their slopes by the bodies' spatial velocity, over all that joint j
-    moves, S_j its screw and D_j = V_parent(j) x S_j, for i an ancestor of j or j itself:
-
-        F_j = S_j . W_j         dF_j/dv_i = dF_i/dv_j = S_i . K_j S_j
-        dF_j/dq_i = D_i . K_j S_j       dF_i/dq_j = S_i . (K_j D_j + S_j x* W_j)
-
-    because turning joint i turns a body and its wrench together, up to the velocity D_i that the turn adds; hence the A
-    and T of `ForceWithDerivatives`.
+    moves, S_j its screw and D_j = V_parent(j) x S_j, F_j = S_j . W_j, and the columns of `ForceWithDerivatives` are
+    A_j = K_j S_j and T_j = K_j D_j + S_j x* W_j, because turning a joint i above turns a body and its wrench together,
+    up to the velocity D_i that the turn adds.
 
     By joint index, `wrenches`, shape (6, 1), are about the world origin and must turn with the body and its velocity;
     `slopes`, shape (6, 6), are symmetric.

@@ -27,11 +27,6 @@ def _bending_stiffness(system: System, segment: str) -> float:
     return max(float(np.mean(np.array(function(system.parameters.vector())))), 1e-6)
 
 
-def _reference_cubic_stiffness(system: System, segment: str) -> float:
-    """Bending stiffness over the squared reference angle [N m/rad^3]."""
-    return _bending_stiffness(system, segment) / _REFERENCE_ANGLE**2
-
-
 class _SegmentEffect(EffectBase):
     """An effect on every elastic joint of a segment."""
 
@@ -155,7 +150,7 @@ class CubicStiffness(_SegmentEffect):
     declared_parameters = (
         replace(
             ParameterDefinition("k3", "N m/rad^3", 0.0, -10.0, 50.0, (-0.5, 1.0), "cubic stiffness of every joint"),
-            range_scale=_reference_cubic_stiffness,
+            range_scale=lambda system, segment: _bending_stiffness(system, segment) / _REFERENCE_ANGLE**2,
         ),
     )
 

@@ -40,7 +40,7 @@ def _branch_joints_by_junction(system: System) -> dict[str, tuple[str, ...]]:
 
 
 class _JointInsertion(EffectBase):
-    """A massless two-axis rotational spring in what is rigid in the model."""
+    """A massless two-axis rotational spring, relaxing in `_SPRING_RELAXATION_TIME`, in what is rigid in the model."""
 
     required_excitation = "how hard it pulls at its ends"
     declared_parameters = (
@@ -75,10 +75,7 @@ class _JointInsertion(EffectBase):
 
 @EFFECTS.register("mount_compliance")
 class MountCompliance(_JointInsertion):
-    """A massless two-axis rotational spring under the object's foot or clamp, about x and y of the first link.
-
-    It has the relaxation time `_SPRING_RELAXATION_TIME`.
-    """
+    """A massless two-axis rotational spring under the object's foot or clamp, about x and y of the first link."""
 
     equation = "two joints with V = 1/2 stiffness q^2 before the first link"
     possible_locations = _root_joints_by_base
@@ -94,7 +91,7 @@ class JunctionCompliance(_JointInsertion):
     """A massless two-axis rotational spring between a segment and the branches that leave it at one junction.
 
     At `w_PARENT` all branches turn together about x and y of the parent's last link, at `junction_BRANCH` one turns
-    about its own. It has the relaxation time `_SPRING_RELAXATION_TIME`.
+    about its own.
     """
 
     equation = "two joints with V = 1/2 stiffness q^2 before the branches"

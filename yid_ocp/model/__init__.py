@@ -1,7 +1,4 @@
-"""The mechanical model: parameters, mechanisms, flexible objects, symbolic mechanics and the `System`.
-
-Everything here is description and symbols, nothing is solved; extend it with new terms through `effects`, not here.
-"""
+"""The mechanical model: parameters, mechanisms, flexible objects and the `System`; new terms come through `effects`."""
 
 from yid_ocp.model.flexible import FlexibleObject as FlexibleObject
 from yid_ocp.model.flexible import Segment as Segment

@@ -70,9 +70,8 @@ def symbolic_rotation_from_axis_angle(axis: Sequence[float], angle: ca.SX) -> ca
 
 def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
     """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of symbolic angles [rad], shape (3, 3); without yaw Ry Rx."""
-    turned = symbolic_rotation_from_axis_angle((0.0, 1.0, 0.0), pitch) @ symbolic_rotation_from_axis_angle(
-        (1.0, 0.0, 0.0), roll
-    )
+    about_x = symbolic_rotation_from_axis_angle((1.0, 0.0, 0.0), roll)
+    turned = symbolic_rotation_from_axis_angle((0.0, 1.0, 0.0), pitch) @ about_x
     return ca.densify(turned if yaw is None else symbolic_rotation_from_axis_angle((0.0, 0.0, 1.0), yaw) @ turned)
 
 
@@ -82,5 +81,4 @@ def _skew(u: Array) -> Array:
 
 def transform_from_xyz_rpy(xyz: ArrayLike = (0.0, 0.0, 0.0), rpy: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """Homogeneous 4x4 matrix from a translation [m] and roll, pitch, yaw [rad]."""
-    angles = np.asarray(rpy, float)
-    return homogeneous_transform(rotation_from_rpy(*angles), xyz)
+    return homogeneous_transform(rotation_from_rpy(*np.asarray(rpy, float)), xyz)

@@ -15,19 +15,14 @@ from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
 CommandInterpolation = Literal["held", "interpolated"]
-TORQUE_SATURATION_EXPONENT = 16
-"""Exponent p of a servo's smooth torque limit, demand / (1 + |demand/limit|^p)^(1/p)."""
-UNLIMITED_EFFORT_THRESHOLD = 2e4
-"""Effort limits from this value on mean that there is none [N m or N]."""
+TORQUE_SATURATION_EXPONENT = 16  # p of a servo's smooth torque limit, demand / (1 + |demand/limit|^p)^(1/p)
+UNLIMITED_EFFORT_THRESHOLD = 2e4  # effort limits from this value on mean that there is none [N m or N]
 _DEFAULT_FULL_TORQUE_ERROR = 0.05  # at which a servo of unknown gain reaches its torque limit [rad or m]
 _DEFAULT_GAIN = 50.0  # of a servo without an effort limit [N m/rad or N/m]
 _DEFAULT_DAMPING_TIME = 0.1  # a servo's damping over its gain [s]
 _MAX_COMMAND_DELAY = 0.5  # [s]
-MOTOR_OFF_COMMAND = 1e6
-"""Input of a servo whose motor is off; from half of it on there is no torque [rad or m]."""
-
-SERVO_GAIN_FACTOR = "servo_gain_factor"
-"""Parameter of a joint by which a recording states the proportional gain of its servo's firmware."""
+MOTOR_OFF_COMMAND = 1e6  # input of a servo whose motor is off; from half of it on there is no torque [rad or m]
+SERVO_GAIN_FACTOR = "servo_gain_factor"  # parameter by which a recording states the proportional gain of a firmware
 
 MotorKind = Literal["ideal", "dc"]
 MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]

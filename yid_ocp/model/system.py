@@ -430,10 +430,7 @@ def _check_names(
 
 
 def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
-    """A massless mechanism of one frame, called `frame` or as the clamp, with six coordinates.
-
-    Joints are `NAME_x`, `NAME_y`, `NAME_z`, then `NAME_rx`, `NAME_ry`, `NAME_rz`, which turn about x, y, z.
-    """
+    """A massless mechanism of one frame, called `frame` or as the clamp, with joints `NAME_x`, ... and `NAME_rx`, ..."""
     kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(
         Joint(f"{name}_{prefix}{letter}", kind, 3 * block + a - 1, Placement.identity(), axis)

@@ -42,10 +42,7 @@ log = logging.getLogger(__name__)
 
 
 def _example_robot_urdf(robot: str) -> Path:
-    """Path of a robot's URDF file in the installed example-robot-data package; `ModelError` where there is none.
-
-    `robot` is `baxter`, `panda`, `ur5`, or `folder/file.urdf` below the package's robots folder.
-    """
+    """Path of `baxter`, `panda`, `ur5`, or `folder/file.urdf` in the installed example-robot-data package."""
     roots = [Path(p) / "cmeel.prefix/share/example-robot-data/robots" for p in [*sys.path, *site.getsitepackages()]]
     roots += [Path(sys.prefix) / "share/example-robot-data/robots"]
     folder = next((root for root in roots if root.is_dir()), None)

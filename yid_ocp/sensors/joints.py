@@ -37,8 +37,7 @@ _TORQUE_CONSTANT = "torque_constant"
 _CURRENT = CHANNEL_KINDS.register("motors.current")(
     ChannelKind("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
 )
-NOISE_DIFFERENCE_ORDER = 6
-"""Order of the differences that estimate a noise level; they remove any motion that is slow against the sampling."""
+NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate a noise level: they remove motion slow against sampling
 
 
 @dataclass(frozen=True)
@@ -263,10 +262,7 @@ def joint_torque_bias_std(joints: RecordedJoints, names: Sequence[str], choice: 
 
 
 def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
-    """White-noise standard deviation of evenly sampled channels (N, k), estimated from high-order differences, (k,).
-
-    Whatever else is as fast as the sampling counts as noise, so that this is rather too much than too little.
-    """
+    """Noise of channels (N, k) from high-order differences, (k,): all that is as fast as the sampling counts as noise."""
     order = NOISE_DIFFERENCE_ORDER
     if len(values) <= order:
         what, allowed = f"{len(values)} samples are too few to see the noise of {group}", f"more than {order}"

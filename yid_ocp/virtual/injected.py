@@ -87,8 +87,7 @@ class _EffectContext:
         return int(model.jnt_bodyid[model.joint(named.get(place, place)).id])
 
 
-_ForceBuilder = Callable[[_EffectContext, Any, str, Any], _ForceCallback]
-"""From the scene, MuJoCo's model, a place and a size to a force."""
+_ForceBuilder = Callable[[_EffectContext, Any, str, Any], _ForceCallback]  # of a model, at a place, of a size
 
 
 def _joint_force(at: Any, law: Callable[[Any, Any, float], Any]) -> _ForceCallback:
@@ -300,7 +299,6 @@ _FORCES: Mapping[str, _ForceBuilder] = {  # of the library's effects
     "effort_lag": _in_motion(_effort_lag),
 }
 INJECTABLE_EFFECT_KINDS = (*_DESCRIPTION_KINDS, *_MUJOCO_MODEL_KINDS, *_FORCES, *_SENSOR_ERROR_KINDS)
-"""Effect kinds of the library that can be simulated in MuJoCo."""
 
 
 # -- effects outside the library --------------------------------------------------------------------------------------

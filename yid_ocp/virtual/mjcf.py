@@ -56,7 +56,6 @@ _DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of fric
 _POINTS = 3  # at which equations are compared
 _ROUNDING = 1e-9
 MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
-"""Aspects that MuJoCo can only approximate."""
 # aspects of sensors and recorded torques, which do not enter the mechanics
 _IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
 # aspects for which MuJoCo has an equivalent term
@@ -300,7 +299,9 @@ def mujoco_xml(
     sites = _sites(system, tree, value)
     base = SubElement(SubElement(root, "worldbody"), "body", name="world_base")
     SubElement(base, "inertial", pos="0 0 0", mass="0", diaginertia="0 0 0")  # Pinocchio asks for one
-    gears = {name: _play_attributes(width, time_step) for name, width in (gear_play or {}).items()}
+    stops = {"solreflimit": format_xml_numbers([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
+    ranges = {name: format_xml_numbers([-width / 2, width / 2]) for name, width in (gear_play or {}).items()}
+    gears = {name: {"limited": "true", "range": ends, **stops} for name, ends in ranges.items()}
     elements = _bodies(tree, weights, joint_dynamics_terms(system, value), sites, base, gears)
     for name, frame in sites:
         SubElement(elements[frame.joint_index], "site", {"name": name, **_pose(frame.placement)})
@@ -389,12 +390,6 @@ def _joint_attributes(joint: Joint, terms: JointDynamicsTerms) -> dict[str, str]
     others = {"armature": [terms.armature], "frictionloss": [terms.dry_friction]}
     numbers |= {name: size for name, size in others.items() if any(size)}
     return attributes | {name: format_xml_numbers(values) for name, values in numbers.items()}
-
-
-def _play_attributes(width: float, time_step: float) -> dict[str, str]:
-    """A joint with stops at half the width either way."""
-    ends = {"limited": "true", "range": format_xml_numbers([-width / 2, width / 2])}
-    return {**ends, "solreflimit": format_xml_numbers([5 * time_step, 1.0]), "solimplimit": "0.99 0.999 0.0001 0.5 2"}
 
 
 def _add_grasps(system: System, value: ParameterEvaluator, root: Element, time_step: float) -> None:

@@ -23,8 +23,7 @@ from yid_ocp.virtual.mujoco_simulation import (
     settle_under_servo_commands,
 )
 
-REPLAY_FEEDBACK_BANDWIDTH = 5.0
-"""Bandwidth of the feedback against drift of driven joints [rad/s]; low, so that recorded torque dominates."""
+REPLAY_FEEDBACK_BANDWIDTH = 5.0  # against drift of driven joints; low, so that recorded torque dominates [rad/s]
 _SMOOTHED = 2.0  # samples over which recorded angles are smoothed before they are followed
 _START = 5  # samples of which the first posture is the mean
 _AT_ENDS = 0.2  # of a recording in which what moves prescribed joints is not compared [s]: it begins anew there

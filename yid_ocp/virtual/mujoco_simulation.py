@@ -24,9 +24,7 @@ from yid_ocp.sensors.base import EffortKind
 from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
 from yid_ocp.virtual.mjcf import compile_mjcf, import_mujoco, mujoco_xml
 
-DEFAULT_SIMULATOR_TIME_STEP = 1e-4
-"""Default time step of the simulator [s]."""
-
+DEFAULT_SIMULATOR_TIME_STEP = 1e-4  # [s]
 _BANDWIDTH = 25.0  # of the joint controller [rad/s]; a 10 ms hold leaves it well damped
 _HOLD_STIFFNESS = 2e3  # [N m/rad] while settling; stable explicitly on the lightest wrist
 _HOLD_DAMPING = 60.0  # [N m s/rad]
@@ -34,8 +32,8 @@ _SETTLING_FACTOR = 10.0  # on the object's damping: equilibrium does not depend 
 _SETTLING_LIMIT = 60.0  # [s]
 _POSTURE_TOLERANCE = 1e-6  # [rad]
 _REST = 1e-7  # [rad/s]
+# warnings after which MuJoCo resets its state and goes on; their numbers differ between its versions
 _LOST = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
-"""Warnings after which MuJoCo resets its state and goes on; their numbers differ between its versions."""
 
 
 class InjectedSimulatorTerms(Protocol):

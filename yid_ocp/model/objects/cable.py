@@ -56,12 +56,9 @@ START_SPEED_PARAMETER_NAME = "start.speed"
 
 @dataclass(frozen=True)
 class CableBranchOptions:
-    """Nominal properties of one branch of a cable: rigidities [N m^2] and damping per curvature rate [N m^2 s].
+    """Nominal properties of one branch of a cable: rigidities [N m^2] and damping per curvature rate [N m^2 s]."""
 
-    In a configuration these three are set under `parameters`.
-    """
-
-    bend_rigidity: float = 1.5e-3
+    bend_rigidity: float = 1.5e-3  # in a configuration this and the next two are set under `parameters`
     twist_rigidity: float = 1.0e-3
     bend_damping: float = 5e-5
     separate_twist_damping: Annotated[bool, OptionInfo("whether twists have a damping parameter of their own")] = False

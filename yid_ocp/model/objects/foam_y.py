@@ -29,10 +29,7 @@ def foam_y_segments() -> tuple[Segment, ...]:
 
 
 def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
-    """The paper's foam Y as a flexible object, its trunk's foot at (0.85, 0, -0.93) m.
-
-    The nominal stiffness per joint is that of four links, however many rigid `links` every tube has.
-    """
+    """The paper's foam Y, its foot at (0.85, 0, -0.93) m; the stiffness per joint is that of four links in any case."""
     segments = [replace(segment, links=links) for segment in foam_y_segments()]
     return flexible_object(segments, _FOOT_POSE, "y_object", gravity_fraction)
 

@@ -10,17 +10,8 @@ from annotated_types import Ge, Gt, Le
 
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment
-from yid_ocp.model.objects.base import (
-    OBJECT_KINDS,
-    SIZE_DESCRIPTIONS,
-    InitCommandObject,
-    InitCommandObjectTemplate,
-    MountedObject,
-    MountSettings,
-    bending_start_values,
-    comma_separated_numbers,
-    required_object_numbers,
-)
+from yid_ocp.model.objects import base
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObject
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
@@ -97,23 +88,23 @@ def _init_segment(links: int, length: float, mass: float, radius: float | None, 
 
 def _init_object(word: str, segments: Mapping[str, SegmentSettings]) -> InitCommandObject:
     item = SegmentedObject(segments=segments)
-    return InitCommandObject(item, bending_start_values(item.model_segments(), _RIGIDITY_RATIO[word]))
+    return InitCommandObject(item, base.bending_start_values(item.model_segments(), _RIGIDITY_RATIO[word]))
 
 
 def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
-    length, mass, radius = required_object_numbers("a cable", numbers, SIZE_DESCRIPTIONS)
+    length, mass, radius = base.required_object_numbers("a cable", numbers, base.SIZE_DESCRIPTIONS)
     section = _section(numbers)
     segment = _init_segment(links, length, mass, None if section else radius, cross_section=section)
     return _init_object("cable", {"cable": segment})
 
 
 def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
-    sizes = {name: SIZE_DESCRIPTIONS[name] for name in ("length", "mass")}
-    length, mass = required_object_numbers("a beam", numbers, sizes)
+    sizes = {name: base.SIZE_DESCRIPTIONS[name] for name in ("length", "mass")}
+    length, mass = base.required_object_numbers("a beam", numbers, sizes)
     section = _section(numbers)
     if section is None and "radius" not in numbers:
         what, hint = "a beam needs a radius or a section", "add --radius NUMBER, or --section WIDTH,HEIGHT"
-        raise ConfigError(what, where="--radius", allowed=SIZE_DESCRIPTIONS["radius"], hint=hint)
+        raise ConfigError(what, where="--radius", allowed=base.SIZE_DESCRIPTIONS["radius"], hint=hint)
     radius = None if section else float(numbers["radius"])
     return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section=section)})
 
@@ -125,7 +116,7 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
         allowed = "--branch NAME=LENGTH,MASS,RADIUS[,ROLL,PITCH,YAW] for each, or --branches NUMBER of equal ones"
         hint = "--branches 4 --length 0.4 --mass 0.03 --radius 0.008"
         raise ConfigError("a tree needs branches", where="--branch", allowed=allowed, hint=hint)
-    length, mass, radius = required_object_numbers("each branch of a tree", numbers, SIZE_DESCRIPTIONS)
+    length, mass, radius = base.required_object_numbers("each branch of a tree", numbers, base.SIZE_DESCRIPTIONS)
     count, quarter = numbers["branches"], 1.5707963
     if not 1 <= count <= 16:
         raise ConfigError(f"the tree has {count} branches", where="--branches", allowed="1 to 16")
@@ -138,7 +129,7 @@ def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
 def _section(numbers: Mapping[str, Any]) -> tuple[float, float] | None:
     if not numbers.get("section"):
         return None
-    x, y = comma_separated_numbers(numbers["section"], 2, "--section")
+    x, y = base.comma_separated_numbers(numbers["section"], 2, "--section")
     return x, y
 
 
@@ -161,7 +152,7 @@ def _branch(text: str, links: int) -> tuple[str, SegmentSettings]:
     count = len(numbers.split(","))
     if not (name and equals) or (at and not parent) or count not in (3, 6):
         raise ConfigError(f"'{text}' describes no branch", where="--branch", allowed=_BRANCH_SHAPE)
-    values = comma_separated_numbers(numbers, count, "--branch")
+    values = base.comma_separated_numbers(numbers, count, "--branch")
     if min(values[:3]) <= 0:
         raise ConfigError(f"'{text}' has a size that is not above 0", where="--branch", allowed=_BRANCH_SHAPE)
     turn = (values[3], values[4], values[5]) if count == 6 else _NO_TURN
@@ -200,7 +191,7 @@ stiffness_per_curvature: true, clamped_at_base: true}
     }
 
     kind: Annotated[Literal["segments"], OptionInfo("what the object is")] = "segments"
-    mount: Annotated[MountSettings, OptionInfo("where its root sits")] = field(default_factory=MountSettings)
+    mount: Annotated[base.MountSettings, OptionInfo("where its root sits")] = field(default_factory=base.MountSettings)
     segments: Annotated[Mapping[str, SegmentSettings], OptionInfo("by name, parents first")] = field(
         default_factory=dict
     )

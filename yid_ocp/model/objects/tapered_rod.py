@@ -12,15 +12,8 @@ from annotated_types import Ge, Gt, Le
 
 from yid_ocp.model.flexible import FlexibleObject, Segment
 from yid_ocp.model.mechanism import Inertia, Joint
-from yid_ocp.model.objects.base import (
-    OBJECT_KINDS,
-    SIZE_DESCRIPTIONS,
-    InitCommandObject,
-    InitCommandObjectTemplate,
-    MountedObject,
-    bending_start_values,
-    required_object_numbers,
-)
+from yid_ocp.model.objects import base
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObject
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
@@ -29,9 +22,11 @@ _FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
 
 
 def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
-    length, mass, radius, tip = required_object_numbers("a tapered rod", numbers, SIZE_DESCRIPTIONS | _FURTHER_NUMBERS)
+    length, mass, radius, tip = base.required_object_numbers(
+        "a tapered rod", numbers, base.SIZE_DESCRIPTIONS | _FURTHER_NUMBERS
+    )
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return InitCommandObject(item, bending_start_values(item.model_segments(), 1.0))
+    return InitCommandObject(item, base.bending_start_values(item.model_segments(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
