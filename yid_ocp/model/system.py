@@ -430,7 +430,7 @@ def _check_names(
 
 
 def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
-    """A massless mechanism of one frame, called `frame` or as the clamp, with joints `NAME_x`, ... and `NAME_rx`, ..."""
+    """A massless mechanism of one frame, called `frame` or as the clamp; its joints are `NAME_x` ... `NAME_rz`."""
     kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(
         Joint(f"{name}_{prefix}{letter}", kind, 3 * block + a - 1, Placement.identity(), axis)

@@ -262,7 +262,7 @@ def joint_torque_bias_std(joints: RecordedJoints, names: Sequence[str], choice: 
 
 
 def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Array:
-    """Noise of channels (N, k) from high-order differences, (k,): all that is as fast as the sampling counts as noise."""
+    """Noise of channels (N, k) from high-order differences, (k,); all that is as fast as the sampling counts."""
     order = NOISE_DIFFERENCE_ORDER
     if len(values) <= order:
         what, allowed = f"{len(values)} samples are too few to see the noise of {group}", f"more than {order}"
