@@ -21,6 +21,7 @@ from yid_ocp.diagnosis.blind import (
     plan_blind_cases,
     scale_parameters_to_more_links,
 )
+from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.virtual.injected import OUT_OF_LIBRARY_EFFECTS, InjectedEffect
 from yid_ocp.virtual.joint_motion import MultisineOptions
@@ -109,6 +110,16 @@ def test_what_cannot_be_simulated_is_refused(drawn, given, words):
     with pytest.raises(ConfigError, match=words):
         drawn(**given)
     drawn(seed=0)
+
+
+def test_what_is_detectable_counts_the_noise_of_torques(drawn, monkeypatch):
+    ensemble, composed = drawn(), AllCandidatesProblem("by the sensors", (DAMPER,), False)
+    weighted = SimpleNamespace(problem="by all noise", values={"k": 1.0})
+    monkeypatch.setattr(ensemble, "_nominal_problem", lambda recordings: SimpleNamespace(system="system"))
+    monkeypatch.setattr(module, "AllCandidatesProblem", SimpleNamespace(from_problem=lambda *_: composed))
+    monkeypatch.setattr(module, "fit_nominal_model", lambda *_, limits: weighted)
+    monkeypatch.setattr(module, "linearize_candidates", lambda of, base, values, grid: of)
+    assert ensemble._linearize_clean_recordings().problem == "by all noise"
 
 
 def test_a_recording_says_nothing_of_what_is_in_it(drawn):
