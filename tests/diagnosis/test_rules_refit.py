@@ -137,15 +137,12 @@ def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monk
 @cases(
     "before, after, half",
     {
-        "much is explained": (100.0, 60.0, True),
         "hardly anything is": (100.0, 98.0, False),
         "a fifth of the excess": (100.0, 81.0, False),
         "more than a fifth of the excess": (100.0, 80.9, True),
         "all is": (100.0, 5.4, False),
         "just not all": (100.0, 5.5, True),
-        "nearly all is": (100.0, 5.6, True),
         "nothing to compare with": (None, 60.0, False),
-        "nothing is": (100.0, 100.0, False),
     },
 )
 def test_a_refit_that_explains_much_but_not_all_is_half_done(before, after, half):
@@ -189,7 +186,6 @@ def test_a_half_done_refit_is_tried_again_from_the_nominal_initial_values(solved
     "good, bad, runs",
     {
         "worse from there": (70.0, 60.0, [5.0, 1.0]),
-        "no better from there": (60.0, 60.0, [5.0, 1.0]),
         "impossible from there": (None, 60.0, [5.0, 1.0]),
         "not half done": (1.0, 5.0, [5.0]),
     },
@@ -238,9 +234,8 @@ def test_another_place_is_tried_where_more_than_noise_is_left(solved, monkeypatc
     cases = {11.5: (11.5, 0.75), 11.7: (5.0, -0.75), None: (5.0, -0.75)}
     for first, (cost, value) in cases.items():
         there = {0.75: first, -0.75: 5.0}
-        found = refit_with_effects(
-            Problem(lambda values, there=there: there.get(values[A])), [FRICTION], {"k": 2.0, A: 0.75}
-        )
+        problem = Problem(lambda values, there=there: there.get(values[A]))
+        found = refit_with_effects(problem, [FRICTION], {"k": 2.0, A: 0.75})
         assert (found.cost, found.values[A]) == (pytest.approx(cost), value)
     # a worse one is not taken
     there = {0.75: 20.0, -0.75: 21.0}
@@ -272,7 +267,6 @@ def test_a_stored_refit_is_evaluated_and_not_solved(solved):
     {
         "other unknowns": ({"k": 1.0}, {"k": 1.0}, {A: 0.2}, 5.0),
         "deviations of others": (START, {"k": 1.0}, {A: 0.2}, 5.0),
-        "one unknown more": ({**START, "more": 1.0}, dict.fromkeys(START, 0.3), {A: 0.2}, 5.0),
         "other amplitudes": (START, dict.fromkeys(START, 0.3), {"k": 0.2}, 5.0),
         "cannot be rolled out": (START, dict.fromkeys(START, 0.3), {A: 0.2}, None),
     },
@@ -327,7 +321,6 @@ def episode(name="other", steps=100, time_step=0.01, of=()):
         "forty seconds": ((40.0,), 1.0),
         "two recordings": ((30.0, 30.0), 1.5),
         "long": ((200.0,), 2.0),
-        "a minute": ((60.0,), 1.5),
     },
 )
 def test_held_out_time_is_cut_in_some_forty_blocks(seconds, length):
@@ -352,39 +345,25 @@ def predicting(monkeypatch):
     monkeypatch.setattr(module, "rmse_by_channel", channel_errors)
 
     def rows(i, there, result):
-        parts = [
-            group.residual_block(values).residual
-            for group, values in zip(there.measurements, result.predicted_outputs, strict=True)
-        ]
-        return SimpleNamespace(residual=np.concatenate(parts))
+        pairs = zip(there.measurements, result.predicted_outputs, strict=True)
+        return SimpleNamespace(residual=np.concatenate([group.residual_block(x).residual for group, x in pairs]))
 
-    return lambda *pairs: (
-        SimpleNamespace(
-            held_out=[e for e, _ in pairs],
-            predict_held_out=lambda x: list(pairs),
-            whitened_held_out_residual=rows,
-            has_process_noise=False,
-            options=ProblemOptions(),
-            shared_parameters=(),
-            unknown_names=(),
-            initial_unknowns=np.zeros(0),
-        ),
-        told,
-    )
+    usual = {"whitened_held_out_residual": rows, "has_process_noise": False, "options": ProblemOptions()}
+    usual |= {"shared_parameters": (), "unknown_names": (), "initial_unknowns": np.zeros(0)}
+
+    def made(*pairs):
+        return SimpleNamespace(held_out=[e for e, _ in pairs], predict_held_out=lambda x: list(pairs), **usual), told
+
+    return made
 
 
 def test_a_held_out_loss_sums_whitened_squares_block_by_block(predicting):
     nan = math.nan
-    group = measured(
-        [0.0, 0.49, 0.5, 0.99, 1.0],
-        [[1, 1], [2, nan], [3, 3], [4, 4], [5, 5]],
-        [[1, 1], [2, 0], [1, 1], [1, 1], [1, 2]],
-    )
-    more = measured([0.2], [[0, 0]], [[3, 3]])
+    value, weight = [[1, 1], [2, nan], [3, 3], [4, 4], [5, 5]], [[1, 1], [2, 0], [1, 1], [1, 1], [1, 2]]
+    group, more = measured([0.0, 0.49, 0.5, 0.99, 1.0], value, weight), measured([0.2], [[0, 0]], [[3, 3]])
     predicted = np.array([[2.0, 1.0], [3.0, 9.0], [3.0, 1.0], [4.0, 5.0], [6.0, 6.0]])
-    problem, told = predicting(
-        (episode(of=[group, more]), SimpleNamespace(predicted_outputs=(predicted, np.array([[1.0, 2.0]]))))
-    )
+    outputs = SimpleNamespace(predicted_outputs=(predicted, np.array([[1.0, 2.0]])))
+    problem, told = predicting((episode(of=[group, more]), outputs))
     found = _held_out_loss(problem, np.zeros(1))
     # blocks of half a second: [0, 0.5), [0.5, 1.0) and the last sample
     np.testing.assert_allclose(found.block_chi2, [1 + 4 + 9 + 36, 4 + 1, 1 + 4])

@@ -42,7 +42,6 @@ def only(of, columns, residual, noise=None, **shapes):
     "expected, count, values",
     {
         "logarithm": ((0.1, 100.0), 4, (0.1, 1.0, 10.0, 100.0)),
-        "logarithm of three": ((0.1, 1000.0), 3, (0.1, 10.0, 1000.0)),
         "from zero": ((0.0, 3.0), 4, (0.0, 1.0, 2.0, 3.0)),
         "through zero": ((-1.0, 1.0), 3, (-1.0, 0.0, 1.0)),
         "one value": ((0.5, 2.0), 1, (0.5,)),
@@ -84,9 +83,8 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
     for i in range(count):
         for j in range(count):
             expected += max(0.0, 1 - abs(i - j) / length) * np.outer(u[i], u[j])
-    np.testing.assert_allclose(
-        _newey_west_covariance(columns, residual, [series(rows)]), expected, rtol=1e-10, atol=1e-12
-    )
+    found = _newey_west_covariance(columns, residual, [series(rows)])
+    np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
 
 
 # -- what could be seen -----------------------------------------------------------------------------------------------
@@ -98,7 +96,6 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
         "seen": ([3.0, 4.0], None, (0.0, 1.0), 2.0 / 5.0, True),
         "as large as expected": ([3.0, 4.0], None, (0.0, 0.4), 2.0 / 5.0, False),
         "to either side": ([3.0, 4.0], None, (-0.5, 0.3), 2.0 / 5.0, True),
-        "noisier": ([3.0, 4.0], 100.0, (0.0, 1.0), 2.0 * 10.0 / 25.0, True),
         "too noisy": ([3.0, 4.0], 400.0, (0.0, 1.0), 2.0 * 20.0 / 25.0, False),
         "nothing": ([0.0, 0.0], None, (0.0, 1.0), math.inf, False),
         "hardly": ([1e-09, 0.0], None, (0.0, 1000000000000.0), math.inf, False),
@@ -114,10 +111,8 @@ def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size,
 
 def test_the_range_counts_from_the_neutral_value():
     of = effect("factor@T1", amplitude(neutral=1.0, lower=0.0, expected=(0.7, 1.2)))
-    assert [candidate_detectability(point([0.0], signature(of, [c])), 2.0)[0].is_detectable for c in (6.0, 8.0)] == [
-        False,
-        True,
-    ]
+    found = [candidate_detectability(point([0.0], signature(of, [c])), 2.0)[0] for c in (6.0, 8.0)]
+    assert [entry.is_detectable for entry in found] == [False, True]
 
 
 @pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
@@ -131,16 +126,15 @@ def test_the_best_shape_tells_what_is_detectable(order):
 def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_small():
     of = effect("pair@x", amplitude("x", expected=(0.0, 0.05)), amplitude("y", expected=(0.0, 1.0)), shape())
     hidden, seen = signature(of, [[20.0, 0.0]], s=0.1), signature(of, [[0.0, 4.0]], s=0.2)
-    [found] = candidate_detectability(point([0.0], hidden, seen), detection_z=2.0)
-    assert (found.detectable_amplitudes["pair@x.y"], found.is_detectable) == (pytest.approx(0.5), True)
-    [other] = candidate_detectability(point([0.0], seen, hidden), detection_z=2.0)
-    assert (other.detectable_amplitudes["pair@x.x"], other.is_detectable) == (pytest.approx(0.1), True)
-    weaker = signature(of, [[0.0, 3.0]], s=0.3)
-    [best] = candidate_detectability(point([0.0], seen, weaker), detection_z=2.0)
-    assert best.detectable_amplitudes["pair@x.y"] == pytest.approx(0.5)
-    larger = signature(of, [[10.0, 0.0]], s=0.4)
-    [first] = candidate_detectability(point([0.0], hidden, larger), detection_z=2.0)
-    assert (first.detectable_amplitudes["pair@x.x"], first.is_detectable) == (pytest.approx(0.1), False)
+    weaker, larger = signature(of, [[0.0, 3.0]], s=0.3), signature(of, [[10.0, 0.0]], s=0.4)
+    for pair, name, size, is_seen in (
+        ((hidden, seen), "y", 0.5, True),
+        ((seen, hidden), "x", 0.1, True),
+        ((seen, weaker), "y", 0.5, True),
+        ((hidden, larger), "x", 0.1, False),
+    ):
+        [found] = candidate_detectability(point([0.0], *pair), detection_z=2.0)
+        assert (found.detectable_amplitudes[f"pair@x.{name}"], found.is_detectable) == (pytest.approx(size), is_seen)
 
 
 # -- scores -----------------------------------------------------------------------------------------------------------
@@ -249,9 +243,8 @@ def test_a_signature_explained_by_another():
 def test_nothing_is_like_what_moves_nothing():
     a, b = effect("a@x", amplitude()), effect("b@x", amplitude())
     at = point([0.0] * 2, signature(a, [0.0, 0.0]), signature(b, [1.0, 0.0]))
-    np.testing.assert_array_equal(
-        confusability_matrix(score_candidates_jointly(at)).overlap_fractions, [[0.0, 0.0], [0.0, 1.0]]
-    )
+    found = confusability_matrix(score_candidates_jointly(at))
+    np.testing.assert_array_equal(found.overlap_fractions, [[0.0, 0.0], [0.0, 1.0]])
     assert confusability_matrix(score_candidates_jointly(point([0.0]))).labels == ()
 
 

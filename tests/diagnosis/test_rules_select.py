@@ -57,7 +57,6 @@ def test_a_loss_is_a_mean_over_samples_and_a_gap_what_exceeds_one(squares, count
     {
         "all": ((3.0, 3.0), (1.0, 1.0), 1.0),
         "half": ((3.0, 3.0), (2.0, 2.0), 0.5),
-        "nothing": ((3.0, 3.0), (3.0, 3.0), 0.0),
         "worse": ((2.0, 2.0), (3.0, 3.0), -1.0),
         "below noise": ((3.0, 3.0), (0.5, 0.5), 1.0),
     },
@@ -133,7 +132,6 @@ def labels(fits):
         "within its error": ((1.1, 1.3, 1.0, 1.2), (1.2, 1.0, 1.2, 1.12), ["small@x", "large@x"]),
         "sure": ((1.2, 1.2, 1.2), (1.1, 1.1, 1.1), ["large@x"]),
         "tie": ((1.005, 1.005), (1.0, 1.0), ["small@x", "large@x"]),
-        "simplest is best": ((1.0, 1.0), (1.2, 1.2), ["small@x"]),
     },
 )
 def test_the_simplest_within_reach_of_the_best_comes_first(small, large, expected):
@@ -179,13 +177,10 @@ ODD, UNSURE, SURE = {"s": 9.0}, {"a": 0.019, "b": 0.0}, {"a": 0.021, "b": 0.0}
         "an unlikely shape, another comes near": (WIDE, ODD, 1.0, 1.04, "small@x"),
         "an unlikely shape, nothing comes near": (WIDE, ODD, 1.0, 1.2, "wide@x"),
         "an unlikely shape, near as a part of it": (WIDE, ODD, 10.0, 10.4, "small@x"),
-        "an unlikely shape, another is better": (WIDE, ODD, 1.0, 0.9, "small@x"),
         "hardly there, another comes near": (LARGE, UNSURE, 1.0, 1.04, "small@x"),
         "hardly there, nothing comes near": (LARGE, UNSURE, 1.0, 1.2, "large@x"),
         "hardly there, near as a part of it": (LARGE, UNSURE, 10.0, 10.4, "small@x"),
         "there, another comes near": (LARGE, SURE, 1.0, 1.04, "large@x"),
-        "there, nothing comes near": (LARGE, SURE, 1.0, 1.2, "large@x"),
-        "there, near as a part of it": (LARGE, SURE, 10.0, 10.4, "large@x"),
     },
 )
 def test_an_unlikely_shape_or_unsure_amplitude_counts_only_where_no_other_comes_near(of, values, own, plain, expected):
@@ -442,10 +437,8 @@ def test_only_odds_convince_of_a_rest_that_shows_along_a_candidate(monkeypatch):
         "enough": ((3.0, 3.0, 3.0), (2.89, 2.89, 2.89), ["a"]),
         "not sure": ((3.0, 5.0, 3.0), (4.4, 2.5, 2.9), []),
         "no gap": ((0.9, 1.0, 1.0), (0.88, 0.98, 0.98), []),
-        "below noise": ((0.9, 0.9, 0.9), (0.88, 0.88, 0.88), []),
         "likelier": ((1.0, 1.0, 1.0), (0.9, 0.99, 1.0), ["a"]),
         "likelier in one block": ((1.2, 1.0, 1.0), (1.0, 1.01, 1.02), ["a"]),
-        "nothing": ((2.0, 2.0, 2.0), (2.0, 2.0, 2.0), []),
     },
 )
 def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best, chosen):
@@ -463,7 +456,6 @@ def test_an_effect_must_close_a_sure_part_of_the_gap(monkeypatch, nominal, best,
         "a fall by 19": ((1.19, 1.0), (1.0, 1.0), True),
         "chi2 tells enough of it": ((1.2, 1.0), (1.0, 1.0), False),
         "what is left is no noise": ((1.6, 1.3), (1.2, 1.0), False),
-        "failed": ((1.6, 1.3), (math.inf, 1.0), False),
     },
 )
 def test_held_out_recordings_are_far_likelier_with_an_effect_that_leaves_noise(before, after, sure):

@@ -58,7 +58,6 @@ def scored(*p_values):
         "sure on the data of the fit": ((0.004, 1.2), (0.5, 1.0), True),
         "sure on held-out data": ((0.5, 1.0), (0.004, 1.2), True),
         "two tests: the smaller p counts twice": ((0.006, 1.2), (0.5, 1.0), False),
-        "two tests, the other way": ((0.5, 1.0), (0.006, 1.2), False),
         "at the level": ((0.005, 1.2), (0.5, 1.0), False),
         "sure but small": ((0.0, 1.05), (0.0, 1.09), False),
         "at the smallest gap": ((0.0, 1.1), (0.0, 1.1), False),
@@ -79,7 +78,6 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
         "in a held-out channel": ((0.004, 0.9), {"a": 1.0}, {"a": 1.0, "b": 1.2}, True),
         "best of two tries": ((0.006, 0.9), {"a": 1.2}, {"a": 1.0}, False),
         "best of four tries": ((0.9, 0.001, 0.9, 0.9), {"a": 1.2}, {"a": 1.0}, True),
-        "not the best of four tries": ((0.9, 0.003, 0.9, 0.9), {"a": 1.2}, {"a": 1.0}, False),
         "at the level": ((0.01,), {"a": 1.2}, {"a": 1.2}, False),
         "no channel above noise": ((0.001,), {"a": 1.02}, {"a": 1.01}, False),
         "channels at the smallest excess": ((0.001,), {"a": 1.03}, {"a": 0.9}, False),
@@ -89,12 +87,8 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
     tests = [outcome(channels=channels) for channels in (before, held_out)]
-    assert (
-        has_significant_gap(
-            *tests, Thresholds(min_channel_excess_chi2=0.03, candidate_significance_level=0.01), scored(*p_values)
-        )
-        is gap
-    )
+    limits = Thresholds(min_channel_excess_chi2=0.03, candidate_significance_level=0.01)
+    assert has_significant_gap(*tests, limits, scored(*p_values)) is gap
 
 
 def test_a_candidate_alone_has_to_be_surer_than_all_residuals():
@@ -126,8 +120,6 @@ SPEAKING = smoothed({FORCE: 9.0, BIAS: 0.0}, evidence={"plant": 9.0, "both": 9.0
     "found, p_values, before, held_out, chance",
     {
         "barely": (SILENT, (0.5,), 0.003, 0.5, True),
-        "barely on held-out data": (SILENT, (0.5,), 0.5, 0.003, True),
-        "no candidate": (SILENT, (), 0.003, 0.5, True),
         "sure": (SILENT, (0.5,), 9e-05, 0.5, False),
         "sure on held-out data": (SILENT, (0.5,), 0.5, 9e-05, False),
         "as sure as needed": (SILENT, (0.5,), 0.0001, 0.5, False),
@@ -146,7 +138,7 @@ def test_a_barely_significant_excess_without_shape_is_chance(found, p_values, be
 
 SEEN, UNSEEN = (visible(ONE),), (visible(ONE, seen=False),)
 CERTAIN, HALF, HARDLY_HALF = closed(0.45, 0.4, 0.49), closed(0.9, 0.5, 0.95), closed(0.9, 0.49, 0.95)
-NO_INTERVAL = closed(0.9, math.nan, math.nan)
+NO_INTERVAL, MUCH = closed(0.9, math.nan, math.nan), closed(0.95, 0.9, 0.98)
 ALIKE = (added(ONE, [OTHER]),)
 TWO, THREE = (added(ONE), added(OTHER)), (added(ONE), added(OTHER), added(THIRD))
 ONE_LAW, TWO_LOADS = (added(ONE), added(ELSEWHERE)), (added(LOADS[0]), added(LOADS[1]))
@@ -160,9 +152,7 @@ ONE_LAW, TWO_LOADS = (added(ONE), added(ELSEWHERE)), (added(LOADS[0]), added(LOA
         "nothing could be seen": ({"visible": UNSEEN}, "insufficient_data"),
         "no candidate": ({"visible": ()}, "insufficient_data"),
         "one could be seen": ({"visible": (*UNSEEN, visible(OTHER))}, "effect"),
-        "too few samples and no gap": ({"enough": False, "gap": False}, "insufficient_data"),
         "no gap": ({"gap": False}, "no_gap"),
-        "no gap and nothing added": ({"gap": False, "added": ()}, "no_gap"),
         "nothing added": ({"added": ()}, "unknown"),
         "closure sure by too little, however large": ({"total": closed(0.9, 0.04, 1.0)}, "unknown"),
         "lower end at the limit": ({"total": closed(0.9, 0.05, 1.0)}, "unknown"),
@@ -173,29 +163,19 @@ ONE_LAW, TWO_LOADS = (added(ONE), added(ELSEWHERE)), (added(LOADS[0]), added(LOA
         "little, half of the held-out gap": ({"explained": 0.1, "total": HALF}, "effect"),
         "little, hardly half of the held-out gap": ({"explained": 0.1, "total": HARDLY_HALF}, "unknown"),
         "little, no interval": ({"explained": 0.1, "total": replace(NO_INTERVAL, is_decisive=True)}, "unknown"),
-        "smoother explains less": ({"explained": 7.0}, "effect"),
         "two that do the same": ({"added": ALIKE}, "confusable"),
-        "two that do the same, and more": ({"added": (*ALIKE, added(OTHER))}, "confusable"),
         "only later ones do the same": ({"added": (added(ONE), added(OTHER, [ONE]))}, "effect"),
-        "confusable but explains little": ({"added": ALIKE, "explained": 0.1}, "unknown"),
         "two explain too little for two": ({"added": TWO, "explained": 0.74}, "unknown"),
         "two explain enough": ({"added": TWO, "explained": 0.75}, "effect"),
-        "two explain little, however much of the held-out gap": (
-            {"added": TWO, "explained": 0.1, "total": closed(0.95, 0.9, 0.98)},
-            "unknown",
-        ),
+        "two explain little, but much held out": ({"added": TWO, "explained": 0.1, "total": MUCH}, "unknown"),
         "three explain too little for three": ({"added": THREE, "explained": 0.87}, "unknown"),
         "three explain enough": ({"added": THREE, "explained": 0.88}, "effect"),
         "one law at two places explains too little": ({"added": ONE_LAW, "explained": 0.49}, "unknown"),
         "one law at two places explains enough": ({"added": ONE_LAW, "explained": 0.5}, "effect"),
         "loads at two places explain too little for two": ({"added": TWO_LOADS, "explained": 0.74}, "unknown"),
         "loads at two places explain enough for two": ({"added": TWO_LOADS, "explained": 0.75}, "effect"),
-        "one law at two places, half of the held-out gap": (
-            {"added": ONE_LAW, "explained": 0.1, "total": HALF},
-            "effect",
-        ),
+        "one law at two places, half held out": ({"added": ONE_LAW, "explained": 0.1, "total": HALF}, "effect"),
         "does not carry over": ({"carried": False}, "unknown"),
-        "does not carry over where there is no gap": ({"carried": False, "gap": False}, "no_gap"),
     },
 )
 def test_the_verdict(changed, verdict):
@@ -227,7 +207,6 @@ def test_the_first_reason_that_holds_is_why_a_gap_has_no_name(changed, reason):
     {
         "as much": ((100.0, 60.5), (200.0, 110.0), (90.0, 78.0), 1.0),
         "half": ((100.0, 80.5), (200.0, 110.0), (90.0, 78.0), 38.0 / 78.0),
-        "smoother takes no noise": ((100.0, 60.5), (200.0, 110.0), (90.0, 90.0), 78.0 / 90.0),
         "smoother explains nothing": ((100.0, 60.5), (110.0, 100.0), (90.0, 80.0), 1.0),
         "smoother is worse": ((100.0, 60.5), (100.0, 110.0), (90.0, 90.0), 1.0),
         "explains less": ((100.0, 100.0), (200.0, 110.0), (90.0, 78.0), -1.0 / 78.0),
@@ -255,10 +234,8 @@ def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, par
         "both by chance": ({FORCE: 9.0, BIAS: 3.0}, 9.0, 3.0, 14.0, "plant"),
         "both": ({FORCE: 9.0, BIAS: 3.0}, 9.0, 3.0, 14.1, "both"),
         "both, mostly the sensor": ({FORCE: 3.0, BIAS: 9.0}, 3.0, 9.0, 14.1, "both"),
-        "mostly the sensor": ({FORCE: 3.0, BIAS: 9.0}, 3.0, 9.0, 13.9, "sensor"),
         "an effort's bias would do the same": ({READ_FORCE: 9.0, BIAS: 3.0}, 9.0, 3.0, 20.0, "either"),
         "another force weighs more": ({READ_FORCE: 3.0, FORCE: 9.0}, 9.0, 0.0, 9.0, "plant"),
-        "little": ({FORCE: 0.1}, 0.1, 0.0, 0.1, "plant"),
     },
 )
 def test_the_side_of_a_gap_by_evidence(weight, plant, sensor, both, side):
@@ -274,7 +251,6 @@ def test_the_side_of_a_gap_by_evidence(weight, plant, sensor, both, side):
         "worse": ((200.0, 400.0), (100.0, 100.0), 0.0),
         "more than all": ((200.0, 45.0), (100.0, 90.0), 1.0),
         "no gap": ((100.0, 45.0), (100.0, 90.0), 0.0),
-        "below noise": ((90.0, 45.0), (100.0, 90.0), 0.0),
     },
 )
 def test_the_part_of_a_gap_that_can_be_explained_at_all(chi2, degrees, part):
@@ -383,14 +359,10 @@ def test_the_held_out_recordings_are_fitted_with_the_same_effects(monkeypatch):
     assert name == "spring@elbow on the held-out recordings"
 
 
-@cases("blocks, effects", {"in blocks": (True, (SPRING,)), "no effect": (False, ())})
+@cases("blocks, effects", {"in blocks": (True, [SPRING]), "no effect": (False, ()), "no fit": (False, [SPRING])})
 def test_nothing_is_compared_where_there_is_nothing_to_compare(monkeypatch, blocks, effects):
-    monkeypatch.setattr(module, "refit_with_effects", lambda *_: pytest.fail("not asked for"))
+    asked = []
+    monkeypatch.setattr(module, "refit_with_effects", lambda *_: asked.append(True))
     search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), blocks), Thresholds(), NULL_PROGRESS)
     assert check_parameter_transfer(search, fit(effects)) == ()
-
-
-def test_a_model_that_cannot_be_fitted_there_is_no_evidence(monkeypatch):
-    monkeypatch.setattr(module, "refit_with_effects", lambda *_: None)
-    search = RefitContext(AllCandidatesProblem(Problem(), (SPRING,), False), Thresholds(), NULL_PROGRESS)
-    assert check_parameter_transfer(search, fit([SPRING])) == ()
+    assert bool(asked) is (not blocks and bool(effects))
