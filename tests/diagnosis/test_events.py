@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,54 +35,43 @@ JOINTS = ("shoulder", "elbow")
 
 
 @dataclass(frozen=True)
-class ForcePulse:
-    """peak_force sin^2(pi (t - start_time)/(end_time - start_time)) on one coordinate."""
+class Push:
+    """peak sin^2(pi (t - start)/(end - start)) on one coordinate, and a spring that holds it where it was first."""
 
     joint: str
-    start_time: float
-    end_time: float
-    peak_force: float
+    start: float
+    end: float
+    peak: float = 0.0
+    stiffness: float = 0.0
 
     @property
     def impulse(self) -> float:
-        return self.peak_force * (self.end_time - self.start_time) / 2
-
-
-@dataclass(frozen=True)
-class SnagSpring:
-    """A spring that holds one coordinate at its value when the spring sets in."""
-
-    joint: str
-    start_time: float
-    end_time: float
-    stiffness: float
+        return self.peak * (self.end - self.start) / 2
 
 
 class DisturbanceTerms:
     """Disturbances as `InjectedSimulatorTerms`; times are since the motion's beginning."""
 
-    def __init__(self, pushes: Sequence[ForcePulse] = (), snags: Sequence[SnagSpring] = ()) -> None:
-        self.pushes, self.snags, self.start, self.caught = tuple(pushes), tuple(snags), 0.0, {}
+    def __init__(self, *pushes: Push) -> None:
+        self.pushes, self.begun, self.caught = pushes, 0.0, {}
 
     def edit_model(self, model) -> None:
         pass
 
     def start_motion(self, data) -> None:
-        self.start, self.caught = float(data.time), {}
+        self.begun, self.caught = float(data.time), {}
 
     def add_forces(self, model, data) -> None:
-        t = float(data.time) - self.start
-        for push in (p for p in self.pushes if p.start_time < t < p.end_time):
-            wave = np.sin(np.pi * (t - push.start_time) / (push.end_time - push.start_time)) ** 2
-            data.qfrc_passive[model.joint(push.joint).id] += push.peak_force * wave
-        for snag in (s for s in self.snags if s.start_time < t < s.end_time):
-            at = model.joint(snag.joint).id
-            caught = self.caught.setdefault(snag, float(data.qpos[at]))
-            data.qfrc_passive[at] -= snag.stiffness * (float(data.qpos[at]) - caught)
+        t = float(data.time) - self.begun
+        for push in (p for p in self.pushes if p.start < t < p.end):
+            at = model.joint(push.joint).id
+            caught = self.caught.setdefault(push, float(data.qpos[at]))
+            wave = np.sin(np.pi * (t - push.start) / (push.end - push.start)) ** 2
+            data.qfrc_passive[at] += push.peak * wave - push.stiffness * (float(data.qpos[at]) - caught)
 
 
 DAMPING = {"shoulder": 0.1, "elbow": 0.05}
-PUSHES = (ForcePulse("shoulder", 1.5, 2.0, 1.5), ForcePulse("elbow", 3.0, 3.4, -0.8))
+PUSHES = (Push("shoulder", 1.5, 2.0, 1.5), Push("elbow", 3.0, 3.4, -0.8))
 
 
 @dataclass(frozen=True)
@@ -97,17 +85,9 @@ class Twin:
         frequency = np.array([[0.5, 0.9, 1.3], [0.6, 1.0, 1.5]])
         phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, (2, 3))
         motion = MultisineMotion(JOINTS, 0.25 / frequency, frequency, phase)
-        noise = ArmSensorNoise(position_std=5e-5, effort_std=0.02)
-        how = VirtualExperiment(
-            motion,
-            dict.fromkeys(JOINTS, 0.3),
-            SimulationOptions(5.0, 200.0, 1e-3, effort_kind="mean"),
-            noise,
-            None,
-            interruptions,
-            seed,
-            f"run_{seed}",
-        )
+        simulation = SimulationOptions(5.0, 200.0, 1e-3, effort_kind="mean")
+        noise, start = ArmSensorNoise(position_std=5e-5, effort_std=0.02), dict.fromkeys(JOINTS, 0.3)
+        how = VirtualExperiment(motion, start, simulation, noise, None, interruptions, seed, f"run_{seed}")
         return run_virtual_experiment(self.driven, None, how)
 
     def problem(self, *recordings: Recording) -> EstimationProblem:
@@ -125,25 +105,19 @@ class Twin:
 @pytest.fixture(scope="module")
 def twin(urdf_folder) -> Twin:
     tree = read_urdf(str(urdf_folder / "double_pendulum.urdf"))
-    return Twin(
-        System.build(tree, driven=JOINTS, damping=DAMPING), System.build(tree, prescribed=JOINTS, damping=DAMPING)
-    )
+    return Twin(*(System.build(tree, **{mode: JOINTS}, damping=DAMPING) for mode in ("driven", "prescribed")))
 
 
 @pytest.fixture(scope="module")
 def pushed(twin) -> Recording:
-    return twin.recording(DisturbanceTerms(PUSHES))
+    return twin.recording(DisturbanceTerms(*PUSHES))
 
 
 def test_pushes_are_found_at_their_joints_in_their_windows_with_their_impulses(twin, pushed):
     found = twin.events(pushed).disturbances
-    assert [(event.kind, event.location, event.unit) for event in found] == [
-        ("force", "shoulder", "N m"),
-        ("force", "elbow", "N m"),
-    ]
+    assert [(e.kind, e.location, e.unit) for e in found] == [("force", name, "N m") for name in JOINTS]
     for event, push in zip(found, PUSHES, strict=True):
-        assert event.start_time == pytest.approx(push.start_time, abs=0.1)
-        assert event.end_time == pytest.approx(push.end_time, abs=0.1)
+        assert (event.start_time, event.end_time) == pytest.approx((push.start, push.end), abs=0.1)
         assert event.impulse == pytest.approx(push.impulse, rel=0.15)
         assert abs(event.impulse - push.impulse) < 3 * event.impulse_std
 
@@ -154,7 +128,8 @@ def test_nothing_happens_in_a_clean_run(twin, seed):
 
 
 def test_a_snag_is_an_event_of_its_joint(twin):
-    found = twin.events(twin.recording(DisturbanceTerms((), (SnagSpring("elbow", 2.0, 2.3, 30.0),)))).disturbances
+    snag = Push("elbow", 2.0, 2.3, stiffness=30.0)
+    found = twin.events(twin.recording(DisturbanceTerms(snag))).disturbances
     assert found
     assert {event.location for event in found} == {"elbow"}
     assert all(event.start_time > 1.8 and event.end_time < 2.5 for event in found)
@@ -162,15 +137,11 @@ def test_a_snag_is_an_event_of_its_joint(twin):
 
 def test_forces_that_mostly_recur_are_the_motions_own(twin, pushed):
     """What is there at the same times of another recording comes with the motion; one that does is still an event."""
-    other = (replace(PUSHES[0], start_time=3.2, end_time=3.7), *PUSHES[1:])
-    again, partly = (twin.recording(DisturbanceTerms(pushes), seed=1) for pushes in (PUSHES, other))
+    other = (replace(PUSHES[0], start=3.2, end=3.7), *PUSHES[1:])
+    again, partly = (twin.recording(DisturbanceTerms(*pushes), seed=1) for pushes in (PUSHES, other))
     assert not twin.events(pushed, again).disturbances
-    assert [event.location for event in twin.events(pushed, partly).disturbances] == [
-        "shoulder",
-        "elbow",
-        "elbow",
-        "shoulder",
-    ]
+    found = twin.events(pushed, partly).disturbances
+    assert [event.location for event in found] == ["shoulder", "elbow", "elbow", "shoulder"]
 
 
 def test_a_wrong_encoder_sample_is_named_as_such_and_makes_no_push(twin):
@@ -202,25 +173,12 @@ def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(ben
 
 
 def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_everywhere(bench, monkeypatch):
-    claimed = DisturbanceEvent(
-        "run_1",
-        "elbow",
-        "elbow",
-        "force",
-        1.0,
-        1.2,
-        -0.1,
-        -0.01,
-        0.001,
-        "N m",
-        DetectedForcePulse(1.0, 1.2, -0.1, False, 0.01, 1e-9),
-    )
-    odd = replace(
-        claimed, kind="sample", channel="points_arm.tip.x", start_time=2.0, end_time=2.01, unit="m", detected_pulse=None
-    )
-    monkeypatch.setattr(
-        sys.modules["yid_ocp.diagnosis.diagnose"], "find_disturbance_events", lambda *_: EventSet((claimed, odd))
-    )
+    pulse = DetectedForcePulse(1.0, 1.2, -0.1, False, 0.01, 1e-9)
+    size = (-0.1, -0.01, 0.001)
+    claimed = DisturbanceEvent("run_1", "elbow", "elbow", "force", 1.0, 1.2, *size, "N m", pulse)
+    odd = DisturbanceEvent("run_1", "elbow", "points_arm.tip.x", "sample", 2.0, 2.01, *size, "m")
+    events = EventSet((claimed, odd))
+    monkeypatch.setattr(sys.modules["yid_ocp.diagnosis.diagnose"], "find_disturbance_events", lambda *_: events)
     rubbing = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, seed) for seed in (1, 2)]
     for share, expected in ((0.1, (odd,)), (0.0, (claimed, odd))):
         limits = Thresholds(min_event_chi2_fraction=share)
@@ -239,27 +197,19 @@ def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
     smear = 1 / problem.options.path_cutoff
     assert not hidden[:, 0].any()
     assert np.array_equal(hidden[:, 1], before.used_output_mask[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
-    assert (
-        problem_corrected_for_events(problem, EventSet((replace(event, recording="another"),)))
-        .episodes[0]
-        .measurements[0]
-        is before
-    )
+    elsewhere = problem_corrected_for_events(problem, EventSet((replace(event, recording="another"),)))
+    assert elsewhere.episodes[0].measurements[0] is before
 
 
 def test_after_a_fall_nothing_counts(twin, pushed):
-    events = find_disturbance_events(*fitted(twin.problem(pushed)), None, Thresholds(max_joint_speed=1.0))
+    problem = twin.problem(pushed)
+    x = solve(problem, GaussNewton()).x
+    events = find_disturbance_events(problem, x, problem.evaluate(x), None, Thresholds(max_joint_speed=1.0))
     (fall,) = events.overspeeds
-    assert fall.recording == "run_0"
-    assert fall.joint in JOINTS
+    assert (fall.recording, fall.joint in JOINTS) == ("run_0", True)
     assert all(event.end_time < fall.start_time for event in events.disturbances)
-    cleaned = problem_corrected_for_events(twin.problem(pushed), EventSet((), (_Overspeed("run_0", "elbow", 3.0),)))
+    cleaned = problem_corrected_for_events(problem, EventSet((), (_Overspeed("run_0", "elbow", 3.0),)))
     (samples,) = cleaned.episodes[0].measurements
     t = times_since_recording_start(cleaned.episodes[0], samples)
     assert not samples.used_output_mask[t > 3.0].any()
     assert samples.used_output_mask[(t > 1.0) & (t < 2.0)].all()
-
-
-def fitted(problem: EstimationProblem):
-    x = solve(problem, GaussNewton()).x
-    return problem, x, problem.evaluate(x)

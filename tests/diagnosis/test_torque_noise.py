@@ -56,22 +56,14 @@ def recorded(step: Step, seed: int, offset: float | None = None, friction: float
     swept = simulate(step, theta, np.zeros(step.sizes["nx"]), STEPS, torque[:-1, None])
     assert swept.status.is_converged
     off = OFFSET * rng.standard_normal() if offset is None else offset
-    noise = rng.standard_normal
-    joints = JointGroup(
-        ("shoulder",),
-        t,
-        swept.state[:, :1] + ANGLE * noise((STEPS + 1, 1)),
-        effort=torque[:, None] + WHITE * noise((STEPS + 1, 1)) + off,
-        position_std=ANGLE,
-        effort_std=WHITE,
-        effort_bias_std=OFFSET,
-        effort_kind="command",
-    )
+    angle = swept.state[:, :1] + ANGLE * rng.standard_normal((STEPS + 1, 1))
+    effort = torque[:, None] + WHITE * rng.standard_normal((STEPS + 1, 1)) + off
+    said = {"position_std": ANGLE, "effort_std": WHITE, "effort_bias_std": OFFSET, "effort_kind": "command"}
+    joints = JointGroup(("shoulder",), t, angle, effort=effort, **said)
     q = ca.SX.sym("q", system.n_coordinates)
     place = ca.Function("p", [q], [forward_kinematics(system.mechanism, q).frame_position("tip")])
-    tip = np.array([np.array(place(x[: system.n_coordinates])).T for x in swept.state]) + POINT * noise(
-        (STEPS + 1, 1, 3)
-    )
+    tip = np.array([np.array(place(x[: system.n_coordinates])).T for x in swept.state])
+    tip = tip + POINT * rng.standard_normal((STEPS + 1, 1, 3))
     points = PointGroup("points_camera", ("tip",), t, tip, std=np.full(tip.shape, POINT))
     return Recording(joints, (points,), name=f"run_{seed}")
 
@@ -119,10 +111,8 @@ def test_what_an_effect_takes_from_a_torque_its_offset_gives_back(step, held_out
         np.testing.assert_allclose(*biases, atol=1e-12)
     there, then = (problem_whitened_by_sensor_noise(own).evaluate(at) for own, at in ((moved, x), (wide, frozen)))
     np.testing.assert_allclose(there.residual[: len(then.residual)], then.residual, atol=1e-7)
-    own, nominal = (
-        problem.whitened_held_out_residual(0, *problem.predict_held_out(point)[0]).residual
-        for problem, point in ((moved, x), (wide, frozen))
-    )
+    pairs = ((moved, x), (wide, frozen))
+    own, nominal = (p.whitened_held_out_residual(0, *p.predict_held_out(at)[0]).residual for p, at in pairs)
     assert np.max(np.abs(own - nominal)) > 1e-3  # its prior is no longer about zero
     # and to first order the rows are those of a filter that is worked out there
     again = problem_whitened_at(moved, x)
@@ -255,20 +245,14 @@ def test_squares_of_innovations_are_the_least_over_all_errors(geared, step, feed
     problem = weighted_at_truth(geared, recorded(step, 8), feedback)
     innovations = problem.evaluate(problem.initial_unknowns).residual[problem.residual_rows.data]
     errors = problem.episodes[0].input_errors
-    along = (
-        problem.with_episodes(problem.episodes, ())
-        .evaluate(problem.initial_unknowns)
-        .residual[problem.residual_rows.data]
-    )
+    plain = problem.with_episodes(problem.episodes, ())
+    along = plain.evaluate(problem.initial_unknowns).residual[problem.residual_rows.data]
     apart = [errors.torque_noise[:-1] / errors.torque_std, errors.torque_bias / errors.torque_bias_std]
     least = along @ along + sum(float(np.sum(part**2)) for part in apart)
     assert least == pytest.approx(innovations @ innovations, rel=5e-3)
     # and nobody mistakes it for a prediction
-    recorded_torque = (
-        problem_whitened_by_sensor_noise(problem)
-        .evaluate(problem.initial_unknowns)
-        .residual[problem.residual_rows.data]
-    )
+    by_sensors = problem_whitened_by_sensor_noise(problem).evaluate(problem.initial_unknowns)
+    recorded_torque = by_sensors.residual[problem.residual_rows.data]
     assert recorded_torque @ recorded_torque > 2 * along @ along
 
 
@@ -323,12 +307,8 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     decay = math.exp(-_MIN_INTERVAL / _CORRELATION_TIME)
     column = model.unknown_names.index("shoulder")
     # the integral over a long time has the variance of white noise that is held over each sample
-    lasting = (
-        (model.torque_noise_variance[column] * model.reference_std[column] ** 2 - OFFSET**2)
-        * _MIN_INTERVAL
-        * (1 + decay)
-        / (1 - decay)
-    )
+    variance = model.torque_noise_variance[column] * model.reference_std[column] ** 2 - OFFSET**2
+    lasting = variance * _MIN_INTERVAL * (1 + decay) / (1 - decay)
     assert lasting == pytest.approx(WHITE**2 * TIME_STEP, rel=0.02)
     assert np.count_nonzero(model.torque_noise_variance) == 1
     calm = problem_without_input_errors(problem)
