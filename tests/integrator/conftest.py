@@ -66,9 +66,8 @@ def maxwell_branch(joint: str, stiffness: float, relaxation_time: float) -> Adde
         k1, tau = effect.parameters.symbols[0], effect.parameters.symbols[1]
         row = state.internal_rows[name]
         stretch = state.q[state.system.mechanism.joint_index(joint)] - state.z[row]
-        return StepTerms(
-            lagrangian=-0.5 * k1 * stretch**2, internal_equations={name: stretch - tau * state.z_rate[row]}
-        )
+        equation = stretch - tau * state.z_rate[row]
+        return StepTerms(lagrangian=-0.5 * k1 * stretch**2, internal_equations={name: equation})
 
     return Added("maxwell", joint, parameters, {name: ca.SX.sym(name)}, add=add)
 
@@ -91,13 +90,22 @@ def soft_grasp(grasp: str, compliance: float, relaxation: float | None = None) -
     parameters = _parameters("soft_grasp", grasp, **values)
 
     def change(effect, system):
-        names = {"compliance": "compliance", "relaxation": "relaxation_time"}
-        symbols = {p.name.rpartition(".")[2]: p.symbol for p in effect.parameters}
-        values = {names[name]: symbol for name, symbol in symbols.items()}
-        changed = [replace(g, **values) if g.name == grasp else g for g in system.grasps]
-        return replace(system, grasps=tuple(changed))
+        names = ("compliance", "relaxation_time")
+        values = {name: p.symbol for name, p in zip(names, effect.parameters, strict=False)}
+        return changed_grasp(system, grasp, **values)
 
     return Added("soft_grasp", grasp, parameters, change=change)
+
+
+def changed_grasp(system, name, **values):
+    return replace(system, grasps=tuple(replace(g, **values) if g.name == name else g for g in system.grasps))
+
+
+def changed_joint(system, name, **values):
+    joints = list(system.mechanism.joints)
+    index = system.mechanism.joint_index(name)
+    joints[index] = replace(joints[index], **values)
+    return replace(system, mechanism=replace(system.mechanism, joints=tuple(joints)))
 
 
 def creeping_grasp(grasp: str, rate: float) -> Added:
@@ -107,10 +115,7 @@ def creeping_grasp(grasp: str, rate: float) -> Added:
     internal = {name: ca.SX.sym(name)}
 
     def change(effect, system):
-        changed = [
-            replace(g, axial_slip=effect.internal_coordinates[name]) if g.name == grasp else g for g in system.grasps
-        ]
-        return replace(system, grasps=tuple(changed))
+        return changed_grasp(system, grasp, axial_slip=effect.internal_coordinates[name])
 
     def add(effect, state):
         held = next(g.held_frame for g in state.system.grasps if g.name == grasp)
@@ -130,11 +135,9 @@ def growing_link(joint: str, length: float, time: float) -> Added:
     internal = {name: ca.SX.sym(name)}
 
     def change(effect, system):
-        joints = list(system.mechanism.joints)
-        index = system.mechanism.joint_index(joint)
+        placement = system.mechanism.joints[system.mechanism.joint_index(joint)].placement
         shift = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(effect.internal_coordinates[name], 0, 0))
-        joints[index] = replace(joints[index], placement=joints[index].placement @ shift)
-        return replace(system, mechanism=replace(system.mechanism, joints=tuple(joints)))
+        return changed_joint(system, joint, placement=placement @ shift)
 
     def add(effect, state):
         target, tau = effect.parameters.symbols[0], effect.parameters.symbols[1]
@@ -149,13 +152,9 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
     parameters = _parameters("air", joint, coefficient=coefficient, viscosity=viscosity, buoyancy=buoyancy)
 
     def change(effect, system):
-        joints = list(system.mechanism.joints)
-        index = system.mechanism.joint_index(joint)
-        lighter = tuple(
-            replace(body, gravity_fraction=1 - effect.parameters.symbols[2]) for body in joints[index].bodies
-        )
-        joints[index] = replace(joints[index], bodies=lighter)
-        return replace(system, mechanism=replace(system.mechanism, joints=tuple(joints)))
+        bodies = system.mechanism.joints[system.mechanism.joint_index(joint)].bodies
+        lighter = tuple(replace(body, gravity_fraction=1 - effect.parameters.symbols[2]) for body in bodies)
+        return changed_joint(system, joint, bodies=lighter)
 
     def add(effect, state):
         c, b, v = effect.parameters.symbols[0], effect.parameters.symbols[1], state.v
@@ -165,10 +164,8 @@ def thick_air(joint: str, coefficient: float, viscosity: float, buoyancy: float)
         for j in chain:
             along[j] = along[tree.joints[j].parent_index] + screws[j] * v[j]
         link = chain[-1]
-        com = (
-            kinematics.joint_rotations[link] @ tree.joints[link].bodies[0].center_of_mass
-            + kinematics.joint_origins[link]
-        )
+        own = kinematics.joint_rotations[link] @ tree.joints[link].bodies[0].center_of_mass
+        com = own + kinematics.joint_origins[link]
         reach = ca.horzcat(-ca.skew(com), ca.SX.eye(3))
         speed = reach @ along[link]
         wrench = reach.T @ (-c * ca.sumsqr(speed) * speed)

@@ -1,16 +1,21 @@
-"""Faults of compiled code: no memory, derivatives that do not fit."""
+"""Compiled code: no memory, derivatives that do not fit, and threads that share one step."""
 
 from __future__ import annotations
 
 import ctypes
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from yid_ocp.errors import InsufficientMemoryError, ModelError
 from yid_ocp.integrator import codegen, compiled, compiler
 from yid_ocp.integrator.compiled import CompiledKernel
+from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 from yid_ocp.model import System
@@ -31,9 +36,8 @@ def step(parts, urdf_folder):
 def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     case = parts.make_case(*parts.closed_loop(urdf_folder))
     model = case.step.model
-    library = compiler.compiled_shared_library(
-        poor.source + codegen.kernel_c_source(model.functions, model.index_tables)
-    )
+    source = codegen.kernel_c_source(model.functions, model.index_tables)
+    library = compiler.compiled_shared_library(poor.source + source)
     poor.watch(library)
     kernel = CompiledKernel(model, library)
     names = ("spin.mass", "hinge.damping")
@@ -82,9 +86,8 @@ def test_a_rollout_beyond_all_memory(urdf_folder, use_compiler):
     for word in ("a rollout of 100000000000000 steps with 0 derivatives", "3.2e+06 GB", "fewer parameters"):
         assert word in str(caught.value)
     wide = SensitivityDirections((), np.broadcast_to(0.0, (4, 10**15)))
-    with pytest.raises(
-        InsufficientMemoryError, match=r"3 steps with 1000000000000000 derivatives: it takes 1\.28e\+08 GB"
-    ):
+    said = r"3 steps with 1000000000000000 derivatives: it takes 1\.28e\+08 GB"
+    with pytest.raises(InsufficientMemoryError, match=said):
         step.kernel.rollout(RolloutInputs(theta, start, nothing, np.zeros((4, 0)), None, wide))
 
 
@@ -132,3 +135,94 @@ def test_derivatives_are_those_of_their_own_equations(parts, urdf_folder, monkey
     together = [swept(split, "one") for split in ("left", "symmetric")]
     for split, found in zip(("left", "symmetric"), together, strict=True):
         np.testing.assert_array_equal(found, swept(split, f"that of {split}"))
+
+
+THREADS = 4
+GIVEN = ("state", "multipliers", "effort", "state_sensitivity", "multipliers_sensitivity")
+
+
+@pytest.fixture(params=[True, False], ids=["compiled", "interpreted"])
+def use_compiler(request):
+    if request.param and compiler._compiler_path() is None:
+        pytest.skip("this machine has no C compiler")
+    return request.param
+
+
+def at_once(function, items):
+    """Results of all items, every thread let go at the same moment."""
+    gate = threading.Barrier(len(items))
+
+    def run(item):
+        gate.wait()
+        return function(item)
+
+    with ThreadPoolExecutor(len(items)) as pool:
+        return list(pool.map(run, items))
+
+
+def slowed(monkeypatch, owner, name):
+    """Count the calls of a function and let each last long enough for other threads to come in between."""
+    calls = []
+    original = getattr(owner, name)
+
+    def slow(*arguments, **options):
+        calls.append(name)
+        time.sleep(0.05)
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(owner, name, slow)
+    return calls
+
+
+def assert_equal_arrays(one, other):
+    for actual, expected in zip(one, other, strict=True):
+        for a, b in zip(actual, expected, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_rollouts_adjoints_and_linearizations(parts, urdf_folder, monkeypatch, tmp_path, use_compiler):
+    monkeypatch.setenv("YID_OCP_CACHE", str(tmp_path))
+    case = parts.make_case(*parts.closed_loop(urdf_folder), steps=40)
+    system = case.step.system
+    names = tuple(system.parameters.names[::2])
+    directions = SensitivityDirections(names, np.random.default_rng(1).normal(size=(len(case.start), len(names))))
+    inputs = RolloutInputs(case.theta, case.start, case.torque, case.path, case.feedback, directions)
+    thetas = [case.theta * (1 + 0.02 * i) for i in range(THREADS)]
+
+    def everything(step):
+        def run(theta):
+            rollout = step.kernel.rollout(replace(inputs, theta=theta))
+            assert rollout.status.is_converged, rollout.status.message
+            cost = (np.ones_like(rollout.state), None, None)
+            back = step.kernel.adjoint_gradient(theta, rollout, case.feedback, names, cost)
+            along = step.kernel.linearize(theta, rollout.state, rollout.multipliers, rollout.torque, names, True)
+            found = [getattr(rollout, name) for name in GIVEN]
+            return *found, *vars(back).values(), *vars(along).values()
+
+        return run
+
+    # neither step has its derivatives by these parameters yet
+    shared, plain = (compile_step(system, case.step.time_step, use_compiler=use_compiler) for _ in range(2))
+    built = slowed(monkeypatch, codegen, "parameter_jacobian_function")
+    together = at_once(everything(shared), thetas)
+    assert built == (["parameter_jacobian_function"] if use_compiler else [])
+    assert_equal_arrays(together, [everything(plain)(theta) for theta in thetas])
+
+
+def test_equilibria(parts, monkeypatch):
+    system = parts.cable()
+    shared, plain = (EquilibriumSolver(compile_step(system, 1e-3, use_compiler=False)) for _ in range(2))
+    thetas = [system.parameters.vector({"C.bend": 2.0 + i}) for i in range(THREADS)]
+
+    def rest(statics):
+        def run(theta):
+            found = statics.solve([], theta, names=("C.bend", "C.mass"))
+            assert found.is_converged, found.message
+            return found.state, found.state_by_theta
+
+        return run
+
+    built = slowed(monkeypatch, ca, "jacobian")
+    together = at_once(rest(shared), thetas)
+    assert len(built) == 2  # of a step by its unknowns and by all else, once
+    assert_equal_arrays(together, [rest(plain)(theta) for theta in thetas])

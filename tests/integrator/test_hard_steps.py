@@ -69,9 +69,8 @@ def out_of_reach(folder):
     turn = read_urdf(folder / "turntable.urdf", joints=["turn"])
     carrier = replace(turn, frames={"disc": turn.frames["disc"]})
     far = Grasp("far", "ceiling", "tip", holder_offset=ca.SX(ca.DM([0.0, 3.0, 0.0])))
-    return System.build(
-        carrier.with_attached_mechanism(read_urdf(folder / "double_pendulum.urdf"), "disc"), grasps=[far]
-    )
+    hung = carrier.with_attached_mechanism(read_urdf(folder / "double_pendulum.urdf"), "disc")
+    return System.build(hung, grasps=[far])
 
 
 def redundant(folder):

@@ -151,10 +151,8 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     shift = EffectMomentumShift(step)
     read = torque + misread
     loop = lqr_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
-    true = DrivenJointMotion(state[:, ANGLES], torque, internal)
-    value, _ = shift.momentum_shift_and_derivatives(
-        DrivenJointMotion(state[:, ANGLES], read, internal), true, theta, ()
-    )
+    recorded, true = (DrivenJointMotion(state[:, ANGLES], x, internal) for x in (read, torque))
+    value, _ = shift.momentum_shift_and_derivatives(recorded, true, theta, ())
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     if names or misread:
         assert np.max(np.abs(value)) > 1e-3
@@ -174,9 +172,8 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
     np.testing.assert_allclose(value[1:], 0.5 * TIME_STEP / 2 * torque[:-1], atol=1e-12)
     np.testing.assert_allclose(slope[:, :, 0] * 0.5, value, atol=1e-12)
     np.testing.assert_array_equal(slope[:, :, 1], 0.0)
-    np.testing.assert_allclose(
-        shift.momentum_derivative_by_previous_torque(theta), TIME_STEP / 2 * np.eye(2), atol=1e-15
-    )
+    by_previous = shift.momentum_derivative_by_previous_torque(theta)
+    np.testing.assert_allclose(by_previous, TIME_STEP / 2 * np.eye(2), atol=1e-15)
 
 
 @pytest.mark.parametrize("names", [EFFECTS["two that hold"], EFFECTS["friction"]], ids=["holds", "slides"])
@@ -197,9 +194,8 @@ def test_derivatives_are_those_of_differences(plain, names):
         own = theta.copy()
         own[[step.system.parameters.index(name) for name in wanted]] += move[: len(wanted)]
         parts = (state[:, ANGLES] + by_angles @ move, torque + by_torque @ move, internal + by_internal @ move)
-        return shift.momentum_shift_and_derivatives(
-            recorded, DrivenJointMotion(*parts, by_angles, by_torque, by_internal), own, wanted
-        )
+        true = DrivenJointMotion(*parts, by_angles, by_torque, by_internal)
+        return shift.momentum_shift_and_derivatives(recorded, true, own, wanted)
 
     value, slopes = at(np.zeros(d))
     assert slopes.shape == (*value.shape, d)

@@ -27,12 +27,8 @@ def test_a_rollout_makes_all_rows_zero_and_needs_its_effort(case, made):
         x0, x1 = rollout.state[k : k + 2]
         rows, effort = function(x0, x1, rollout.multipliers[k], u, case.theta)
         assert float(ca.norm_inf(rows)) < 1e-7 * max(1.0, np.abs(rollout.state).max())
-        np.testing.assert_allclose(
-            np.array(effort).ravel(),
-            rollout.effort[k],
-            rtol=1e-7,
-            atol=1e-7 * max(1.0, np.max(np.abs(rollout.effort), initial=0.0)),
-        )
+        scale = max(1.0, np.max(np.abs(rollout.effort), initial=0.0))
+        np.testing.assert_allclose(np.array(effort).ravel(), rollout.effort[k], rtol=1e-7, atol=1e-7 * scale)
 
 
 def test_slopes_in_closed_form_are_those_that_casadi_finds(case, made):
@@ -44,17 +40,14 @@ def test_slopes_in_closed_form_are_those_that_casadi_finds(case, made):
     for value, slopes in ((made.residual, made.residual_jacobians), (made.prescribed_effort, made.effort_jacobians)):
         for name, found in slopes.items():
             symbol = getattr(made, name)
-            function = ca.Function(
-                "slopes", inputs_of(made), [ca.densify(found), ca.densify(ca.jacobian(value, symbol))]
-            )
+            pair = [ca.densify(found), ca.densify(ca.jacobian(value, symbol))]
+            function = ca.Function("slopes", inputs_of(made), pair)
             actual, expected = (np.array(x) for x in function(*point))
             assert actual.shape == (value.numel(), symbol.numel())
-            np.testing.assert_allclose(
-                actual, expected, rtol=0, atol=1e-11 * max(1.0, np.max(np.abs(expected), initial=0.0))
-            )
-    assert not np.any(
-        np.array(ca.DM(made.residual_jacobians["x1"].sparsity(), 1))[: len(made.residual_names) - n, n : 2 * n]
-    )
+            scale = max(1.0, np.max(np.abs(expected), initial=0.0))
+            np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-11 * scale)
+    pattern = np.array(ca.DM(made.residual_jacobians["x1"].sparsity(), 1))
+    assert not np.any(pattern[: len(made.residual_names) - n, n : 2 * n])
 
 
 def test_every_row_and_every_slope_has_its_name(case, made):

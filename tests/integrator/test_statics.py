@@ -21,18 +21,13 @@ from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
 
 
-def hung_cable(span: float, **options):
+def hung_cable(span: float):
     """A cable of 0.6 m that starts level along x, its end held at a fraction of its length; statics and clamp pose."""
     turn = rotation_from_rpy(0.0, np.pi / 2, 0.0)
     segment = Segment("C", 0.6, 0.3, 0.01, links=4, bend=0.05, twist=1.0, damping=0.01, rest_rotation=turn)
     clamp = floating_clamp("clamp")
-    system = System.build(
-        clamp,
-        objects=[(flexible_object([segment], name="cable"), None, None)],
-        grasps=[Grasp("end", "clamp", "w_C")],
-        prescribed=clamp.joint_names,
-        **options,
-    )
+    objects, grasps = [(flexible_object([segment], name="cable"), None, None)], [Grasp("end", "clamp", "w_C")]
+    system = System.build(clamp, objects=objects, grasps=grasps, prescribed=clamp.joint_names)
     return EquilibriumSolver(compile_step(system, 0.01, use_compiler=False)), np.array([0.6 * span, 0, 0, 0, 0, 0])
 
 
@@ -66,9 +61,8 @@ def arm(urdf_folder):
     """The double pendulum, its elbow driven, with a spring on each joint."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     springs = {name: RobotJointSpring(4.0, 0.1) for name in robot.joint_names}
-    return EquilibriumSolver(
-        compile_step(System.build(robot, driven=["elbow"], springs=springs), 0.01, use_compiler=False)
-    )
+    system = System.build(robot, driven=["elbow"], springs=springs)
+    return EquilibriumSolver(compile_step(system, 0.01, use_compiler=False))
 
 
 def derivatives(step, rest, given, held, stiffness, theta):
@@ -76,9 +70,8 @@ def derivatives(step, rest, given, held, stiffness, theta):
     e, n = equilibrium_equations(step.equations), step.system.n_coordinates
     others = ca.vertcat(e.inputs[4], e.inputs[1])
     outputs = [ca.densify(ca.jacobian(f, x)) for f in (e.residual, e.state) for x in (e.inputs[0], others)]
-    w = np.concatenate(
-        [rest.state[list(step.system.unprescribed_coordinate_indices)], rest.state[2 * n :], rest.constraint_reactions]
-    )
+    free = list(step.system.unprescribed_coordinate_indices)
+    w = np.concatenate([rest.state[free], rest.state[2 * n :], rest.constraint_reactions])
     at = (w, given, held, stiffness, theta, step.time_step)
     by_w, by_others, state_by_w, state_by_others = (np.array(x) for x in ca.Function("by", e.inputs, outputs)(*at))
     return state_by_others - state_by_w @ np.linalg.lstsq(by_w, by_others, rcond=None)[0]
@@ -103,12 +96,10 @@ def test_compiled_and_interpreted_equilibria_are_one(case):
     held = np.zeros(0) if torque is None else torque
     expected = derivatives(steps[1], fast, given, held, stiffness, case.theta)
     for rest in (fast, slow):
-        np.testing.assert_allclose(
-            np.hstack([rest.state_by_theta, rest.state_by_known_coordinates]), expected, rtol=1e-7, atol=1e-8
-        )
-        np.testing.assert_allclose(
-            rest.state_by_torque, rest.state_by_known_coordinates[:, : len(held)] / stiffness, rtol=1e-12
-        )
+        found = np.hstack([rest.state_by_theta, rest.state_by_known_coordinates])
+        np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-8)
+        by_torque = rest.state_by_known_coordinates[:, : len(held)] / stiffness
+        np.testing.assert_allclose(rest.state_by_torque, by_torque, rtol=1e-12)
 
 
 def test_a_measured_torque_that_fits_takes_the_load_off_the_holding_spring(arm):

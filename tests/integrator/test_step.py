@@ -104,9 +104,8 @@ def test_a_maxwell_branch_relaxes_with_its_time_constant(parts, hinge, roll):
 
 
 def test_an_internal_coordinate_needs_an_equation(parts, hinge):
-    orphan = parts.Added(
-        "orphan", "R", Parameters(), {"orphan@R.z": ca.SX.sym("z")}, add=lambda effect, state: StepTerms()
-    )
+    internal = {"orphan@R.z": ca.SX.sym("z")}
+    orphan = parts.Added("orphan", "R", Parameters(), internal, add=lambda effect, state: StepTerms())
     with pytest.raises(ModelError, match=r"orphan@R\.z"):
         compile_step(hinge([orphan]), 0.01)
 
@@ -302,14 +301,12 @@ def test_a_step_of_another_length_is_one_compiled_for_it(parts, use_compiler):
     names = ("C.bend", "C.twist")
     for step in (fine, expected):
         assert step.time_step == 1e-4
-    made, again = (
-        [*step(state[:9], state[9:], [], theta)[:2], *step.jacobians(state[:9], state[9:], [], theta, names=names)]
-        for step in (fine, expected)
-    )
+    at = (state[:9], state[9:], [], theta)
+    made, again = ([*step(*at)[:2], *step.jacobians(*at, names=names)] for step in (fine, expected))
     for one, other in zip(made, again, strict=True):
         np.testing.assert_array_equal(one, other)
     assert coarse.time_step == 4e-3
-    assert np.max(np.abs(coarse(state[:9], state[9:], [], theta)[0] - made[0])) > 1e-6
+    assert np.max(np.abs(coarse(*at)[0] - made[0])) > 1e-6
     with pytest.raises(ModelError, match="time_step = 0"):
         step_with_time_step(coarse, 0.0)
 
@@ -350,11 +347,8 @@ def test_a_loop_without_damping_keeps_its_energy(parts, urdf_folder):
     rollout = simulate(step, theta, start, 4000)
     assert rollout.status.is_converged, rollout.status.message
     e = step.equations
-    parts_of_energy = [
-        e.rigid_body_terms.kinetic_energy,
-        e.rigid_body_terms.kinetic_energy + e.rigid_body_terms.potential_energy,
-    ]
-    function = ca.Function("energy", [e.q0, e.q1, e.theta, e.time_step], parts_of_energy)
+    kinetic, potential = e.rigid_body_terms.kinetic_energy, e.rigid_body_terms.potential_energy
+    function = ca.Function("energy", [e.q0, e.q1, e.theta, e.time_step], [kinetic, kinetic + potential])
     states = rollout.state[:, : system.n_coordinates]
     kinetic, energy = (np.array(x).ravel() for x in function(states[:-1].T, states[1:].T, theta, 0.01))
     # it falls along its slide as it swings

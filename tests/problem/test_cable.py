@@ -134,28 +134,6 @@ def test_the_undeformed_model_has_the_undeformed_shape(cable, twin):
     np.testing.assert_allclose(distances(at), distances(shape), atol=1e-12)
 
 
-def test_every_row_of_the_axis_constraint_matches_its_derivatives(twin):
-    e = twin[0].equations
-    phi = ca.Function(
-        "phi",
-        [e.q1, e.z1, e.lam, e.theta, e.time_step],
-        [e.constraint_residual, ca.jacobian(e.constraint_residual, e.q1)],
-    )
-    closed = ca.Function(
-        "closed", e.arguments, [e.constraint_impulses.before_jacobian, e.constraint_impulses.before_force_by_q]
-    )
-    random = np.random.default_rng(3)
-    q, lam = random.normal(scale=0.4, size=e.q0.numel()), random.normal(size=5)
-    theta = twin[0].system.parameters.vector()
-    zero = np.zeros
-    matrix, hessian = (np.array(ca.densify(x)) for x in closed(q, q, zero(len(q)), [], [], lam, [], theta, PERIOD))
-    np.testing.assert_allclose(matrix, np.array(ca.densify(phi(q, [], lam, theta, PERIOD)[1])), atol=1e-12)
-    pull = ca.Function(
-        "pull", [e.q1, e.lam, e.theta], [ca.jacobian(ca.jacobian(e.constraint_residual, e.q1).T @ e.lam, e.q1)]
-    )
-    np.testing.assert_allclose(hessian, np.array(ca.densify(pull(q, lam, theta))), atol=1e-11)
-
-
 def test_the_values_of_a_twin_are_found_from_its_vertices(real, twin_options, cable, twin):
     step, options, recording = twin
     settings = replace(

@@ -87,14 +87,10 @@ def test_beside_noise_that_drives_other_joints_too(urdf_folder):
     spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, prior_stds={name: 0.5}))
     assert stated.episodes[0].has_uncertain_sensor_biases
     assert not spelt.episodes[0].has_uncertain_sensor_biases
-    weighted, beside = (
-        problem_whitened_at(stated, stated.initial_unknowns),
-        problem_whitened_at(spelt, spelt.initial_unknowns),
-    )
+    weighted, beside = (problem_whitened_at(problem, problem.initial_unknowns) for problem in (stated, spelt))
     assert weighted.whitening_filters[0] is not None
-    assert weighted.evaluate(stated.initial_unknowns).cost == pytest.approx(
-        least(beside, spelt.initial_unknowns)[0], rel=1e-6
-    )
+    expected, _ = least(beside, spelt.initial_unknowns)
+    assert weighted.evaluate(stated.initial_unknowns).cost == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_gradient_is_that_of_the_cost(urdf_folder):
@@ -113,15 +109,9 @@ def test_what_is_known_of_constants_is_taken_off_the_samples(urdf_folder):
     _, x = least(spelt, spelt.initial_unknowns)
     found = problem.evaluate(problem.initial_unknowns, derivatives=False)
     for i, (episode, result) in enumerate(zip(problem.episodes, found.episode_predictions, strict=True)):
-        [(before, after)] = [
-            pair
-            for pair in zip(
-                episode.measurements,
-                subtract_estimated_biases(episode.measurements, result.predicted_outputs),
-                strict=True,
-            )
-            if pair[0].sensor.effort_joints
-        ]
+        corrected = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
+        pairs = zip(episode.measurements, corrected, strict=True)
+        [(before, after)] = [pair for pair in pairs if pair[0].sensor.effort_joints]
         offsets = [x[spelt.unknown_names.index(f"effort_offset@{joint}.offset[{episode.name}]")] for joint in BIAS]
         np.testing.assert_allclose(before.value - after.value, np.broadcast_to(offsets, before.value.shape), rtol=1e-6)
         assert not np.any(after.bias_std), i
@@ -131,9 +121,8 @@ def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     problem = arm(urdf_folder, BIAS, ("shoulder.damping",), prescribed=tuple(BIAS))
     [(episode, result)] = problem.predict_held_out(problem.initial_unknowns)
     counted = problem.whitened_held_out_residual(0, episode, result).residual
-    plain = np.concatenate(
-        [s.residual_block(y).residual for s, y in zip(episode.measurements, result.predicted_outputs, strict=True)]
-    )
+    pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
+    plain = np.concatenate([samples.residual_block(y).residual for samples, y in pairs])
     slopes = sensitivities_to_constant_errors(episode.measurements)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)

@@ -1,4 +1,4 @@
-"""Errors of one acceleration stand in the efforts of all joints that inertia couples with it."""
+"""Measured efforts count for as much as they tell: smoothed ones, and errors of one acceleration in all of them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_problems import correlated, efforts, measured, pendulum_step, taken
+from small_problems import PENDULUM, correlated, efforts, measured, pendulum_step, taken
 
 from yid_ocp.data.recording import JointGroup, Recording
+from yid_ocp.errors import DataError
 from yid_ocp.inference.smoother_model import linear_residual_models
-from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.integrator.step import compile_step
+from yid_ocp.model import System
+from yid_ocp.model.urdf import read_urdf
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.signal_filters import LowPassFilter
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME
 from yid_ocp.solvers import GaussNewton, MultipleShooting, SingleShooting, solve
 from yid_ocp.solvers.symbolic_transcription import transcribe
 
@@ -39,14 +44,12 @@ def test_rows_are_independent_whatever_of_a_sample_was_seen():
     assert made.whitened_residual(predicted)[1, 1] == 0.0
     slopes = np.random.default_rng(0).standard_normal((2, 3, 4))
     found = made.residual_block(predicted, slopes, threshold=1.5)
-    np.testing.assert_allclose(
-        found.jacobian, found.robust_factor[:, None] * (mixing @ (2.0 * slopes[made.used_output_mask])), rtol=1e-12
-    )
+    seen = made.used_output_mask
+    expected = found.robust_factor[:, None] * (mixing @ (2.0 * slopes[seen]))
+    np.testing.assert_allclose(found.jacobian, expected, rtol=1e-12)
     pull = np.random.default_rng(1).standard_normal((2, 3))
-    back = np.einsum("mk,mkd->d", made.whitened_residual_adjoint(np.where(made.used_output_mask, pull, 0.0)), slopes)
-    np.testing.assert_allclose(
-        back, pull[made.used_output_mask] @ made.residual_block(predicted, slopes).jacobian, rtol=1e-12
-    )
+    back = np.einsum("mk,mkd->d", made.whitened_residual_adjoint(np.where(seen, pull, 0.0)), slopes)
+    np.testing.assert_allclose(back, pull[seen] @ made.residual_block(predicted, slopes).jacobian, rtol=1e-12)
 
 
 def arm(step, path, effort, angle=ANGLE, std=EFFORT, free=("shoulder.damping",), cutoff=CUTOFF):
@@ -76,10 +79,8 @@ def test_residuals_of_a_right_model_are_white_among_joints(urdf_folder):
         noisy = (a + b * rng.standard_normal(path.shape) for a, b in ((path, ANGLE), (effort, EFFORT)))
         problem = arm(step, *noisy)
         evaluation = problem.evaluate(problem.initial_unknowns, derivatives=False)
-        [samples], [predicted] = (
-            problem.episodes[0].measurements,
-            evaluation.episode_predictions[0].predicted_outputs,
-        )
+        [samples] = problem.episodes[0].measurements
+        [predicted] = evaluation.episode_predictions[0].predicted_outputs
         found.append(evaluation.residual.reshape(-1, 2))
         alone.append((predicted - samples.value) / samples.std)
     rows, plain = np.vstack(found), np.vstack(alone)
@@ -103,10 +104,8 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     problem = correlated_problem(urdf_folder, **how)
     x = 1.2 * problem.initial_unknowns
     evaluation = problem.evaluate(x)
-    size = 1e-6 * x
-    moved = [
-        (problem.evaluate(x + d).residual - problem.evaluate(x - d).residual) / (2 * d.max()) for d in np.diag(size)
-    ]
+    ends = [(problem.evaluate(x + d).residual, problem.evaluate(x - d).residual) for d in np.diag(1e-6 * x)]
+    moved = [(above - below) / (2e-6 * value) for (above, below), value in zip(ends, x, strict=True)]
     np.testing.assert_allclose(evaluation.jacobian, np.stack(moved, axis=1), rtol=1e-5, atol=1e-5 * np.abs(moved).max())
     np.testing.assert_allclose(problem.cost_and_gradient(x)[1], evaluation.jacobian.T @ evaluation.residual, rtol=1e-8)
     program = transcribe(problem)
@@ -116,11 +115,8 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     assert float(solver(**arguments)["f"]) == pytest.approx(evaluation.cost, rel=1e-8)
     if "cutoff" in how:  # what is measured of the efforts says little beside points that are this wrong
         return
-    solvers = [
-        GaussNewton(),
-        SingleShooting(),
-        *([] if how else [MultipleShooting(), MultipleShooting(condensing=True)]),
-    ]
+    solvers = [GaussNewton(), SingleShooting()]
+    solvers += [] if how else [MultipleShooting(), MultipleShooting(condensing=True)]
     found = [solve(problem, s, restarts=False) for s in solvers]
     for other in found[1:]:
         assert other.cost == pytest.approx(found[0].cost, rel=1e-6)
@@ -151,9 +147,8 @@ def test_a_gear_does_not_give_way_to_the_noise_of_an_effort_that_is_compared(urd
         for made in (effort, effort + 0.3 * rng.standard_normal(effort.shape), effort + 2.0)
     )
     inner, gain = slice(50, -50), LowPassFilter(CUTOFF).noise_gains(0.01)[0]
-    np.testing.assert_allclose(
-        clean.joint_loads[inner], LowPassFilter(CUTOFF)(clean.grid.node_times, effort)[inner], atol=0.02
-    )
+    smooth = LowPassFilter(CUTOFF)(clean.grid.node_times, effort)
+    np.testing.assert_allclose(clean.joint_loads[inner], smooth[inner], atol=0.02)
     assert np.std((noisy.joint_loads - clean.joint_loads)[inner]) < 0.5 * 0.3 * gain
     # what the model does not know of a load is measured all the same
     np.testing.assert_allclose((heavier.joint_loads - clean.joint_loads)[inner], 2.0, atol=1e-6)
@@ -179,3 +174,93 @@ def test_dry_friction_needs_no_time_to_turn(urdf_folder):
     assert found @ found / len(found) < 1.5
     [samples] = problem.episodes[0].measurements
     assert np.abs(np.diff(samples.value[:, 1])).max() > 30 * samples.std.max()
+
+
+JOINTS = ("shoulder", "elbow")
+DAMPING = {"shoulder.damping": 0.3, "elbow.damping": 0.2}
+EFFORT_NOISE = 0.05  # of the efforts [N m]
+LOW_CUTOFF = 5.0  # [Hz]
+REPEATS = 60
+
+
+@pytest.fixture(scope="module")
+def efforts_of(urdf_folder):
+    """efforts_of(effort, cutoff): both joints moved as measured for six seconds at 100 Hz, their efforts measured."""
+    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
+    system = System.build(robot, prescribed=JOINTS, damping=0.1)
+    steps = {h: compile_step(system, h, use_compiler=h == 0.01) for h in (0.02, 0.01, 0.005, 0.0025)}
+    t = 0.01 * np.arange(601)
+    path = np.stack([0.6 * np.sin(2.9 * t), 0.5 * np.sin(3.7 * t + 1)], axis=1)
+
+    def build(effort: np.ndarray, cutoff: float, kind: str | None = None, time_step: float = 0.01) -> EstimationProblem:
+        joints = JointGroup(JOINTS, t, path, effort=effort, position_std=0.0, effort_std=EFFORT_NOISE, effort_kind=kind)
+        options = ProblemOptions(path_cutoff=cutoff, weak_prior_factor=0.0)
+        return EstimationProblem(steps[time_step], [Recording(joints, name="arm")], tuple(DAMPING), options, DAMPING)
+
+    return build
+
+
+def test_deviations_are_those_of_repeats(efforts_of):
+    exact = efforts_of(np.zeros((601, 2)), math.inf)
+    inner = exact.evaluate(exact.initial_unknowns, derivatives=False).episode_predictions[0].predicted_outputs[0]
+    clean = np.vstack([inner[:1], inner, inner[-1:]])
+    found, stated = [], []
+    for seed in range(REPEATS):
+        noise = EFFORT_NOISE * np.random.default_rng(seed).standard_normal(clean.shape)
+        solution = solve(efforts_of(clean + noise, LOW_CUTOFF), GaussNewton())
+        found.append([solution.parameters[name].value for name in DAMPING])
+        stated.append([solution.parameters[name].std for name in DAMPING])
+    error = np.array(found) - list(DAMPING.values())
+    inside = np.mean(np.abs(error) <= 1.96 * np.array(stated))
+    assert 0.90 <= inside <= 0.99
+    np.testing.assert_allclose(np.std(error, axis=0), np.median(stated, axis=0), rtol=0.2)
+
+
+def test_a_record_shorter_than_the_filter_is_refused(efforts_of):
+    with pytest.raises(DataError, match=r"(?s)6 s of efforts are too short.*more than 15\.4 s"):
+        efforts_of(np.zeros((601, 2)), 0.5)
+
+
+def test_neighbours_that_repeat_each_other_are_left_out(efforts_of):
+    nothing = np.zeros((601, 2))
+    plain, smooth = (efforts_of(nothing, cutoff).episodes[0].measurements[0] for cutoff in (math.inf, LOW_CUTOFF))
+    np.testing.assert_array_equal(plain.node, np.arange(1, 600))
+    np.testing.assert_array_equal(smooth.node + np.rint(smooth.fraction), np.arange(77, 524, 10))
+
+
+@pytest.mark.parametrize(("kind", "late"), [(None, 0.0), ("sample", 0.0), ("mean", 0.005), ("command", 0.005)])
+def test_an_effort_that_stands_for_an_interval_belongs_to_its_middle(efforts_of, kind, late):
+    t = 0.01 * np.arange(601)
+    [samples] = efforts_of(np.stack([t, 2 - t], axis=1), np.inf, kind).episodes[0].measurements
+    at = 0.01 * (samples.node + samples.fraction)[:, None]
+    expected = np.hstack([at - late, 2 - at + late])
+    np.testing.assert_allclose(samples.value.reshape(len(at), 2), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["sample", "mean", "command"])
+def test_settings_say_what_recorded_efforts_are(urdf_folder, kind):
+    step = pendulum_step(urdf_folder, driven=PENDULUM)
+    recorded, free = taken(step, 1), ["shoulder.damping"]
+    stated = ProblemOptions(sensors={JOINT_EFFORT_GROUP_NAME: SensorOptions(effort_kind=kind)})
+    [said] = EstimationProblem(step, [recorded], free, stated).episodes
+    [held] = EstimationProblem(step, [recorded.with_effort_kind(kind)], free, ProblemOptions()).episodes
+    assert said.recording.joints.effort_kind == kind
+    np.testing.assert_array_equal(said.torque, held.torque)
+    assert (np.abs(said.torque - recorded.joints.effort[:-1]).max() < 1e-12) == (kind != "sample")
+
+
+@pytest.mark.parametrize("cutoff", [math.inf, LOW_CUTOFF])
+@pytest.mark.parametrize("time_step", [0.02, 0.005, 0.0025])
+def test_efforts_are_compared_where_they_were_measured(efforts_of, cutoff, time_step):
+    """Never between samples, however short the step: what lies there was not measured."""
+    effort = np.random.default_rng(0).standard_normal((601, 2))
+    found = {}
+    for h in (0.01, time_step):
+        samples = efforts_of(effort, cutoff, time_step=h).episodes[0].measurements[0]
+        found[h] = dict(zip(np.round((samples.node + samples.fraction) * h / 0.01, 6), samples.value, strict=True))
+    assert all(time == round(time) for time in found[time_step])
+    if time_step < 0.01:
+        assert len(found[time_step]) == len(found[0.01])
+    if math.isinf(cutoff):
+        for time, value in found[time_step].items():
+            np.testing.assert_allclose(value, effort[round(time)], atol=1e-12)

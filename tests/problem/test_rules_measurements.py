@@ -70,12 +70,6 @@ def test_hubers_loss_is_square_first_and_then_straight(residual, scale, cost, fa
     assert weight == pytest.approx([factor])
 
 
-def test_losses_add():
-    cost, factor = huber_loss_and_residual_factors(np.array([[1.0, 4.0], [0.0, -1.0]]), 2.0)
-    assert cost == pytest.approx(0.5 + 2 * 3 + 0.5)
-    np.testing.assert_allclose(factor, [[1.0, math.sqrt(0.5)], [1.0, 1.0]])
-
-
 # -- rows of a residual -----------------------------------------------------------------------------------------------
 
 TWO = measured(efforts("a", "b"), [0, 1], [0.0, 0.0], [[1.0, NAN], [3.0, 4.0]], [[2.0, 0.0], [0.5, 10.0]])
@@ -102,7 +96,7 @@ def test_rows_have_the_slopes_of_their_predictions_and_a_robust_weight():
     assert found.cost == pytest.approx(2.0 + 0.5 + 2.5 * (10 - 1.25))
 
 
-def test_every_output_of_a_point_has_its_channel():
+def test_every_output_has_its_channel():
     made = measured(points("p", "r"), [0], [0.0], np.zeros((1, 6)))
     assert made.output_channel_names == ("points.p",) * 3 + ("points.r",) * 3
     assert TWO.output_channel_names == ("joints.effort.a", "joints.effort.b")
@@ -180,9 +174,8 @@ def test_distributing_is_the_transpose_of_interpolating(late):
     assert back.shape == (count, 2)
     assert np.sum(there * at_samples) == pytest.approx(np.sum(at_nodes * back), rel=1e-12)
     deep = rng.standard_normal((4, 2, 3))
-    np.testing.assert_allclose(
-        made.interpolation_adjoint(deep)[:, :, 1], made.interpolation_adjoint(deep[:, :, 1]), atol=1e-12
-    )
+    whole, part = made.interpolation_adjoint(deep), made.interpolation_adjoint(deep[:, :, 1])
+    np.testing.assert_allclose(whole[:, :, 1], part, atol=1e-12)
 
 
 # -- late samples -----------------------------------------------------------------------------------------------------

@@ -98,10 +98,8 @@ def test_start_bounds_and_values_by_name(make):
 def test_joints_are_coupled_by_the_inertia_of_every_configuration(momentum, free_step):
     theta = free_step.system.parameters.vector()
     angles = np.array([[0.4, 0.2], [-1.1, 0.7], [2.0, -0.3]])
-    matrices = [
-        np.column_stack([momentum(free_step, q[::-1], velocity, theta)[::-1] for velocity in np.eye(2)[::-1]])
-        for q in angles
-    ]
+    turned = np.eye(2)[::-1]
+    matrices = [np.column_stack([momentum(free_step, q[::-1], v, theta)[::-1] for v in turned]) for q in angles]
     found = _joint_mass_matrices(free_step, theta, ("elbow", "shoulder"), angles)
     np.testing.assert_allclose(found, matrices, rtol=1e-9)
     assert found[0, 0, 1] == pytest.approx(found[0, 1, 0]) != found[1, 0, 1]
@@ -146,10 +144,8 @@ def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_anothe
     np.testing.assert_allclose(residual, [0.5, 1.0])
     np.testing.assert_allclose(rows, [[0.5, 0.0, 0.0], [0.0, 1 / (math.log(10.0) * 30.0), 0.0]])
     assert problem.positive_unknowns_mask.tolist() == [True, True, False]
-    assert (problem.residual_rows.weak_priors, problem.residual_rows.slice_without_weak_priors) == (
-        slice(problem.residual_rows.data.stop + 1, problem.residual_rows.data.stop + 2),
-        slice(0, problem.residual_rows.data.stop + 1),
-    )
+    rows_of, at = problem.residual_rows, problem.residual_rows.data.stop + 1
+    assert (rows_of.weak_priors, rows_of.slice_without_weak_priors) == (slice(at, at + 1), slice(0, at))
     # at its bound the row is one that a step can follow: a thousandth of the start has its value but for 0.65
     low, slope = problem.prior_residual_and_jacobian(np.array([7.0, 0.0, 0.5]))
     assert low[1] == pytest.approx(-3.0 - 1.5 / math.log(10.0))

@@ -132,11 +132,8 @@ def grasped_cable(urdf_folder):
 def slopes(motion, split, roll, momentum):
     """Slope of log error over log time step, of q and of p, against a run with many more steps."""
     system, q, v, amplitude, duration, counts = motion
-    plain, theta, n = (
-        compile_step(system, duration / counts[0], split),
-        system.parameters.vector(),
-        system.n_coordinates,
-    )
+    plain, theta = compile_step(system, duration / counts[0], split), system.parameters.vector()
+    n = system.n_coordinates
 
     def finish(step, count):
         """Coordinates and momenta at the end; the torque is held at its value in each step's middle."""

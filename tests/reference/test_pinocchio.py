@@ -49,12 +49,10 @@ class Twin:
         effort = M @ a + by_qv.T @ v - rigid.lagrangian_by_q
         frames = list(self.mechanism.frames)
         poses = [kinematics.frame_pose(name).homogeneous_matrix() for name in frames]
-        jacobians = [
-            ca.vertcat(kinematics.position_jacobian(name), kinematics.angular_jacobian(name)) for name in frames
-        ]
-        dynamics = ca.Function(
-            "dynamics", [q, v, a], [M, rigid.lagrangian_by_q, effort, rigid.kinetic_energy, rigid.potential_energy]
-        )
+        by_q = [(kinematics.position_jacobian(name), kinematics.angular_jacobian(name)) for name in frames]
+        jacobians = [ca.vertcat(*pair) for pair in by_q]
+        values = [M, rigid.lagrangian_by_q, effort, rigid.kinetic_energy, rigid.potential_energy]
+        dynamics = ca.Function("dynamics", [q, v, a], values)
         return frames, ca.Function("poses", [q], poses), ca.Function("jacobians", [q], jacobians), dynamics
 
     @property
