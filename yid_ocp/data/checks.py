@@ -14,13 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.data.channel_checks import (
-    excess_noise_issues,
-    overstated_noise_issues,
-    saturated_effort_issues,
-    stuck_channel_issues,
-    white_noise_std,
-)
+from yid_ocp.data import channel_checks
 from yid_ocp.data.issues import (
     DEGREES_PER_RADIAN,
     MAX_ISSUE_EVIDENCE,
@@ -127,10 +121,10 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
         _common_clock(recording),
         _dropped(recording, driving),
         _velocities(recording),
-        stuck_channel_issues(recording),
-        excess_noise_issues(recording, choice),
-        overstated_noise_issues(recording, choice),
-        saturated_effort_issues(recording),
+        channel_checks.stuck_channel_issues(recording),
+        channel_checks.excess_noise_issues(recording, choice),
+        channel_checks.overstated_noise_issues(recording, choice),
+        channel_checks.saturated_effort_issues(recording),
         _standstill(recording),
     )
     return [replace(doubt, recording=recording.name) for doubt in found]
@@ -223,7 +217,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     names = joints.names
     ratio, fit = np.full(len(names), np.nan), np.zeros(len(names))
     for j, (x, y) in enumerate(zip(by_velocity.T, by_angle.T, strict=True)):
-        floor = max(0.02, 2 * white_noise_std(joints.t, joints.velocity[:, j]))
+        floor = max(0.02, 2 * channel_checks.white_noise_std(joints.t, joints.velocity[:, j]))
         if np.std(x) > floor and np.std(y) > 0:
             ratio[j] = np.sign(x @ y) * math.sqrt(float(y @ y) / float(x @ x))
             fit[j] = float(np.corrcoef(x, y)[0, 1])

@@ -21,6 +21,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from yid_ocp import files
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
@@ -35,14 +36,6 @@ from yid_ocp.data.recording import (
     validate_recording,
 )
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
-from yid_ocp.files import (
-    MAX_INPUT_NUMBERS,
-    atomic_write,
-    check_input_file,
-    file_sha256,
-    limited_memory,
-    os_error_reason,
-)
 from yid_ocp.sensors import CHANNEL_KINDS
 from yid_ocp.sensors.base import declared_channel_kinds
 
@@ -66,7 +59,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
         the format does not know, lacks one that it needs, or fails `validate_recording`.
     """
     path = Path(path)
-    digest = file_sha256(path)
+    digest = files.file_sha256(path)
     allowed = f"HDF5 in the format {_RECORDING_FORMAT}"
     hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.data.read_any"
     require_data(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), allowed, hint)
@@ -237,7 +230,7 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
     the file and says what stands against it, nothing where all of it can be read. `DataError` where the file is no
     regular one, with what the trial said of a file of the format `noun`, or how it ended.
     """
-    check_input_file(path)
+    files.check_input_file(path)
     if not hasattr(os, "fork"):
         return
     here, there = os.pipe()
@@ -248,7 +241,7 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
         try:
             faulthandler.disable()
             os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # allocators print before they abort
-            with limited_memory():
+            with files.limited_memory():
                 said = complaint(path)
             os.write(there, f".{said}".encode(errors="replace")[:2000])
         finally:
@@ -280,7 +273,7 @@ def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
 
     `OutputError` where the file cannot be written; one that was there before is left as it was.
     """
-    with atomic_write(Path(path)) as temporary:
+    with files.atomic_write(Path(path)) as temporary:
         with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
             yield file
             file.flush()
@@ -300,7 +293,7 @@ def open_checked_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
         with h5py.File(path, "r") as file:
             yield file
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:  # all of them come from h5py
-        what = f"the HDF5 file is truncated or damaged ({os_error_reason(error)})"
+        what = f"the HDF5 file is truncated or damaged ({files.os_error_reason(error)})"
         raise DataError(what, where=str(path), hint="copy or record it again") from error
 
 
@@ -314,7 +307,7 @@ def _complaint(path: Path) -> str:
                 file.visititems(_read)
             return complaint
     except Exception as error:  # whatever h5py says of damaged files
-        return f"the HDF5 file is truncated or damaged ({os_error_reason(error)})"
+        return f"the HDF5 file is truncated or damaged ({files.os_error_reason(error)})"
 
 
 def _read(name: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -349,5 +342,9 @@ def _excess(file: h5py.File) -> str:
             numbers += max(1.0, item.dtype.itemsize / 8) * item.size
 
     file.visititems(count)
-    meant = f"{MAX_INPUT_NUMBERS / 1e6:.0f} million are the most that can be meant"
-    return f"the HDF5 file declares {numbers / 1e6:.0f} million numbers; {meant}" if numbers > MAX_INPUT_NUMBERS else ""
+    meant = f"{files.MAX_INPUT_NUMBERS / 1e6:.0f} million are the most that can be meant"
+    return (
+        f"the HDF5 file declares {numbers / 1e6:.0f} million numbers; {meant}"
+        if numbers > files.MAX_INPUT_NUMBERS
+        else ""
+    )

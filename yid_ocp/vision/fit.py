@@ -27,6 +27,7 @@ from yid_ocp.least_squares import LocalQuadraticModel, minimize_by_damped_newton
 from yid_ocp.model.kinematics import Kinematics, forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
+from yid_ocp.vision import shape_evidence
 from yid_ocp.vision.initial_shapes import InitialShapeFinder, ObservedObjectEnd
 from yid_ocp.vision.shape_evidence import (
     FrameShapeFit,
@@ -35,12 +36,6 @@ from yid_ocp.vision.shape_evidence import (
     ShapePointClassification,
     TubeDimensionCost,
     TubeLinks,
-    across_links,
-    assess_shape_against_cloud,
-    line_of_sight_residuals,
-    link_axes,
-    nearest_surface_residuals,
-    tube_like_node_point_masks,
     tube_link_projections,
 )
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
@@ -199,7 +194,7 @@ class ShapeFitter:
         q[known] = q_known[known]
         begun = [self._with_free(q, start[free]) for start in starts or (self.rest_configuration,)]
         everything = np.ones(len(sight.skeleton_nodes), bool), np.ones(len(sight.points), bool)
-        thin = tube_like_node_point_masks(sight, float(self.link_radii.max()))
+        thin = shape_evidence.tube_like_node_point_masks(sight, float(self.link_radii.max()))
         best, evidence = self._attempt(sight, begun, thin if thin[0].any() and thin[1].any() else everything)
         for left in (self._without(best, evidence, sight, self._links_of(self._failed(evidence))), everything):
             failed = self._failed(evidence)
@@ -273,11 +268,11 @@ class ShapeFitter:
         tried = [self._minimise(_Minimum(start, unit, math.inf), on_nodes) for start in starts]
         last = self._minimise(min(tried, key=lambda minimum: minimum.cost), on_points)
         near = self.max_informative_surface_distance
-        evidence = assess_shape_against_cloud(self.tube_links_at(last.q), sight, near)
+        evidence = shape_evidence.assess_shape_against_cloud(self.tube_links_at(last.q), sight, near)
         keep = ~(evidence.is_contested | evidence.is_foreign)
         if on_points and keep.any():
             last = self._minimise(last, self._tasks(sight, left[0], keep)[1])
-            evidence = assess_shape_against_cloud(self.tube_links_at(last.q), sight, near)
+            evidence = shape_evidence.assess_shape_against_cloud(self.tube_links_at(last.q), sight, near)
         return last, evidence
 
     @property
@@ -338,13 +333,15 @@ class ShapeFitter:
         corners = self._links_at(q)
         touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING
         # the spread across the links about each point
-        wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across_links(corners, sight.camera_position))
+        wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(
+            shape_evidence.across_links(corners, sight.camera_position)
+        )
         swath = np.max(np.where(touching[..., None], wide[:, None], 0.0), axis=0)
         off_end, noise = np.zeros(places.shape), max(self.options.surface_noise_std, evidence.noise_std)
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
             if abs(offset) > _SIGMAS * noise:
                 at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING
-                off_end[at_end] = offset * link_axes(corners)[k]
+                off_end[at_end] = offset * shape_evidence.link_axes(corners)[k]
         # a point is seen where a link that begins or ends there is, of a tube that is where it should be
         sure = evidence.covered_fraction >= self.options.min_link_coverage
         sure &= ~self._links_of(self._failed(evidence))
@@ -366,7 +363,9 @@ class ShapeFitter:
         """Cost, gradient and Gauss-Newton Hessian by the free bends."""
         out, jacobian = self._corners(q)
         corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
-        surface = nearest_surface_residuals(corners, self.link_radii, task.points, task.camera, task.share)
+        surface = shape_evidence.nearest_surface_residuals(
+            corners, self.link_radii, task.points, task.camera, task.share
+        )
         link, error = surface.link_indices, surface.signed_distance
         square = (error / task.scale) ** 2
         cost = 0.5 * task.scale**2 * float(np.sum(task.weight * square / (1 + square)))
@@ -416,7 +415,7 @@ class ShapeFitter:
             hessian[:] += weighted.T @ rows
 
         if task is not None:
-            depths = line_of_sight_residuals(corners, self.link_radii, task.points, task.camera)
+            depths = shape_evidence.line_of_sight_residuals(corners, self.link_radii, task.points, task.camera)
             weight = task.weight[depths.point_indices] / (1 + (depths.signed_distance / task.scale) ** 2) ** 2
             segment = np.array([names.index(owner) for owner in self.link_segments])
             for k in range(len(self.link_radii)):
@@ -428,7 +427,7 @@ class ShapeFitter:
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
             if np.isfinite(offset):
                 rows = np.zeros((1, total))
-                rows[0, : free + many] = -link_axes(corners)[k] @ chain[6 * k + 3 : 6 * k + 6]
+                rows[0, : free + many] = -shape_evidence.link_axes(corners)[k] @ chain[6 * k + 3 : 6 * k + 6]
                 noise = max(self.options.surface_noise_std, evidence.noise_std)
                 add(rows, np.array([offset]), np.array([1.0 / noise**2]))
         held, by_held = (np.array(x) for x in self._held(q))

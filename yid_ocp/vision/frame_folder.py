@@ -20,18 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from yid_ocp import files
 from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, OutputError, unknown_name_details
-from yid_ocp.files import (
-    atomic_write,
-    check_input_file,
-    check_number_count,
-    limited_memory,
-    make_folder,
-    read_input_json,
-    read_input_text,
-    write_text,
-)
 from yid_ocp.vision.frames import CameraIntrinsics, ColourArray, FrameSequence, import_open3d, validated_camera_pose
 
 _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
@@ -49,7 +40,7 @@ _Cloud = tuple[Array, ColourArray | None]
 
 def _read_cloud(path: Path, coloured: bool = False) -> _Cloud:
     """A cloud; colours of PLY files only where asked for."""
-    check_input_file(path, _MAX_FRAME_BYTES)
+    files.check_input_file(path, _MAX_FRAME_BYTES)
     if path.suffix.lower() == ".ply":
         return _read_ply(path, coloured)
     readers = {".npz": _read_npz, ".xyz": _read_xyz, ".pcd": _read_pcd}
@@ -64,7 +55,7 @@ def _read_npz(path: Path) -> _Cloud:
     allowed += " to 255 if wanted"
     try:
         with zipfile.ZipFile(path) as packed:
-            check_number_count(sum(entry.file_size for entry in packed.infolist()), str(path))
+            files.check_number_count(sum(entry.file_size for entry in packed.infolist()), str(path))
         with np.load(path, allow_pickle=False) as held:
             arrays: dict[str, Any] = {name: held[name] for name in (_POINTS_ARRAY, _COLOURS_ARRAY) if name in held}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
@@ -100,7 +91,7 @@ def _read_pcd(path: Path) -> _Cloud:
         raise DataError(what, where=str(path), hint=_AGAIN)
     # Open3D says what is wrong on the standard output and returns an empty cloud
     try:
-        with limited_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        with files.limited_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             cloud = o3d.io.read_point_cloud(str(path))
     except (MemoryError, RuntimeError) as error:
         what = f"the cloud is damaged: it declares more points than fit into memory ({error})"
@@ -112,9 +103,9 @@ def _read_pcd(path: Path) -> _Cloud:
 def _read_depth_image(path: Path) -> Array:
     """A depth image in the file's unit, shape (height, width); `DataError` where it is no grey PNG of 16 bits."""
     o3d = import_open3d()
-    with check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
+    with files.check_input_file(path, _MAX_FRAME_BYTES).open("rb") as file:
         head = file.read(24)  # whose last eight bytes are a PNG's width and height
-    check_number_count(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
+    files.check_number_count(int.from_bytes(head[16:20], "big") * int.from_bytes(head[20:24], "big"), str(path))
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         image = np.asarray(o3d.io.read_image(str(path)))
     if image.ndim != 2 or image.dtype != np.uint16:
@@ -259,7 +250,7 @@ def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) 
 
     `OutputError` where the folder or a file cannot be written.
     """
-    path, o3d = make_folder(folder), import_open3d()
+    path, o3d = files.make_folder(folder), import_open3d()
     names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
     for i, name in enumerate(names):
         # float32 keeps 0.2 um at 2 m in half the space
@@ -272,8 +263,8 @@ def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) 
     head: dict[str, Any] = {"format": _FRAMES_FORMAT, "pose": pose, "frame": "camera", "unit": "m"}
     if sequence.intrinsics is not None:
         head |= {"intrinsics": asdict(sequence.intrinsics), "depth_unit": 1e-3}
-    write_text(path / _CAMERA_FILE, json.dumps(head, indent=1) + "\n")
-    with atomic_write(path / STAMP_FILE) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+    files.write_text(path / _CAMERA_FILE, json.dumps(head, indent=1) + "\n")
+    with files.atomic_write(path / STAMP_FILE) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["file", "t"])
         writer.writerows([name, repr(float(t))] for name, t in zip(names, sequence.stamps, strict=True))
@@ -289,7 +280,7 @@ def metres_per_unit(unit: str, where: str) -> float:
 def _read_camera(path: Path) -> dict[str, Any]:
     if not path.exists():
         return {}
-    head = read_input_json(path)
+    head = files.read_input_json(path)
     if not isinstance(head, dict):
         raise DataError("the camera's file is not an object", where=str(path), allowed='{"pose": ..., ...}')
     for key in (key for key in head if key not in _KEYS):
@@ -339,7 +330,7 @@ def _read_stamps(path: Path) -> tuple[tuple[str, ...], Array]:
     if not path.exists():
         raise DataError("the frames have no time stamps", where=str(path), allowed=allowed)
     try:
-        rows = list(csv.DictReader(read_input_text(path).splitlines()))
+        rows = list(csv.DictReader(files.read_input_text(path).splitlines()))
     except csv.Error as error:
         raise DataError(f"the time stamps cannot be read ({error})", where=str(path), allowed=allowed) from error
     if not rows:

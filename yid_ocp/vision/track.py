@@ -19,6 +19,7 @@ from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import ConfigError, DataError, ModelError, nearest_name_hint
 from yid_ocp.model.system import System
+from yid_ocp.vision import frame_selection, point_cloud, sequence_calibration, surface_meshes
 from yid_ocp.vision.calibration import (
     CameraCalibration,
     calibrate_camera,
@@ -28,41 +29,13 @@ from yid_ocp.vision.calibration import (
 )
 from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
 from yid_ocp.vision.fit import ShapeFitter
-from yid_ocp.vision.frame_selection import (
-    TrackOptions,
-    frame_rejection_reason,
-    is_shape_self_touching,
-    mark_outlying_frames,
-    tracked_states_and_points,
-    with_consistent_root_end,
-)
+from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
 from yid_ocp.vision.initial_shapes import InitialShapeFinder, system_with_free_root, trace_centerline
-from yid_ocp.vision.point_cloud import (
-    CloudSkeleton,
-    ReachableObjectRegion,
-    WeightedCloud,
-    extract_skeleton,
-    has_wanted_colour,
-    is_statistical_inlier,
-    voxel_averages,
-)
-from yid_ocp.vision.sequence_calibration import (
-    BackgroundPoints,
-    ForeignObject,
-    SequenceCalibration,
-    TubeDimensionCheck,
-    estimate_and_check_dimensions,
-    group_foreign_clusters,
-)
+from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
+from yid_ocp.vision.sequence_calibration import BackgroundPoints, ForeignObject, SequenceCalibration, TubeDimensionCheck
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
-from yid_ocp.vision.surface_meshes import (
-    ArticulatedSurfaces,
-    CameraScene,
-    TriangleMesh,
-    extra_meshes_by_joint,
-    load_robot_meshes,
-)
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, CameraScene, TriangleMesh
 from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, TrackResult
 
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
@@ -154,9 +127,9 @@ class FrameTracker:
         known = () if anywhere else self.shape_fitter.recorded_joint_names
         self.joint_time_span, self.joint_angles_at = _joint_angles(system, recording, known)
         tree = system.numeric_mechanism(values)
-        meshes = extra_meshes_by_joint(scene.extra_meshes, tree)
+        meshes = surface_meshes.extra_meshes_by_joint(scene.extra_meshes, tree)
         if scene.robot_urdf is not None:
-            robot = load_robot_meshes(scene.robot_urdf, tree, options.robot_mesh_kind)
+            robot = surface_meshes.load_robot_meshes(scene.robot_urdf, tree, options.robot_mesh_kind)
             if all(joint < 0 for joint in robot):
                 raise ModelError("no link of the robot moves with the model's joints", where=str(scene.robot_urdf))
             meshes |= {joint: [mesh, *meshes.get(joint, ())] for joint, mesh in robot.items()}
@@ -211,9 +184,11 @@ class FrameTracker:
             places = self.shape_fitter.points_at(looks[0].q)
             shared = float(calibration.point_std_from_calibration(places, 0 * places, np.zeros(len(places))).max())
         asked = self.options.estimated_dimensions
-        sizes = estimate_and_check_dimensions(self.system, self.parameter_values, asked, (noise, shared), fitted)
+        sizes = sequence_calibration.estimate_and_check_dimensions(
+            self.system, self.parameter_values, asked, (noise, shared), fitted
+        )
         if self.options.background_estimation == "frames":
-            good = (pair for pair in last if not frame_rejection_reason(pair[1], pair[0], self.options))
+            good = (pair for pair in last if not frame_selection.frame_rejection_reason(pair[1], pair[0], self.options))
             shapes = [shape.tube_links_at(fit.q) for shape, fit in good]
             clouds = [look.sights[0].points for look in looks]
             near = self.shape_fitter.max_informative_surface_distance
@@ -231,7 +206,7 @@ class FrameTracker:
                 points, _ = self._finite(self.sequence, i)
             except DataError:
                 continue  # the second pass says why
-            thinned = voxel_averages(points, options.filters.voxel_size).points
+            thinned = point_cloud.voxel_averages(points, options.filters.voxel_size).points
             glimpses.append(CalibrationFrame(float(self.sequence.stamps[i]), thinned))
         rng = np.random.default_rng(options.seed)
         pose, source = self.sequence.camera_pose, self.sequence.source
@@ -301,10 +276,10 @@ class FrameTracker:
             if colours is None:
                 raise DataError("the cloud has no colours")
             wanted = filters.object_colours, filters.max_colour_angle
-            inside[inside] = has_wanted_colour(colours[finite][inside], *wanted)
+            inside[inside] = point_cloud.has_wanted_colour(colours[finite][inside], *wanted)
             if not inside.any():
                 raise DataError("no point has one of the object's colours: check filters.object_colours")
-        return voxel_averages(points[inside], filters.voxel_size), points
+        return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
 
     def track_frame(self, index: int, common: SequenceCalibration) -> FrameReport:
         """Report of one frame, independent of other frames."""
@@ -315,9 +290,9 @@ class FrameTracker:
         shape = self._shape(common.dimensions)
         fits = [shape.fit_frame(sight, look.q, starts) for sight, starts in zip(look.sights, look.starts, strict=True)]
         fits.sort(key=lambda fit: fit.mean_distance)
-        reason = frame_rejection_reason(fits[0], shape, self.options)
+        reason = frame_selection.frame_rejection_reason(fits[0], shape, self.options)
         anywhere = self.initial_shape_finder is not None
-        if anywhere and not reason and is_shape_self_touching(fits[0].link_ends, shape.link_radii):
+        if anywhere and not reason and frame_selection.is_shape_self_touching(fits[0].link_ends, shape.link_radii):
             reason = "the object crosses or touches itself"
         other = fits[1] if len(fits) > 1 and fits[1].mean_distance < _AS_GOOD * fits[0].mean_distance else None
         spent = work.report.cpu_seconds + time.process_time() - begun
@@ -343,14 +318,16 @@ class FrameTracker:
 
     def assign_root_and_mark_outliers(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Frames with outlying ones dropped, and how the root end was chosen."""
-        rooted, note = with_consistent_root_end(frames, self.options)
-        return mark_outlying_frames(rooted, self.options), note
+        rooted, note = frame_selection.with_consistent_root_end(frames, self.options)
+        return frame_selection.mark_outlying_frames(rooted, self.options), note
 
     def to_track_result(self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration) -> TrackResult:
         """Tracking result of the frames; `DataError` if none is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.foreign_objects(frames)
-        measured = tracked_states_and_points(frames, columns, common, things, self.options, self.sequence.source)
+        measured = frame_selection.tracked_states_and_points(
+            frames, columns, common, things, self.options, self.sequence.source
+        )
         place = self._shape(common.dimensions).points_at
         return TrackResult(
             self.point_names,
@@ -372,7 +349,7 @@ class FrameTracker:
         box = corners.min(axis=0) - self._widest, corners.max(axis=0) + self._widest
         seen, noise = [(t, fit.foreign_clusters) for t, fit in fitted], self.options.shape_fit.surface_noise_std
         coloured, still = self.sequence.load_colours is not None, self.options.background_estimation == "frames"
-        return group_foreign_clusters(seen, noise, box, self._links, coloured, still)
+        return sequence_calibration.group_foreign_clusters(seen, noise, box, self._links, coloured, still)
 
     def _links(self, t: float) -> dict[str, Array]:
         """Poses of what moves with the robot at a time, by the names of the links."""
@@ -419,7 +396,9 @@ class FrameTracker:
             kept = ~self.robot_surfaces.is_within_surface_distance(cloud.points, q, filters.robot_padding)
         kept[kept] = ~background.is_near_background(cloud.points[kept])
         # beside the robot's points: among all surfaces, wrong points are few
-        cloud = cloud.select(is_statistical_inlier(cloud, filters.outlier_neighbours, filters.outlier_z_max, kept))
+        cloud = cloud.select(
+            point_cloud.is_statistical_inlier(cloud, filters.outlier_neighbours, filters.outlier_z_max, kept)
+        )
         work.filtered = cloud
         work.say(n_filtered_points=len(cloud))
         if len(cloud) < filters.min_points:
@@ -439,7 +418,7 @@ class FrameTracker:
 
     def _held(self, work: _Work, cloud: WeightedCloud, q: Array, rng: np.random.Generator, given: _Given) -> _Look:
         """What is seen of an object whose root is where the model has it."""
-        found = extract_skeleton(cloud, rng, self.options.skeleton)
+        found = point_cloud.extract_skeleton(cloud, rng, self.options.skeleton)
         work.skeleton = found
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):

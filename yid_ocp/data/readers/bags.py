@@ -14,20 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.readers.base import (
-    FILE_PREVIEWERS,
-    READERS,
-    FileDataSourceSummary,
-    FilePreview,
-    SelectionAndUnitOptions,
-    check_unique_point_names,
-    convert_to_si_and_validate,
-    guess_units,
-    import_optional,
-    merge_on_fastest_clock,
-    parse_renamings,
-    zero_order_hold_positions,
-)
+from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import check_input_file, file_sha256, limited_memory
@@ -81,7 +68,7 @@ class OpenBag:
 
     def __init__(self, path: Path) -> None:
         highlevel, typesys = (
-            import_optional(f"rosbags.{name}", "bags", "reading bags needs the package rosbags", path)
+            base.import_optional(f"rosbags.{name}", "bags", "reading bags needs the package rosbags", path)
             for name in ("highlevel", "typesys")
         )
         self.path = path
@@ -154,7 +141,7 @@ class _Contents:
 
 
 @dataclass(frozen=True)
-class BagOptions(SelectionAndUnitOptions):
+class BagOptions(base.SelectionAndUnitOptions):
     """Options of `read_bag`: which topics, joints and points are read, under which names and in which units.
 
     Joints are needed where the messages of a topic do not all have the same ones; messages that lack one are skipped.
@@ -174,10 +161,10 @@ class BagOptions(SelectionAndUnitOptions):
 _DEFAULTS = BagOptions()
 
 
-@READERS.register(".bag")
-@READERS.register(".mcap")
-@READERS.register(".db3")
-@READERS.register("folder")
+@base.READERS.register(".bag")
+@base.READERS.register(".mcap")
+@base.READERS.register(".db3")
+@base.READERS.register("folder")
 def read_bag(
     path: str | os.PathLike[str], options: BagOptions = _DEFAULTS, progress: Progress = NULL_PROGRESS
 ) -> Recording:
@@ -216,14 +203,14 @@ def read_bag(
     left = [f"{t.name} was left out ({t.kind}, {t.n_messages})" for t in bag.file.topics if t.name not in used]
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left))
-    return convert_to_si_and_validate(raw, str(path), replace(options, joints=None, points=None))
+    return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, points=None))
 
 
-@FILE_PREVIEWERS.register(".bag")
-@FILE_PREVIEWERS.register(".mcap")
-@FILE_PREVIEWERS.register(".db3")
-@FILE_PREVIEWERS.register("folder")
-def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FilePreview:
+@base.FILE_PREVIEWERS.register(".bag")
+@base.FILE_PREVIEWERS.register(".mcap")
+@base.FILE_PREVIEWERS.register(".db3")
+@base.FILE_PREVIEWERS.register("folder")
+def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> base.FilePreview:
     """What a bag holds: its topics, what they would become, and units that their values look like."""
     path = Path(path)
     file_sha256(path)
@@ -245,10 +232,10 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
         options["points"] = names
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
         notes.append("poses have orientations: --pose-axes 0.1 keeps them as points 0.1 m along the axes")
-    units, why = guess_units(_for_guess(bag))
+    units, why = base.guess_units(_for_guess(bag))
     if units:
         options["units"] = units
-    return FilePreview(tuple(sources), options, (*notes, *why))
+    return base.FilePreview(tuple(sources), options, (*notes, *why))
 
 
 def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Contents:
@@ -324,7 +311,7 @@ def _joints(bag: _Contents, options: BagOptions, where: str) -> tuple[list[_Stat
     for topic in (*(topics or ()), *((command,) if command else ())):
         bag.file.check_topic_is_known(topic, known, "joint states")
     chosen = [topic for topic in (known if topics is None else topics) if topic != command]
-    wanted = None if options.joints is None else parse_renamings(options.joints, "joint", where)
+    wanted = None if options.joints is None else base.parse_renamings(options.joints, "joint", where)
     found, notes = [], []
     if wanted is not None:
         _check_together(bag, chosen, wanted, where)
@@ -378,11 +365,11 @@ def _on_one_clock(
     if not groups:
         return None, ()
     made = [(e.topic, _joint_group(e, seconds, f"{where}: {e.topic}")) for e in groups if not e.command]
-    together, notes = merge_on_fastest_clock(made, where)
+    together, notes = base.merge_on_fastest_clock(made, where)
     for entry in groups:
         if entry.command:
             group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
-            together = replace(together, position_command=zero_order_hold_positions(group, together.t))
+            together = replace(together, position_command=base.zero_order_hold_positions(group, together.t))
     return together, notes
 
 
@@ -433,7 +420,7 @@ def _named_places(bag: _Contents, points: Mapping[str, str] | None, where: str) 
     for source in () if points is None else names:
         if source not in present:
             bag.file.check_topic_is_known(source, known, "points")
-    check_unique_point_names(names, where)
+    base.check_unique_point_names(names, where)
     groups: _MessagesByFrame = {}
     for message in bag.places:
         if message.source in names:
@@ -480,7 +467,7 @@ def _positions(
 # -- preview ----------------------------------------------------------------------------------------------------------
 
 
-def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> FileDataSourceSummary:
+def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> base.FileDataSourceSummary:
     own = [m for m in (*bag.states, *bag.places) if m.source.partition(":")[0] == topic.name]
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
@@ -495,7 +482,7 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     elif topic.kind in _TREES:
         children = sorted({message.source.partition(":")[2] for message in own})
         note = f"frames {', '.join(children)}: --points {topic.name}:FRAME=POINT"
-    return FileDataSourceSummary(*topic, rate, becomes, note if topic.n_messages else "no messages")
+    return base.FileDataSourceSummary(*topic, rate, becomes, note if topic.n_messages else "no messages")
 
 
 def _for_guess(bag: _Contents) -> Recording:

@@ -13,15 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.readers.base import (
-    FILE_PREVIEWERS,
-    READERS,
-    FileDataSourceSummary,
-    FilePreview,
-    SelectionAndUnitOptions,
-    convert_to_si_and_validate,
-    import_optional,
-)
+from yid_ocp.data.readers import base
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import check_readable_in_fork
 from yid_ocp.errors import DataError
@@ -39,10 +31,10 @@ class _Markers(NamedTuple):
     t: Array
     position: Array
     unit: str
-    others: tuple[FileDataSourceSummary, ...]
+    others: tuple[base.FileDataSourceSummary, ...]
 
 
-@READERS.register(".c3d")
+@base.READERS.register(".c3d")
 def read_c3d(
     path: str | os.PathLike[str],
     *,
@@ -69,12 +61,12 @@ def read_c3d(
     group = PointGroup("points", found.names, found.t, found.position, None, sensor, frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
-    options = SelectionAndUnitOptions(points=points, units={**own, **(units or {})})
-    return convert_to_si_and_validate(raw, str(path), options)
+    options = base.SelectionAndUnitOptions(points=points, units={**own, **(units or {})})
+    return base.convert_to_si_and_validate(raw, str(path), options)
 
 
-@FILE_PREVIEWERS.register(".c3d")
-def _preview_c3d(path: str | os.PathLike[str]) -> FilePreview:
+@base.FILE_PREVIEWERS.register(".c3d")
+def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
     """What a C3D file holds; errors as `read_c3d`."""
     path = Path(path)
     file_sha256(path)
@@ -84,14 +76,14 @@ def _preview_c3d(path: str | os.PathLike[str]) -> FilePreview:
     for i, name in enumerate(found.names):
         seen = np.isfinite(found.position[:, i]).all(axis=1)
         note = "" if seen.all() else f"seen in {seen.mean():.0%} of the frames"
-        sources.append(FileDataSourceSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
+        sources.append(base.FileDataSourceSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
     notes = [f"the file says that its unit is {found.unit}"] if found.unit else ["the file says no unit: --units mm?"]
     options = {"points": {name: name for name in found.names}}
-    return FilePreview((*sources, *found.others), options, tuple(notes))
+    return base.FilePreview((*sources, *found.others), options, tuple(notes))
 
 
 def _markers(path: Path) -> _Markers:
-    ezc3d = import_optional("ezc3d", "c3d", "reading C3D files needs the package ezc3d", path)
+    ezc3d = base.import_optional("ezc3d", "c3d", "reading C3D files needs the package ezc3d", path)
     check_readable_in_fork(path, _complaint, "C3D")
     try:
         file = ezc3d.c3d(str(path))
@@ -124,10 +116,12 @@ def _markers(path: Path) -> _Markers:
         what = "no labelled marker of the C3D file was ever seen"
         raise DataError(what, where=str(path), allowed="labelled 3-D points", hint="label them and export it again")
     others = [
-        FileDataSourceSummary(labels[i] or f"marker {i + 1}", "marker", int(np.sum(~unseen[:, i])), rate, "", reason)
+        base.FileDataSourceSummary(
+            labels[i] or f"marker {i + 1}", "marker", int(np.sum(~unseen[:, i])), rate, "", reason
+        )
         for i, reason in why.items()
     ]
-    others += [FileDataSourceSummary(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
+    others += [base.FileDataSourceSummary(name, "analog", 0, math.nan, "", "an analog channel") for name in analog]
     names, t = _short([labels[i] for i in kept]), np.arange(len(position)) / rate
     return _Markers(names, t, position[:, kept], unit, tuple(others))
 

@@ -17,17 +17,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.readers.base import (
-    FILE_PREVIEWERS,
-    READERS,
-    SKIPPED_COLUMN_MEANING,
-    FileDataSourceSummary,
-    FilePreview,
-    SelectionAndUnitOptions,
-    convert_to_si_and_validate,
-    guess_units,
-    mean_sample_rate,
-)
+from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, ClockKind, JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_number_count, file_sha256
@@ -45,7 +35,7 @@ _LISTED = 5  # numbers of bad lines in a note
 
 
 @dataclass(frozen=True)
-class CsvOptions(SelectionAndUnitOptions):
+class CsvOptions(base.SelectionAndUnitOptions):
     """Options of `read_csv`: what the columns of the table mean, and which of them are kept.
 
     `columns` say what a column means where its name does not: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a
@@ -65,7 +55,7 @@ class CsvOptions(SelectionAndUnitOptions):
 _DEFAULTS = CsvOptions()
 
 
-@READERS.register(".csv")
+@base.READERS.register(".csv")
 def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> Recording:
     """Read a table with one row per time; its points become one group called `points`.
 
@@ -82,7 +72,7 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     meanings, table, notes = _read_table(path, options)
     raw = _raw(meanings, table, str(path), options)
     made = Recording(raw.joints, raw.points, options.description, path.name, path.stem, digest, notes=notes)
-    return convert_to_si_and_validate(made, str(path), options)
+    return base.convert_to_si_and_validate(made, str(path), options)
 
 
 def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: CsvOptions = _DEFAULTS) -> Recording:
@@ -106,8 +96,8 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     return Recording(group, (points,) if point_names else ())
 
 
-@FILE_PREVIEWERS.register(".csv")
-def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
+@base.FILE_PREVIEWERS.register(".csv")
+def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     """What a table holds: columns, what their names say, and units that its values look like."""
     path = Path(path)
     file_sha256(path)
@@ -154,22 +144,24 @@ def _preview_csv(path: str | os.PathLike[str]) -> FilePreview:
     for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
         becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "its name does not say what it is"
-        sources.append(FileDataSourceSummary(name, kind, count, mean_sample_rate(t) if ok else math.nan, becomes, note))
+        sources.append(
+            base.FileDataSourceSummary(name, kind, count, base.mean_sample_rate(t) if ok else math.nan, becomes, note)
+        )
     notes = [f"{bad} of {n_lines} lines are no rows of numbers"] if bad else []
     clean = table[np.isfinite(t)]
     try:
-        units, why = guess_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
+        units, why = base.guess_units(_raw([m for m, _ in known], clean[:, [i for _, i in known]], str(path)))
     except (DataError, ValueError):  # a channel that is not complete: its meaning has to be given first
         units, why = {}, ()
     if units:
         options["units"] = units
-    return FilePreview(tuple(sources), options, (*notes, *why))
+    return base.FilePreview(tuple(sources), options, (*notes, *why))
 
 
 def _proposed(name: str, numeric: bool) -> str:
     """A meaning to be filled in for a column whose name does not say it."""
     if not numeric:
-        return SKIPPED_COLUMN_MEANING
+        return base.SKIPPED_COLUMN_MEANING
     return "CHANNEL:JOINT" if name.isdecimal() else f"CHANNEL:{name}"
 
 
@@ -299,12 +291,15 @@ def _meanings(header: Sequence[str], columns: Mapping[str, str], where: str) -> 
         own = _given_meaning(name, given[name], where) if name in given else _conventional_meaning(name)
         if own is None and name not in given:
             allowed = f"t, {', '.join(f'{prefix}<joint>' for prefix in _PREFIXES)}, <point>_x, <point>_y, <point>_z"
-            skipped = f"{name}={SKIPPED_COLUMN_MEANING} to leave it out"
+            skipped = f"{name}={base.SKIPPED_COLUMN_MEANING} to leave it out"
             hint = f"rename it, or say what it is: columns {name}=position:JOINT, or {skipped}"
             raise DataError(f"the meaning of column '{name}' is not known", where=where, allowed=allowed, hint=hint)
         if own and meant.setdefault(own, name) != name:
             what = f"columns '{meant[own]}' and '{name}' mean the same, {' '.join(own).strip()}"
-            allowed, hint = "one column for every channel", f"leave one out: --columns {name}={SKIPPED_COLUMN_MEANING}"
+            allowed, hint = (
+                "one column for every channel",
+                f"leave one out: --columns {name}={base.SKIPPED_COLUMN_MEANING}",
+            )
             raise DataError(what, where=where, allowed=allowed, hint=hint)
         meanings[name] = own
     if ("t", "") not in meant:
@@ -326,7 +321,7 @@ def _conventional_meaning(column: str) -> _Meaning:
 
 
 def _given_meaning(column: str, given: str, where: str) -> _Meaning:
-    if given == SKIPPED_COLUMN_MEANING:
+    if given == base.SKIPPED_COLUMN_MEANING:
         return None
     if given == "t":
         return "t", ""
@@ -334,7 +329,7 @@ def _given_meaning(column: str, given: str, where: str) -> _Meaning:
     known = (*JOINT_CHANNEL_UNITS, *_AXES)
     if not name or kind not in known:
         what, choice = f"column '{column}' is given the meaning '{given}'", f"one of {', '.join(known)}"
-        allowed = f"t, {SKIPPED_COLUMN_MEANING}, or KIND:NAME with a joint's or a point's name and {choice}"
+        allowed = f"t, {base.SKIPPED_COLUMN_MEANING}, or KIND:NAME with a joint's or a point's name and {choice}"
         hint = nearest_name_hint(kind, known) if kind not in known else f"{kind}:NAME"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name

@@ -12,16 +12,7 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel, Field, ValidationError
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.readers.base import (
-    FILE_PREVIEWERS,
-    READERS,
-    FileDataSourceSummary,
-    FilePreview,
-    SelectionAndUnitOptions,
-    convert_to_si_and_validate,
-    guess_units,
-    import_optional,
-)
+from yid_ocp.data.readers import base
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.errors import DataError, unknown_name_details
 from yid_ocp.files import check_input_file, check_number_count, file_sha256, read_input_json
@@ -62,7 +53,7 @@ class _Dataset(NamedTuple):
     info: _Info
 
 
-@READERS.register("LeRobot dataset")
+@base.READERS.register("LeRobot dataset")
 def read_lerobot_episode(
     path: str | os.PathLike[str],
     *,
@@ -92,11 +83,13 @@ def read_lerobot_episode(
     own = source, f"{dataset.folder.name}_{episode:06d}", file_sha256(file)
     notes = tuple(f"{name} was left out ({why})" for name, why in left.items())
     raw, where = Recording(group, (), description, *own, notes=notes), f"{dataset.folder}, episode {episode}"
-    return convert_to_si_and_validate(raw, where, SelectionAndUnitOptions(joints, None, units, torque_constants, gears))
+    return base.convert_to_si_and_validate(
+        raw, where, base.SelectionAndUnitOptions(joints, None, units, torque_constants, gears)
+    )
 
 
-@FILE_PREVIEWERS.register("LeRobot dataset")
-def _preview_lerobot(path: str | os.PathLike[str]) -> FilePreview:
+@base.FILE_PREVIEWERS.register("LeRobot dataset")
+def _preview_lerobot(path: str | os.PathLike[str]) -> base.FilePreview:
     """What a LeRobot dataset holds, by its first episode; errors as `read_lerobot_episode`."""
     dataset = _dataset(Path(path))
     table, _ = _episode(dataset, 0)
@@ -106,14 +99,14 @@ def _preview_lerobot(path: str | os.PathLike[str]) -> FilePreview:
     for name, feature in dataset.info.features.items():
         becomes = "position_command" if name == _ACTION else f"joints {', '.join(names)}"
         own = (becomes, "") if name not in left else ("", left[name])
-        sources.append(FileDataSourceSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
-    units, guesses = guess_units(Recording(group))
+        sources.append(base.FileDataSourceSummary(name, feature.dtype, len(group.t), dataset.info.fps, *own))
+    units, guesses = base.guess_units(Recording(group))
     options: dict[str, Any] = {"episode": 0, "joints": list(names)}
     if units:
         options["units"] = units | ({"position_command": units["position"]} if "position" in units else {})
     said = f"{dataset.info.total_episodes} episodes at {dataset.info.fps:g} Hz, {dataset.info.codebase_version}"
     robot = dataset.info.robot_type
-    return FilePreview(tuple(sources), options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
+    return base.FilePreview(tuple(sources), options, (said + (f", recorded on {robot}" if robot else ""), *guesses))
 
 
 def _dataset(folder: Path) -> _Dataset:
@@ -136,7 +129,7 @@ def _dataset(folder: Path) -> _Dataset:
 def _episode(dataset: _Dataset, episode: int) -> tuple[Mapping[str, Array], Path]:
     """Columns of one episode, shape (frames, numbers of a frame), and the file in which it stands."""
     arrow, parquet = (
-        import_optional(name, "lerobot", "reading LeRobot datasets needs pyarrow", dataset.folder)
+        base.import_optional(name, "lerobot", "reading LeRobot datasets needs pyarrow", dataset.folder)
         for name in ("pyarrow", "pyarrow.parquet")
     )
     where = f"{dataset.folder}, episode {episode}"
