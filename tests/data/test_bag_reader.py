@@ -4,7 +4,7 @@ import contextlib
 import math
 import sqlite3
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,98 +12,73 @@ import numpy as np
 import pytest
 from heard import Heard
 from recording_examples import joints_of
+from ros_bags import BAG_KINDS, SECOND, START, Bag
 
 from yid_ocp.data.readers import preview_file, read_any
 from yid_ocp.data.readers.bags import OpenBag, read_bag
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
-SECOND = 10**9
-
-
 NO_ROSBAGS = "bags need rosbags: pip install 'yid-ocp[bags]'"
-JOINT_STATE, POINT = "sensor_msgs/msg/JointState", "geometry_msgs/msg/PointStamped"
-POSE, TREE, BOOL = "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage", "std_msgs/msg/Bool"
+BOOL, STRING = "std_msgs/msg/Bool", "std_msgs/msg/String"
 QUARTER = (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5))
 """A quarter turn about z, as (x, y, z, w)."""
-START = 1_700_000_000 * SECOND
-FORMATS = ("bag", "mcap", "mcap folder", "db3", "db3 folder")
+Message = tuple[str, Callable[[Bag], dict[str, Any]]]
+"""Type of a message, and its fields in a bag."""
 
 
-def joint_state(names: Sequence[str], stamp: int, **channels: Sequence[float]) -> tuple[str, dict[str, Any]]:
-    return JOINT_STATE, {"name": list(names), "stamp": stamp, "frame_id": "", **channels}
+def geometry(bag: Bag, kind: str, values: Sequence[float]) -> Any:
+    return bag.of(f"geometry_msgs/msg/{kind}", *map(float, values))
 
 
-def point(stamp: int, xyz: Sequence[float], frame: str = "camera_link") -> tuple[str, dict[str, Any]]:
-    return POINT, {"stamp": stamp, "frame_id": frame, "xyz": xyz}
+def joint_state(names: Sequence[str], stamp: int, **channels: Sequence[float]) -> Message:
+    arrays = {c: np.array(channels.get(c, []), dtype=float) for c in ("position", "velocity", "effort")}
+    return "sensor_msgs/msg/JointState", lambda bag: {"header": bag.header(stamp), "name": list(names), **arrays}
 
 
-def pose(stamp: int, xyz: Sequence[float], turn: Sequence[float] = QUARTER) -> tuple[str, dict[str, Any]]:
-    return POSE, {"stamp": stamp, "frame_id": "map", "xyz": xyz, "turn": turn}
+def point(stamp: int, xyz: Sequence[float], frame: str = "camera_link") -> Message:
+    return "geometry_msgs/msg/PointStamped", lambda bag: {
+        "header": bag.header(stamp, frame),
+        "point": geometry(bag, "Point", xyz),
+    }
 
 
-def frame(stamp: int, child: str, xyz: Sequence[float]) -> tuple[str, dict[str, Any]]:
-    return TREE, {"stamp": stamp, "frame_id": "map", "child": child, "xyz": xyz, "turn": QUARTER}
+def pose(stamp: int, xyz: Sequence[float], turn: Sequence[float] = QUARTER) -> Message:
+    def fields(bag: Bag) -> dict[str, Any]:
+        place = geometry(bag, "Point", xyz), geometry(bag, "Quaternion", turn)
+        return {"header": bag.header(stamp, "map"), "pose": bag.of("geometry_msgs/msg/Pose", *place)}
+
+    return "geometry_msgs/msg/PoseStamped", fields
 
 
-def note(text: str = "x") -> tuple[str, dict[str, Any]]:
-    return "std_msgs/msg/String", {"stamp": 0, "frame_id": "", "data": text}
+def frame(stamp: int, child: str, xyz: Sequence[float]) -> Message:
+    def fields(bag: Bag) -> dict[str, Any]:
+        place = geometry(bag, "Vector3", xyz), geometry(bag, "Quaternion", QUARTER)
+        transform = bag.of("geometry_msgs/msg/Transform", *place)
+        return {
+            "transforms": [bag.of("geometry_msgs/msg/TransformStamped", bag.header(stamp, "map"), child, transform)]
+        }
+
+    return "tf2_msgs/msg/TFMessage", fields
 
 
-Messages = Sequence[tuple[str, int, tuple[str, dict[str, Any]]]]
+def plain(data: Any = "x", kind: str = STRING) -> Message:
+    return kind, lambda bag: {"data": data}
+
+
+Messages = Sequence[tuple[str, int, Message]]
 
 
 def write_bag(folder: Path, kind: str, messages: Messages) -> Path:
-    """Write (topic, time of recording, message) triples as one of `FORMATS`."""
-    pytest.importorskip("rosbags", reason=NO_ROSBAGS)
-    from rosbags.rosbag1 import Writer as Writer1
-    from rosbags.rosbag2 import StoragePlugin
-    from rosbags.rosbag2 import Writer as Writer2
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
-    types: Any = store.types
-    path = folder / ("run.bag" if kind == "bag" else "run")
-    writer: Any
-    if kind == "bag":
-        writer = Writer1(path)
-    else:
-        plugin = StoragePlugin.MCAP if kind.startswith("mcap") else StoragePlugin.SQLITE3
-        writer = Writer2(path, version=9, storage_plugin=plugin)
-    with writer:
-        connections: dict[tuple[str, str], Any] = {}
-        for topic, logged, (msgtype, values) in messages:
-            if (topic, msgtype) not in connections:
-                connections[topic, msgtype] = writer.add_connection(topic, msgtype, typestore=store)
-            stamp = types["builtin_interfaces/msg/Time"](*divmod(values["stamp"], SECOND))
-            sequence = (0,) if kind == "bag" else ()
-            header = types["std_msgs/msg/Header"](*sequence, stamp=stamp, frame_id=values["frame_id"])
-            if msgtype == JOINT_STATE:
-                arrays = [np.array(values.get(c, []), dtype=float) for c in ("position", "velocity", "effort")]
-                message = types[JOINT_STATE](header, values["name"], *arrays)
-            elif msgtype == POINT:
-                message = types[POINT](header, types["geometry_msgs/msg/Point"](*map(float, values["xyz"])))
-            elif msgtype == POSE:
-                place = types["geometry_msgs/msg/Point"](*map(float, values["xyz"]))
-                turn = types["geometry_msgs/msg/Quaternion"](*map(float, values["turn"]))
-                message = types[POSE](header, types["geometry_msgs/msg/Pose"](place, turn))
-            elif msgtype == TREE:
-                place = types["geometry_msgs/msg/Vector3"](*map(float, values["xyz"]))
-                turn = types["geometry_msgs/msg/Quaternion"](*map(float, values["turn"]))
-                transform = types["geometry_msgs/msg/Transform"](place, turn)
-                stamped = types["geometry_msgs/msg/TransformStamped"](header, values["child"], transform)
-                message = types[TREE]([stamped])
-            elif msgtype == BOOL:
-                message = types[BOOL](bool(values["data"]))
-            else:
-                message = types[msgtype](values["data"])
-            serialize = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
-            writer.write(connections[topic, msgtype], logged, serialize(message, msgtype))
-    return path / f"run.{kind}" if kind in ("mcap", "db3") else path
+    """Write (topic, time of recording, message) triples as one of `BAG_KINDS`."""
+    with Bag(folder, kind) as bag:
+        for topic, logged, (msgtype, fields) in messages:
+            bag.put(topic, msgtype, logged, **fields(bag))
+    return bag.path
 
 
 def arm_and_camera() -> Messages:
-    messages: list[tuple[str, int, tuple[str, dict[str, Any]]]] = []
+    messages: list[tuple[str, int, Message]] = []
     for k in range(5):
         stamp = START + k * SECOND // 100
         values = {"position": [0.1 * k, 0.2 * k], "velocity": [1.0, 2.0], "effort": [math.nan, math.nan]}
@@ -111,11 +86,11 @@ def arm_and_camera() -> Messages:
     for k, topic in enumerate(("/seen/w_T1", "/seen/w_T2", "/seen/w_T1")):
         stamp = START + (k // 2) * SECOND // 50 + SECOND // 200
         messages.append((topic, stamp + 1000, point(stamp, (0.1 * k, 0.0, 1.0))))
-    messages.append(("/note", START, ("std_msgs/msg/String", {"stamp": 0, "frame_id": "", "data": "hello"})))
+    messages.append(("/note", START, plain("hello")))
     return messages
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", BAG_KINDS)
 def test_bag_round_trip(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, heard = write_bag(tmp_path, kind, arm_and_camera()), Heard()
     monkeypatch.setattr("yid_ocp.data.readers.bags._PROGRESS_INTERVAL", 3)
@@ -165,7 +140,7 @@ def test_bag_with_different_sets_of_joints(tmp_path: Path) -> None:
 
 def two_arms(rate: int = 200, effort: bool = True) -> Messages:
     """Left at 100 Hz, right at `rate` Hz from 5 ms on, its angle a straight line in time."""
-    messages: list[tuple[str, int, tuple[str, dict[str, Any]]]] = []
+    messages: list[tuple[str, int, Message]] = []
     for k in range(20):
         stamp = START + k * SECOND // 100
         more = {"effort": [1.0]} if effort else {}
@@ -235,8 +210,8 @@ def twelve_topics() -> Messages:
         messages.append(("/mocap/tip", stamp, point(stamp, (1.0, 0.0, 0.1 * k), "map")))
         messages.append(("/vrpn/hand/pose", stamp, pose(stamp, (0.5, 0.0, 0.1 * k))))
         messages.append(("/tf", stamp, frame(stamp, "middle", (0.0, 0.7, 0.1 * k))))
-        messages.append(("/gripper/closed", stamp, (BOOL, {"stamp": 0, "frame_id": "", "data": True})))
-    messages += [(f"/log/{name}", START, note()) for name in "abcdef"]
+        messages.append(("/gripper/closed", stamp, plain(True, BOOL)))
+    messages += [(f"/log/{name}", START, plain()) for name in "abcdef"]
     return messages
 
 
@@ -358,10 +333,7 @@ def test_bag_points_of_two_frames(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("messages", "expected"),
     [
-        (
-            [("/note", START, ("std_msgs/msg/String", {"stamp": 0, "frame_id": "", "data": "x"}))],
-            "no joint states and no",
-        ),
+        ([("/note", START, plain())], "no joint states and no"),
         ([("/j", START, joint_state(("a",), START, velocity=[1.0]))], "no positions"),
         ([("/j", START, joint_state(("a", "b"), START, position=[1.0]))], "1 values of 'position' for 2 joints"),
         (

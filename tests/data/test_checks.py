@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.data.channel_checks import quantization_step
+from yid_ocp.data.channel_checks import median_point_pair_distances
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_at_gaps
 from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.errors import DataError
 from yid_ocp.problem.options import SensorOptions
 
 NAMES = ("a", "b", "c")
@@ -66,17 +67,11 @@ def test_a_recording_without_a_fault_is_not_in_doubt(seed):
     assert causes(made(seed, rate=[50.0, 100.0, 500.0][seed % 3])) == set()
 
 
-def test_angles_that_count_in_steps_of_their_stated_noise_are_not_in_doubt():
-    recording, step = made(), 12**0.5 * STD
-    counted = changed(recording, position=step * np.rint(recording.joints.position / step), velocity=None)
-    assert causes(counted) == set()
-
-
-def test_a_joint_that_rests_on_one_step_of_its_encoder_is_not_stuck():
-    recording = made()
-    rest = column(recording.joints.position, 1, lambda x: 0 * x + 0.3)
-    still = column(recording.joints.velocity, 1, lambda v: 0 * v)
-    assert causes(changed(recording, position=rest, velocity=still, position_std=None)) == set()
+def test_steps_as_large_as_the_stated_noise_and_a_rest_on_one_of_them_are_not_in_doubt():
+    step = 12**0.5 * STD
+    assert causes(changed(RECORDING, position=step * np.rint(POSITION / step), velocity=None)) == set()
+    rest, still = column(POSITION, 1, lambda x: 0 * x + 0.3), column(VELOCITY, 1, lambda v: 0 * v)
+    assert causes(changed(RECORDING, position=rest, velocity=still, position_std=None)) == set()
 
 
 @pytest.mark.parametrize("step", [1e-4, 2 * np.pi / 4096])
@@ -178,15 +173,12 @@ def test_noise_stated_far_above_what_is_there():
     assert causes(changed(made(), effort_std=0.2)) == set()
 
 
-def test_noise_that_a_sensor_smooths_is_not_overstated():
+def test_what_a_sensor_smooths_is_computed_or_weighed_by_settings_is_not_overstated():
     recording = made(rate=1000.0)
     slow = np.random.default_rng(5).standard_normal((len(recording.joints.t) + 20, 3))
     slow = np.stack([np.convolve(x, np.full(21, 21**-0.5), "valid") for x in slow.T], axis=1)
     smooth = 5 * np.sin(recording.joints.t)[:, None] + 0.05 * slow
     assert causes(changed(recording, effort=smooth)) == set()
-
-
-def test_what_is_computed_or_weighed_by_settings_is_not_overstated():
     recording = changed(made(), effort_std=1.0)
     assert causes(recording) == {"noise_overstated"}
     assert causes(recording, joints_effort=SensorOptions(std=1.0)) == set()
@@ -224,13 +216,6 @@ def test_nothing_moves():
         replace(g, position=1 + 0 * g.position + 5e-3 * rng.standard_normal(g.position.shape)) for g in recording.points
     ]
     assert causes(replace(changed(recording, **rest), points=tuple(still))) == {"standstill"}
-
-
-def test_steps_of_a_channel():
-    rng = np.random.default_rng(0)
-    assert quantization_step(0.25 * rng.integers(-50, 50, 2000)) == pytest.approx(0.25)
-    assert quantization_step(rng.standard_normal(2000)) == 0.0
-    assert quantization_step(np.ones(100)) == 0.0
 
 
 def test_one_measurement_listed_twice_is_told_also_in_part():
@@ -320,3 +305,26 @@ def test_points_that_drive_a_model_may_be_hidden_for_a_while():
     recording = Recording(None, (PointGroup("points", ("p0", "p5"), t, seen),), name="cable")
     assert [len(p.points[0].t) for p in split_at_gaps(recording, ("p0",), True).recordings] == [200, 200]
     assert split_at_gaps(recording, ("p5",), True).issues == ()
+
+
+def stretched(lengths: list[float], name: str = "r") -> Recording:
+    """Two points that are so far apart in each frame."""
+    position = np.zeros((len(lengths), 2, 3))
+    position[:, 1, 0] = lengths
+    return Recording(points=(PointGroup("points", ("a", "b"), np.arange(len(lengths)), position),), name=name)
+
+
+def test_lengths_are_means_over_frames_and_medians_over_recordings() -> None:
+    recordings = [stretched([1.0, 2.0, np.nan]), stretched([5.0]), stretched([3.0, 3.0])]
+    assert median_point_pair_distances([("a", "b")], recordings) == {("a", "b"): 3.0}
+    assert median_point_pair_distances([("a", "b")], recordings[:1], frames=1) == {("a", "b"): 1.0}
+
+
+def test_a_recording_that_never_shows_an_edge_does_not_count() -> None:
+    hidden, seen = stretched([np.nan]), stretched([2.0])
+    assert median_point_pair_distances([("a", "b")], [hidden, seen]) == {("a", "b"): 2.0}
+    with pytest.raises(DataError, match="edge a to b is never seen"):
+        median_point_pair_distances([("a", "b")], [hidden])
+    with pytest.raises(DataError, match="point 'c' is not recorded") as caught:
+        median_point_pair_distances([("a", "c")], [stretched([4.0], "run")])
+    assert caught.value.where == "run"

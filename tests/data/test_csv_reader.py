@@ -2,14 +2,18 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any
 
 import numpy as np
 import pytest
 from recording_examples import joints_of, table
 
-from yid_ocp.data.readers import preview_file, read_any
+from yid_ocp.data import readers
+from yid_ocp.data.readers import READERS, preview_file, read_any
 from yid_ocp.data.readers.csv import read_csv
+from yid_ocp.data.recording import JointGroup, Recording, validate_recording
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
 
 
@@ -50,30 +54,30 @@ def test_csv_units_are_converted(tmp_path: Path) -> None:
         read_any(path, units={"t": "ms"})
 
 
-def test_csv_columns_given(tmp_path: Path) -> None:
+def test_csv_columns_given_chosen_and_renamed(tmp_path: Path) -> None:
     path = table(tmp_path, "stamp;angle;label;X;Y;Z\n0;0.1;start;1;2;3\n1;0.2;;4;5;6\n")
     columns = {"stamp": "t", "angle": "position:elbow", "label": "skip", "X": "x:tip", "Y": "y:tip", "Z": "z:tip"}
     recording = read_any(path, columns=columns, delimiter=";")
     assert recording.joint_names == ("elbow",)
     assert np.array_equal(recording.points[0].position[:, 0], [[1, 2, 3], [4, 5, 6]])
+    path = table(tmp_path, "t,q_a,q_b,m1_x,m1_y,m1_z,m2_x,m2_y,m2_z\n0,1,2,3,3,3,4,4,4\n")
+    recording = read_any(path, joints=["b=elbow"], points={"m2": "cable:100%"})
+    assert (recording.joint_names, recording.point_names) == (("elbow",), ("cable:100%",))
+    assert (joints_of(recording).position[0, 0], recording.points[0].position[0, 0, 0]) == (2, 4)
 
 
-def test_csv_two_clocks_in_one_table(tmp_path: Path) -> None:
-    recording = read_csv(table(tmp_path, "t,q_a,p_x,p_y,p_z\n0,1,,,\n1,2,1,1,1\n2,,2,2,2\n3,3,,,\n"))
+def test_csv_clocks_of_joints_and_points(tmp_path: Path) -> None:
+    # the first line tells Excel the delimiter
+    recording = read_csv(table(tmp_path, "sep=,\nt,q_a,p_x,p_y,p_z\n0,1,,,\n1,2,1,1,1\n2,,2,2,2\n3,3,,,\n"))
     assert np.array_equal(joints_of(recording).t, [0, 1, 3])
     assert np.array_equal(recording.points[0].t, [1, 2])
-
-
-def test_csv_of_points_keeps_frames_without_any(tmp_path: Path) -> None:
+    # of points alone frames without any stay
     recording = read_csv(table(tmp_path, "t,p_x,p_y,p_z\n0,1,1,1\n1,,,\n"))
     assert np.array_equal(recording.points[0].t, [0, 1])
     assert np.isnan(recording.points[0].position[1]).all()
-
-
-def test_joints_named_after_axes_are_not_points(tmp_path: Path) -> None:
+    # joints named after axes are no points
     recording = read_csv(table(tmp_path, "t,q_T1_x,q_T1_y,q_T1_z\n0,1,2,3\n"))
-    assert recording.joint_names == ("T1_x", "T1_y", "T1_z")
-    assert not recording.points
+    assert (recording.joint_names, recording.points) == (("T1_x", "T1_y", "T1_z"), ())
 
 
 GOOD = "t,q_a\n0,1\n"
@@ -115,12 +119,6 @@ def test_csv_errors(case: str, tmp_path: Path) -> None:
     assert hint in caught.value.hint
 
 
-def test_csv_errors_say_the_line(tmp_path: Path) -> None:
-    with pytest.raises(DataError) as caught:
-        read_csv(table(tmp_path, "t,q_a\n0,1\n\n1,fast\n"))
-    assert caught.value.where.endswith("line 4")
-
-
 def test_csv_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
@@ -130,12 +128,6 @@ def test_csv_that_is_no_text(tmp_path: Path) -> None:
         read_csv(tmp_path)
     with pytest.raises(DataError, match="no such file"):
         read_csv(tmp_path / "absent.csv")
-
-
-def test_a_line_for_excel_is_skipped(tmp_path: Path) -> None:
-    path = tmp_path / "run.csv"
-    path.write_text("sep=,\nt,q_a\n0,1\n1,2\n")
-    assert np.array_equal(joints_of(read_csv(path)).position[:, 0], [1, 2])
 
 
 def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monkeypatch):
@@ -153,7 +145,7 @@ def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monk
             read(file)
 
 
-def test_too_many_columns_are_refused_before_the_work(tmp_path: Path) -> None:
+def test_too_many_columns_and_a_line_without_end_are_refused_before_the_work(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_text(",".join(["t", *(f"q_{i}" for i in range(20_000))]) + "\n" + ",".join(["0"] * 20_001) + "\n")
     for read in (read_csv, preview_file):
@@ -161,10 +153,6 @@ def test_too_many_columns_are_refused_before_the_work(tmp_path: Path) -> None:
             read(path)
     path.write_text(",".join(["t", *(f"q_{i}" for i in range(4_999))]) + "\n" + ",".join(["0"] * 5_000) + "\n")
     assert len(read_csv(path).joint_names) == 4_999
-
-
-def test_a_line_without_end_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "run.csv"
     path.write_text("t,q_a\n" + "0," * 2_000_000)
     with pytest.raises(DataError, match="more than 1048576 characters"):
         read_csv(path)
@@ -209,22 +197,15 @@ def test_patterns_of_columns(tmp_path: Path) -> None:
 def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
     text = "t,q_a\n0,1\n1,fast\n2,3\n3,4,5\n4\n5,6\n6,7\n7,8\n"
     path = table(tmp_path, text)
-    with pytest.raises(DataError, match="'fast'"):
+    with pytest.raises(DataError, match="'fast'") as caught:
         read_csv(path)
+    assert caught.value.where.endswith("line 3")
     recording = read_any(path, skip_bad_lines=True)
     assert np.array_equal(joints_of(recording).t, [0, 2, 5, 6, 7])
     assert recording.notes == ("3 of 8 lines were bad and left out (line 3, 5, 6)",)
     mostly = table(tmp_path, "t,q_a\n0,1\n1,fast\n2,slow\n")
     with pytest.raises(DataError, match="2 of 3 lines are no rows of 2 numbers"):
         read_any(mostly, skip_bad_lines=True)
-
-
-def test_joints_and_points_are_chosen_and_renamed(tmp_path: Path) -> None:
-    path = table(tmp_path, "t,q_a,q_b,m1_x,m1_y,m1_z,m2_x,m2_y,m2_z\n0,1,2,3,3,3,4,4,4\n")
-    recording = read_any(path, joints=["b=elbow"], points={"m2": "cable:100%"})
-    assert (recording.joint_names, recording.point_names) == (("elbow",), ("cable:100%",))
-    assert joints_of(recording).position[0, 0] == 2
-    assert recording.points[0].position[0, 0, 0] == 4
 
 
 @pytest.mark.parametrize(
@@ -263,13 +244,11 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
         "# a pause\n0.02, 0.5, 0.6, 3, 4, 0.7, 0.8\n",
         encoding="utf-8",
     )
-    joints = read_any(path, joints=["1=shoulder", "2=elbow"]).joints
-    assert joints is not None
+    joints = joints_of(read_any(path, joints=["1=shoulder", "2=elbow"]))
     assert joints.names == ("shoulder", "elbow")
     np.testing.assert_array_equal(joints.t, [0.0, 0.02])
-    np.testing.assert_array_equal(joints.position, [[0.1, 0.2], [0.5, 0.6]])
-    np.testing.assert_array_equal(joints.velocity, [[1, 2], [3, 4]])
-    np.testing.assert_array_equal(joints.position_command, [[0.3, 0.4], [0.7, 0.8]])
+    values = {"position": [[0.1, 0.2], [0.5, 0.6]], "velocity": [[1, 2], [3, 4]]}
+    np.testing.assert_equal(joints.channels, {**values, "position_command": [[0.3, 0.4], [0.7, 0.8]]})
     contents = preview_file(path)
     assert "columns" not in contents.reader_options
     assert [source.imported_as for source in contents.sources][:4] == ["t", "position:1", "position:2", "velocity:1"]
@@ -277,3 +256,50 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
     path.write_text("t,q0\n0,1\n1,2\n", encoding="utf-8")
     with pytest.raises(DataError, match="meaning of column 'q0' is not known"):
         read_csv(path)
+
+
+SHARED = Path(__file__).parents[2].parent / "shared" / "recordings"
+
+
+# ------------------------------------------------------------------------------------------------------- any format
+
+
+def test_read_any_chooses_by_suffix(tmp_path: Path) -> None:
+    recording = read_any(table(tmp_path, "t,q_a\n0,1\n", "RUN.CSV"), units={"position": "deg"})
+    assert joints_of(recording).position[0, 0] == pytest.approx(math.pi / 180)
+    write_recording(recording, tmp_path / "run.h5")
+    assert joints_of(read_any(tmp_path / "run.h5", allow_nan_effort=True)).names == ("a",)
+
+
+def test_read_any_refuses_what_it_does_not_know(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no reader for '\.csvv'") as caught:
+        read_any(tmp_path / "run.csvv")
+    assert caught.value.hint == "did you mean '.csv'?"
+    assert ".mcap" in caught.value.allowed
+    with pytest.raises(DataError, match="no option 'unit'") as caught:
+        read_any(table(tmp_path, "t,q_a\n0,1\n"), unit={})
+    assert caught.value.hint == "did you mean 'units'?"
+
+
+def test_every_file_of_the_folder_registers_a_format() -> None:
+    files = {entry.name for entry in iter_modules(readers.__path__)} - {"base"}
+    registered = {READERS[name].__module__.rpartition(".")[2] for name in READERS}
+    assert files == registered - {"recording_hdf5"}
+
+
+def test_a_new_reader_is_one_registration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(READERS, "_entries", dict(READERS._entries))
+
+    @READERS.register(".one")
+    def read_one(path: Path, *, value: float = 1.0) -> Recording:
+        return validate_recording(Recording(JointGroup(("a",), np.zeros(1), np.full((1, 1), value)), name=path.stem))
+
+    assert joints_of(read_any(tmp_path / "run.one", value=2.0)).position[0, 0] == 2.0
+
+
+@pytest.mark.skipif(
+    not (SHARED / "deft").is_dir(), reason="the real recordings are not here (shared/recordings beside the project)"
+)
+def test_a_real_table_that_is_no_recording_is_refused() -> None:
+    with pytest.raises(DataError, match="meaning of column 'point'"):
+        read_any(SHARED / "deft" / "bdlo1_undeformed.csv")

@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
+import signal
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,8 +17,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from recording_examples import assert_same, changed, example, finite, turned, with_joints
 
+from yid_ocp.data import recording_hdf5
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validate_recording
-from yid_ocp.data.recording_hdf5 import read_recording, write_recording
+from yid_ocp.data.recording_hdf5 import create_hdf5_atomically, open_checked_hdf5, read_recording, write_recording
 from yid_ocp.errors import DataError, OutputError
 
 ROOT = Path(__file__).parents[2]
@@ -81,15 +83,9 @@ def recordings(draw: st.DrawFn) -> Recording:
             channels[channel] = draw(hnp.arrays(float, shape, elements=finite(bound)))
         std = st.none() | st.floats(0, 1e9) | hnp.arrays(float, shape[1], elements=st.floats(0, 1e9))
         kinds = st.sampled_from([None, "sample", "mean", "command"])
-        joints = JointGroup(
-            joint_names,
-            t,
-            **channels,
-            effort_std=draw(std),
-            effort_bias_std=draw(std),
-            effort_kind=draw(kinds),
-            clock=draw(st.sampled_from(["recorded", "nominal"])),
-        )
+        own: dict[str, Any] = {"effort_std": draw(std), "effort_bias_std": draw(std), "effort_kind": draw(kinds)}
+        clocks = st.sampled_from(["recorded", "nominal"])
+        joints = JointGroup(joint_names, t, **channels, **own, clock=draw(clocks))
     suffixes = draw(st.sets(st.sampled_from(["", "_camera", "_arm", "_\u00e9 2"]), min_size=0 if joints else 1))
     points = []
     for suffix in sorted(suffixes):
@@ -125,14 +121,11 @@ def test_nan_effort_is_written_and_read_on_request(tmp_path: Path) -> None:
     assert_same(read_recording(tmp_path / "run.h5", allow_nan_effort=True), recording)
 
 
-def test_missing_file_and_folder(tmp_path: Path) -> None:
+def test_files_that_are_none(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
         read_recording(tmp_path / "absent.h5")
     with pytest.raises(DataError, match="not an HDF5 file"):
         read_recording(tmp_path)
-
-
-def test_other_contents(tmp_path: Path) -> None:
     for contents in (b"", b"t,q_a\n0,1\n"):
         (tmp_path / "run.h5").write_bytes(contents)
         with pytest.raises(DataError, match="not an HDF5 file"):
@@ -187,25 +180,13 @@ MALFORMED: dict[str, tuple[Callable[[h5py.File], object], str, str]] = {
     "names no text": (lambda f: set_names(f, [1, 2]), "found 1", ""),
     "names empty": (lambda f: set_names(f, h5py.Empty("S1")), "cannot be used", ""),
     "clock": (lambda f: f["joints"].attrs.modify("clock", "wall"), "the clock is 'wall'", ""),
-    "kind of effort": (
-        lambda f: f["joints"].attrs.modify("effort_kind", "average"),
-        "'average'",
-        "leave the attribute",
-    ),
+    "kind of effort": (lambda f: f["joints"].attrs.modify("effort_kind", "mean of"), "'mean of'", "leave the"),
     "kind no text": (lambda f: f["joints"].attrs.create("effort_kind", 2.0), "found", ""),
     "unit of position": (lambda f: f["joints/position"].attrs.modify("unit", "deg"), "'deg'", "never converted"),
-    "unit of points": (
-        lambda f: f["points_arm/position"].attrs.modify("unit", "mm"),
-        "'mm'",
-        "convert the values to m:",
-    ),
+    "unit of points": (lambda f: f["points_arm/position"].attrs.modify("unit", "mm"), "'mm'", "convert the values"),
     "unit of t": (lambda f: f["joints/t"].attrs.modify("unit", "ms"), "'ms'", "convert the values to s:"),
     "group for dataset": (lambda f: [f["joints"].pop("effort"), f.create_group("joints/effort")], "not a dataset", ""),
-    "text for numbers": (
-        lambda f: [f["joints"].pop("effort"), f["joints"].create_dataset("effort", data=b"many")],
-        "not a dataset of real numbers",
-        "",
-    ),
+    "text for numbers": (lambda f: f.create_dataset("points_arm/std", data=b"many"), "not a dataset of real", ""),
     "std twice": (lambda f: f["points_camera"].attrs.create("std", 1.0), "both a dataset and an attribute", ""),
     "std no number": (lambda f: f["joints"].attrs.create("position_std", "small"), "not an array of real", ""),
     "truth no JSON": (lambda f: f.attrs.modify("truth", "T1.bend = 3"), "not JSON", ""),
@@ -259,26 +240,7 @@ def test_files_of_other_tools(file: Path) -> None:
     assert (arm.std[0, 0, 0], camera.std.shape) == (0.03, (4, 3, 3))
 
 
-# -------------------------------------------------------------------------------------------------------- writing
-
-
-def test_unwritable_places(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    for path in (tmp_path / "absent" / "run.h5", tmp_path / "file" / "run.h5"):
-        with pytest.raises(OutputError, match="folder to write to does not exist"):
-            write_recording(example(), path)
-    with pytest.raises(OutputError, match="that of a folder"):
-        write_recording(example(), tmp_path)
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="the superuser may write everywhere")
-def test_a_folder_without_permission(tmp_path: Path) -> None:
-    tmp_path.chmod(0o500)
-    with pytest.raises(OutputError, match="Permission denied"):
-        write_recording(example(), tmp_path / "run.h5")
-
-
-def test_a_failure_leaves_the_old_file_alone(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_that_cannot_be_written_leaves_the_old_one(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = file.read_bytes()
 
     def refuse(source: object, target: object) -> None:
@@ -296,25 +258,10 @@ REAL_SIZES = {"baxter": (7, 0), "deft": (0, 20), "double_pendulum": (2, 0), "pan
 REAL_SIZES["servo_pendulum"] = (1, 0)
 
 
-@pytest.mark.skipif(
-    not REAL_FILES, reason="the real recordings are not here (folder shared/recordings beside the project)"
-)
-def test_the_real_recordings_are_all_there() -> None:
+@pytest.mark.skipif(not REAL_FILES, reason="the real recordings are not here (shared/recordings beside the project)")
+@pytest.mark.parametrize("path", REAL_FILES or [Path()], ids=lambda path: path.stem)
+def test_real_recordings_are_all_there_and_read(path: Path, tmp_path: Path) -> None:
     assert {path.parent.name for path in REAL_FILES} == set(REAL_SIZES)
-
-
-@pytest.mark.parametrize(
-    "path",
-    REAL_FILES
-    or [
-        pytest.param(
-            Path(),
-            marks=pytest.mark.skip(reason="the real recordings are not here (shared/recordings beside the project)"),
-        )
-    ],
-    ids=lambda path: path.stem,
-)
-def test_real_recordings_read(path: Path, tmp_path: Path) -> None:
     recording = read_recording(path)
     assert (len(recording.joint_names), len(recording.point_names)) == REAL_SIZES[path.parent.name]
     assert (recording.marker_reference_pose is not None) == (path.parent.name == "soft_beam")
@@ -322,3 +269,102 @@ def test_real_recordings_read(path: Path, tmp_path: Path) -> None:
     assert recording.source
     write_recording(recording, tmp_path / "copy.h5")
     assert_same(read_recording(tmp_path / "copy.h5"), recording)
+
+
+needs_fork = pytest.mark.skipif(not hasattr(os, "fork"), reason="files are tried in forks")
+
+
+@pytest.fixture
+def plain_file(tmp_path):
+    path = tmp_path / "file.h5"
+    with create_hdf5_atomically(path) as new:
+        new.attrs["format"] = "test"
+        new.create_dataset("a/values", data=np.arange(3.0))
+    return path
+
+
+def test_what_was_written_is_read(plain_file):
+    with open_checked_hdf5(plain_file) as data:
+        assert data.attrs["format"] == "test"
+        np.testing.assert_array_equal(data["a/values"], [0.0, 1.0, 2.0])
+    assert [path.name for path in plain_file.parent.iterdir()] == ["file.h5"]
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no device without room")
+def test_a_full_disk_is_an_error_and_not_the_end(tmp_path, monkeypatch):
+    """The library would write when it closes the file, and end the process when it cannot."""
+    monkeypatch.setattr("yid_ocp.files.secrets.token_hex", lambda _: "x")
+    (tmp_path / ".full.h5.x.tmp").symlink_to("/dev/full")
+    with pytest.raises(OutputError, match="No space left"), create_hdf5_atomically(tmp_path / "full.h5") as new:
+        new.create_dataset("a", data=np.zeros(1000))
+    assert not (tmp_path / "full.h5").exists()
+
+
+@needs_fork
+@pytest.mark.parametrize("kind", ["external link", "external values", "virtual"])
+def test_other_files_are_not_read(plain_file, tmp_path, kind):
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as new, h5py.File(plain_file, "a") as data:
+        new.create_dataset("secret", data=[1.0])
+        if kind == "external link":
+            data["a/more"] = h5py.ExternalLink("other.h5", "secret")
+        elif kind == "external values":
+            data["a"].create_dataset("more", (1,), "f8", external=[(str(other), 0, 8)])
+        else:
+            layout = h5py.VirtualLayout((1,), "f8")
+            layout[:] = h5py.VirtualSource(other, "secret", (1,))
+            data["a"].create_virtual_dataset("more", layout)
+    with pytest.raises(DataError, match=r"'more'.*another file"), open_checked_hdf5(plain_file):
+        pass
+
+
+@needs_fork
+def test_groups_without_end_are_refused(plain_file):
+    with h5py.File(plain_file, "a") as data:
+        data["a/self"] = data["a"]
+    with pytest.raises(DataError, match="stand in one another"), open_checked_hdf5(plain_file):
+        pass
+
+
+@needs_fork
+def test_a_small_file_that_unpacks_to_more_than_fits_is_refused(tmp_path):
+    """Its bytes are few and its numbers of one byte each; as float64 with copies they are 27 GB."""
+    with h5py.File(tmp_path / "bomb.h5", "w") as data:
+        data.create_dataset("joints/position", (120_000_000, 7), "i1", chunks=(1 << 20, 7), compression="gzip")
+    assert (tmp_path / "bomb.h5").stat().st_size < 100_000
+    with pytest.raises(DataError, match="declares 840 million numbers"), open_checked_hdf5(tmp_path / "bomb.h5"):
+        pass
+
+
+@needs_fork
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="no /proc")
+def test_the_trial_has_a_limit_on_its_memory(plain_file):
+    def greedy(path):
+        return f"took {len(bytearray(4 << 30))} bytes"
+
+    with pytest.raises(DataError, match="ends the HDF5 library") as caught:
+        recording_hdf5.check_readable_in_fork(plain_file, greedy, "HDF5")
+    assert "took" not in caught.value.what
+
+
+@needs_fork
+def test_what_is_declared_but_not_there_is_refused(plain_file):
+    with h5py.File(plain_file, "a") as data:
+        data.create_dataset("huge", (10**9,), "f8", chunks=(1000,))
+    with pytest.raises(DataError, match="declares 1000 million numbers"), open_checked_hdf5(plain_file):
+        pass
+
+
+@needs_fork
+def test_a_file_that_ends_the_library_does_not_end_us(plain_file, monkeypatch):
+    monkeypatch.setattr(recording_hdf5, "_foreign", lambda group: os.kill(os.getpid(), signal.SIGSEGV))
+    with pytest.raises(DataError, match="SIGSEGV"), open_checked_hdf5(plain_file):
+        pass
+
+
+@needs_fork
+def test_a_file_that_never_ends_is_given_up(plain_file, monkeypatch):
+    monkeypatch.setattr(recording_hdf5, "_READ_TIMEOUT", 0.3)
+    monkeypatch.setattr(recording_hdf5, "_foreign", lambda group: signal.pause())
+    with pytest.raises(DataError, match=r"within 0\.3 s"), open_checked_hdf5(plain_file):
+        pass

@@ -11,29 +11,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from yid_ocp import vision
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import DataError
 from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import System
-from yid_ocp.vision import (
-    CameraCalibrationOptions,
-    CameraScene,
-    DepthCamera,
-    FrameTiming,
-    TrackOptions,
-    VirtualCamera,
-    look_at_pose,
-    read_frames,
-    render_virtual_frames,
-    track_object,
-)
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frames import CameraIntrinsics, import_open3d
 
 DATA = Path(__file__).parent / "data"
 TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T3.bend": 11.5, "T3.twist": 9.7}
-POSE = look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
+POSE = vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -85,7 +74,7 @@ def recording(system, run):
 
 
 # a quarter of an Xtion's pixels, each as good: a test has four times as many frames in the time
-COARSE = DepthCamera(
+COARSE = vision.DepthCamera(
     CameraIntrinsics.from_field_of_view(320, 240, math.radians(58.0)), disparity_std=1 / 32, disparity_step=1 / 16
 )
 
@@ -98,13 +87,15 @@ def tracked(system, run, recording, shape):
     """
 
     def make(outliers=0.0, seed=0, late=(), **timing):
-        when = FrameTiming(mean_rate=3.0, latency=0.06, **timing)
-        scene = CameraScene(system, "package:baxter")
-        camera = VirtualCamera(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
-        made = render_virtual_frames(scene, run.t, run.q, camera)
-        options = TrackOptions(calibration=CameraCalibrationOptions(n_frames=5), tracked_points=system.point_frames)
+        when = vision.FrameTiming(mean_rate=3.0, latency=0.06, **timing)
+        scene = vision.CameraScene(system, "package:baxter")
+        camera = vision.VirtualCamera(POSE, replace(COARSE, outlier_probability=outliers), when, seed=seed)
+        made = vision.render_virtual_frames(scene, run.t, run.q, camera)
+        options = vision.TrackOptions(
+            calibration=vision.CameraCalibrationOptions(n_frames=5), tracked_points=system.point_frames
+        )
         made.sequence.stamps[list(late)] += 0.15
-        found = track_object(scene, recording, made.sequence, options)
+        found = vision.track_object(scene, recording, made.sequence, options)
         were = np.array([shape.points_at(made.true_configuration_at(t)) for t in found.t])
         errors = np.linalg.norm(found.position - were, axis=2)
         return SimpleNamespace(made=made, track=found, errors=errors)
@@ -123,8 +114,8 @@ def small(system):
     truth = json.loads((DATA / "truth.json").read_text())
     assert tuple(truth["points"]) == system.point_frames
     return SimpleNamespace(
-        sequence=read_frames(DATA / "frames"),
+        sequence=vision.read_frames(DATA / "frames"),
         recording=read_recording(DATA / "joints.h5"),
         truth=np.array(truth["position"]),
-        clouds=[read_frames(DATA / "frames").load_cloud(i) for i in range(3)],
+        clouds=[vision.read_frames(DATA / "frames").load_cloud(i) for i in range(3)],
     )

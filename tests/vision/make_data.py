@@ -10,21 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from yid_ocp import vision
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
-from yid_ocp.vision import (
-    CameraScene,
-    CloudFilterOptions,
-    FrameSequence,
-    FrameTiming,
-    VirtualCamera,
-    look_at_pose,
-    render_virtual_frames,
-    write_frame_folder,
-)
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.point_cloud import ReachableObjectRegion, is_statistical_inlier, voxel_averages
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
@@ -42,11 +33,13 @@ def main() -> None:
     run = simulate_in_mujoco(
         system, None, motion, SimulationOptions(1.5, time_step=2.5e-4), initial_joint_angles=posture
     )
-    camera = VirtualCamera(look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=FrameTiming(mean_rate=2.7), seed=5)
-    made = render_virtual_frames(CameraScene(system, "package:baxter"), run.t, run.q, camera)
+    camera = vision.VirtualCamera(
+        vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=vision.FrameTiming(mean_rate=2.7), seed=5
+    )
+    made = vision.render_virtual_frames(vision.CameraScene(system, "package:baxter"), run.t, run.q, camera)
     tree = system.numeric_mechanism()
     robot = ArticulatedSurfaces(tree, load_robot_meshes("package:baxter", tree))
-    region = ReachableObjectRegion(system, CloudFilterOptions())
+    region = ReachableObjectRegion(system, vision.CloudFilterOptions())
     pose, clouds = made.sequence.camera_pose, []
     true = [made.true_configuration_at(t) for t in made.capture_times]
     for i, q in enumerate(true):
@@ -55,7 +48,7 @@ def main() -> None:
         cloud = cloud.select(is_statistical_inlier(cloud, 12, 4.0))
         cloud = cloud.select(~robot.is_within_surface_distance(cloud.points, q, 0.03))
         clouds.append((cloud.points - pose[:3, 3]) @ pose[:3, :3])
-    write_frame_folder(FrameSequence.from_clouds(made.capture_times, clouds, pose), FOLDER / "frames")
+    vision.write_frame_folder(vision.FrameSequence.from_clouds(made.capture_times, clouds, pose), FOLDER / "frames")
     names = system.driven
     every = slice(None, None, 2)
     joints = JointGroup(names, run.t[every], np.round(run.q[every, : len(names)], 6), position_std=2e-4)

@@ -12,27 +12,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from yid_ocp import vision
 from yid_ocp.model.rotations import homogeneous_transform
-from yid_ocp.vision import (
-    CameraIntrinsics,
-    CameraScene,
-    CloudFilterOptions,
-    FrameSequence,
-    TrackOptions,
-    look_at_pose,
-    track_object,
-)
 from yid_ocp.vision.frames import import_open3d
 from yid_ocp.vision.surface_meshes import TriangleMesh
 
-PINHOLE = CameraIntrinsics.from_field_of_view(320, 240, np.radians(50.0))
+PINHOLE = vision.CameraIntrinsics.from_field_of_view(320, 240, np.radians(50.0))
 EYE, TARGET = (2.6, 0.0, 0.3), (0.85, 0.0, -0.15)
 FOOT = np.array([0.85, 0.0, -0.93])
 LEAN = np.radians(45.0)
 Y_LENGTHS = {"T1": 0.813, "T2": 0.610, "T3": 0.737}
 Y_RADII = {"T1": 0.032, "T2": 0.025, "T3": 0.019}
 NOISE = 0.006  # [m] at 2 m
-COARSE = CloudFilterOptions(voxel_size=0.014)  # a third of the points, where radii do not matter
+COARSE = vision.CloudFilterOptions(voxel_size=0.014)  # a third of the points, where radii do not matter
 
 
 def arc(start, direction, length, curvature, count=60):
@@ -105,7 +97,7 @@ def swaying(k, size=0.35):
 def seen(meshes: Sequence[TriangleMesh], seed, *, pose=None, pinhole=PINHOLE, noise=NOISE, flying=0.3):
     """Cloud of meshes in the camera's frame, shape (N, 3)."""
     o3d = import_open3d()
-    camera = look_at_pose(EYE, TARGET) if pose is None else pose
+    camera = vision.look_at_pose(EYE, TARGET) if pose is None else pose
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     mesh = TriangleMesh.concatenate(list(meshes))
     corners, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
@@ -130,20 +122,20 @@ def floor_and_wall():
 
 def filmed(object_: SmoothY, frames, things=lambda k: [], *, seed=0, rate=4.0, background=True, still=None):
     """A sequence with its truth: tips of every frame, each (3, 3) in the order w_T1, w_T2, w_T3 [m]."""
-    pose = look_at_pose(EYE, TARGET)
+    pose = vision.look_at_pose(EYE, TARGET)
     clouds, truth = [], []
     for k in range(frames):
         meshes, tips = object_.rods(swaying(k) if still is None else still)
         around = floor_and_wall() if background else []
         clouds.append(seen([*meshes, *around, *things(k)], [seed, k]))
         truth.append([tips[name] for name in ("w_T1", "w_T2", "w_T3")])
-    return FrameSequence.from_clouds(np.arange(frames) / rate, clouds, pose), np.array(truth)
+    return vision.FrameSequence.from_clouds(np.arange(frames) / rate, clouds, pose), np.array(truth)
 
 
 def measured(alone, sequence, truth, extra=(), empty=None, **options):
     """A track of a filmed sequence, and its errors [m]."""
-    chosen = TrackOptions(tracked_points=alone.point_frames, **options)
-    found = track_object(CameraScene(alone, extra_meshes=extra), None, sequence, chosen, empty=empty)
+    chosen = vision.TrackOptions(tracked_points=alone.point_frames, **options)
+    found = vision.track_object(vision.CameraScene(alone, extra_meshes=extra), None, sequence, chosen, empty=empty)
     good = [frame.index for frame in found.frame_reports if frame.is_good]
     order = [("w_T1", "w_T2", "w_T3").index(name) for name in found.point_names]
     return found, found.position - truth[good][:, order]

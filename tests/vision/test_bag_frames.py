@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ros_bags import START, Bag
 
 from yid_ocp.errors import DataError
 from yid_ocp.vision import CameraIntrinsics, look_at_pose, read_frames
 
-rosbags = pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'yid-ocp[bags]'")
-from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
-from rosbags.rosbag2 import StoragePlugin  # noqa: E402
-from rosbags.rosbag2 import Writer as Writer2  # noqa: E402
-from rosbags.typesys import Stores, get_typestore  # noqa: E402
-
 POSE = look_at_pose([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
-START = 1_700_000_000 * 10**9
 CLOUDS = [np.random.default_rng(i).uniform(0.5, 2.0, (5 + i, 3)).astype(np.float32) for i in range(3)]
 COLOURS = [np.random.default_rng(i).integers(0, 256, (5 + i, 3)).astype(np.uint8) for i in range(3)]
 DEPTH = np.arange(1200, 1200 + 6 * 8, dtype=np.uint16).reshape(6, 8)
@@ -23,50 +17,21 @@ DEPTH[0, :2] = 0
 LENS = CameraIntrinsics(8, 6, 10.0, 11.0, 3.5, 2.5, "plumb_bob", (-0.2, 0.05, 1e-3, -1e-3, 0.0))
 STAMPS = (0.3, 0.1, 0.2)
 """Since the first joint states [s]; messages come out of order."""
-KINDS = ("ros1", "ros2", "mcap")
+KINDS = ("bag", "db3 folder", "mcap folder")
 UNSTAMPED = object()
 
 
-class Bag:
-    """A bag in the making, of any kind."""
+class Film(Bag):
+    """A bag with what a camera and an arm publish; times are in seconds after the start."""
 
-    def __init__(self, folder, kind, big=False):
-        self.kind, self.big = kind, big
-        self.store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
-        self.path = folder / ("film.bag" if kind == "ros1" else f"film_{kind}")
-        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        self.writer = Writer1(self.path) if kind == "ros1" else Writer2(self.path, version=9, storage_plugin=plugin)
-        self.connections, self.log = {}, START
-
-    def __enter__(self):
-        self.writer.open()
-        return self
-
-    def __exit__(self, *error):
-        self.writer.close()
-
-    def put(self, topic, kind, seconds=None, **fields):
-        """Write a message, with a header where a time is given."""
-        if seconds is not None:
-            stamp = self.of(
-                "builtin_interfaces/msg/Time",
-                *divmod(0 if seconds is UNSTAMPED else START + round(1e9 * seconds), 10**9),
-            )
-            sequence = (0,) if self.kind == "ros1" else ()
-            fields["header"] = self.of("std_msgs/msg/Header", *sequence, stamp=stamp, frame_id="camera")
-        if topic not in self.connections:
-            self.connections[topic] = self.writer.add_connection(topic, kind, typestore=self.store)
-        pack = self.store.serialize_ros1 if self.kind == "ros1" else self.store.serialize_cdr
-        self.log += 10**6
-        self.writer.write(self.connections[topic], self.log, bytes(pack(self.of(kind, **fields), kind)))
-
-    def of(self, kind, *values, **fields):
-        return self.store.types[kind](*values, **fields)
+    def at(self, topic, kind, seconds, **fields):
+        stamp = 0 if seconds is UNSTAMPED else START + round(1e9 * seconds)
+        self.put(topic, kind, header=self.header(stamp), **fields)
 
     def joints(self, seconds):
         empty = np.zeros(0)
         fields = {"name": ["a"], "position": np.zeros(1), "velocity": empty, "effort": empty}
-        self.put("/joint_states", "sensor_msgs/msg/JointState", seconds, **fields)
+        self.at("/joint_states", "sensor_msgs/msg/JointState", seconds, **fields)
 
     def cloud(self, seconds, points, colours=None, topic="/camera/points", names="xyz"):
         order = ">" if self.big else "<"
@@ -84,7 +49,7 @@ class Bag:
         layout = {"height": 1, "width": len(rows), "point_step": size, "row_step": size * len(rows), "is_dense": False}
         data = np.frombuffer(rows.tobytes(), np.uint8)
         kind = "sensor_msgs/msg/PointCloud2"
-        self.put(topic, kind, seconds, **layout, fields=fields, is_bigendian=self.big, data=data)
+        self.at(topic, kind, seconds, **layout, fields=fields, is_bigendian=self.big, data=data)
 
     def image(self, seconds, image, encoding, topic="/camera/depth/image_raw"):
         padded = np.zeros((image.shape[0], image.shape[1] + 1), image.dtype)  # rows may be longer than the picture
@@ -92,25 +57,25 @@ class Bag:
         packed = padded.astype(padded.dtype.newbyteorder(">" if self.big else "<"))
         layout = {"height": image.shape[0], "width": image.shape[1], "step": packed.strides[0], "encoding": encoding}
         data = np.frombuffer(packed.tobytes(), np.uint8)
-        self.put(topic, "sensor_msgs/msg/Image", seconds, **layout, is_bigendian=int(self.big), data=data)
+        self.at(topic, "sensor_msgs/msg/Image", seconds, **layout, is_bigendian=int(self.big), data=data)
 
     def info(self, lens=LENS, topic="/camera/depth/camera_info", model=None):
         matrix = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1])
         own = np.array([2 * lens.fx, 0, lens.cx, 0, 0, 2 * lens.fy, lens.cy, 0, 0, 0, 1, 0])
         names = {"k": matrix, "d": np.array(lens.coefficients), "r": np.eye(3).ravel(), "p": own}
-        if self.kind == "ros1":
+        if self.ros1:
             names = {key.upper(): value for key, value in names.items()}
         nothing = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
         region = self.of("sensor_msgs/msg/RegionOfInterest", **nothing)
         more = {"height": lens.height, "width": lens.width, "binning_x": 0, "binning_y": 0, "roi": region}
         kind = "sensor_msgs/msg/CameraInfo"
-        self.put(topic, kind, 0.0, distortion_model=model or lens.model, **names, **more)
+        self.at(topic, kind, 0.0, distortion_model=model or lens.model, **names, **more)
 
 
 @pytest.mark.parametrize("big", [False, True])
 @pytest.mark.parametrize("kind", KINDS)
 def test_clouds(tmp_path, kind, big):
-    with Bag(tmp_path, kind, big) as bag:
+    with Film(tmp_path, kind, big) as bag:
         bag.joints(0.0)
         for stamp, cloud, colours in zip(STAMPS, CLOUDS, COLOURS, strict=True):
             bag.cloud(stamp, cloud, colours)
@@ -126,7 +91,7 @@ def test_clouds(tmp_path, kind, big):
 @pytest.mark.parametrize("kind", KINDS)
 def test_depth_images_with_the_lens_of_the_camera(tmp_path, kind, encoding):
     image = DEPTH if encoding == "16UC1" else (1e-3 * DEPTH).astype(np.float32)
-    with Bag(tmp_path, kind) as bag:
+    with Film(tmp_path, kind) as bag:
         bag.info()
         bag.info(CameraIntrinsics(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/camera/colour/camera_info")
         bag.image(0.5, image, encoding)
@@ -140,7 +105,7 @@ def test_depth_images_with_the_lens_of_the_camera(tmp_path, kind, encoding):
 
 
 def test_rectified_images_have_no_distortion(tmp_path):
-    with Bag(tmp_path, "ros2") as bag:
+    with Film(tmp_path, "db3 folder") as bag:
         bag.info()
         bag.image(0.0, DEPTH, "16UC1", topic="/camera/depth/image_rect")
     lens = read_frames(bag.path, pose=POSE).intrinsics
@@ -150,7 +115,7 @@ def test_rectified_images_have_no_distortion(tmp_path):
 def test_a_file_of_a_realsense_camera(tmp_path):
     """Its topics, its encoding and its unit, as librealsense writes them."""
     sensor = "/device_0/sensor_0"
-    with Bag(tmp_path, "ros1") as bag:
+    with Film(tmp_path, "bag") as bag:
         bag.info(topic=f"{sensor}/Depth_0/info/camera_info")
         bag.info(CameraIntrinsics(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/device_0/sensor_1/Color_0/info/camera_info")
         bag.put(f"{sensor}/option/Depth_Units/value", "std_msgs/msg/Float32", data=1e-4)
@@ -161,7 +126,7 @@ def test_a_file_of_a_realsense_camera(tmp_path):
 
 
 def test_messages_without_stamps_have_the_time_of_recording(tmp_path):
-    with Bag(tmp_path, "ros2") as bag:
+    with Film(tmp_path, "db3 folder") as bag:
         bag.info()
         bag.image(0.7, DEPTH, "16UC1")
         bag.image(UNSTAMPED, DEPTH, "16UC1")
@@ -169,7 +134,7 @@ def test_messages_without_stamps_have_the_time_of_recording(tmp_path):
 
 
 def test_messages_of_one_time_are_told_apart(tmp_path):
-    with Bag(tmp_path, "ros2") as bag:
+    with Film(tmp_path, "db3 folder") as bag:
         for stamp, cloud in zip(STAMPS, CLOUDS, strict=True):
             bag.log = START
             bag.cloud(stamp, cloud)
@@ -195,14 +160,14 @@ def test_messages_of_one_time_are_told_apart(tmp_path):
     ],
 )
 def test_what_a_bag_lacks_is_said(tmp_path, fill, options, message):
-    with Bag(tmp_path, "ros2") as bag:
+    with Film(tmp_path, "db3 folder") as bag:
         fill(bag)
     with pytest.raises(DataError, match=message):
         read_frames(bag.path, **{"pose": POSE, **options})
 
 
 def test_a_cloud_without_places_and_a_cut_off_one_are_bad_frames(tmp_path):
-    with Bag(tmp_path, "ros2") as bag:
+    with Film(tmp_path, "db3 folder") as bag:
         bag.cloud(0.0, CLOUDS[0], names="xyi")
         bag.cloud(0.1, CLOUDS[1])
     sequence = read_frames(bag.path, pose=POSE)

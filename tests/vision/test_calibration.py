@@ -10,13 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from yid_ocp.errors import DataError
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.vision import CameraCalibrationOptions, CameraClockOptions, CameraIntrinsics, look_at_pose
-from yid_ocp.vision.calibration import (
-    calibrate_camera,
-    calibration_without_estimation,
-    estimate_excess_stamp_delay,
-    is_stamp_delay_significant,
-)
+from yid_ocp.vision import CameraCalibrationOptions, CameraClockOptions, CameraIntrinsics, calibration, look_at_pose
 from yid_ocp.vision.camera_registration import (
     CAMERA_STATE_SIZE,
     CLOCK_DRIFT_INDEX,
@@ -104,7 +98,9 @@ def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=
     ]
     clock = options.pop("clock", CameraClockOptions())
     pose = told_pose(turn, shift, rng)
-    found = calibrate_camera(arm_of(robot, motion), seen, pose, rng, CameraCalibrationOptions(**options), clock)
+    found = calibration.calibrate_camera(
+        arm_of(robot, motion), seen, pose, rng, CameraCalibrationOptions(**options), clock
+    )
     about = found.camera_state.clock_reference_stamp
     return found, CameraState(POSE, 1 / scale, 0.0, latency + drift * (about - latency), drift, about)
 
@@ -256,11 +252,11 @@ def test_frames_stamped_late_do_not_pull(robot):
     for by, expected in ((0.0, False), (0.15, True)):
         stamp = 2.6 + found.camera_state.clock_offset + by
         points = found.camera_state.measured_to_world_points(cloud)
-        own = estimate_excess_stamp_delay(
+        own = calibration.estimate_excess_stamp_delay(
             arm_of(robot), found.camera_state, stamp, points, rng, found.usual_square_distance
         )
         assert own.delay == pytest.approx(by, abs=max(4 * own.std, 0.01))
-        assert is_stamp_delay_significant(own, CameraClockOptions()) is expected
+        assert calibration.is_stamp_delay_significant(own, CameraClockOptions()) is expected
 
 
 def test_a_kept_pose_that_the_arm_contradicts_is_said_and_counted(robot):
@@ -285,7 +281,7 @@ def test_speed_and_time_enter_the_standard_deviation(clean):
     assert (fast > 0.8 * 2.0 * clock).all()
     assert (found.point_std_from_calibration(POINTS, np.full((3, 3), 2.0), np.full(3, about + 100)) > fast).all()
     assert (rest > 0).all()
-    nothing = calibration_without_estimation(POSE, CameraClockOptions(initial_offset=0.1))
+    nothing = calibration.calibration_without_estimation(POSE, CameraClockOptions(initial_offset=0.1))
     assert nothing.point_std_from_calibration(POINTS, np.ones((3, 3)), np.zeros(3)) == pytest.approx(0.0)
     assert nothing.camera_state.stamps_to_joint_clock(1.0) == pytest.approx(0.9)
 
@@ -305,8 +301,8 @@ def test_refused_where_the_arm_does_not_tell(robot):
     ]
     options = CameraCalibrationOptions(fix_pose=True)
     with pytest.raises(DataError, match="in view in 0 frames"):
-        calibrate_camera(arm_of(robot), nothing, away, rng, CameraCalibrationOptions(), known, "there")
-    kept = calibrate_camera(arm_of(robot), nothing, away, rng, options, known)
+        calibration.calibrate_camera(arm_of(robot), nothing, away, rng, CameraCalibrationOptions(), known, "there")
+    kept = calibration.calibrate_camera(arm_of(robot), nothing, away, rng, options, known)
     assert kept.n_frames == 0
     assert "as given: it is in view in 0 frames" in kept.message
 
@@ -320,4 +316,4 @@ def test_refused_where_the_camera_sees_through_the_arm(robot):
         for t, c in zip(times, clouds(robot, times, rng, lambda t: lively(1.7 * t + 9)), strict=True)
     ]
     with pytest.raises(DataError, match="cannot be calibrated"):
-        calibrate_camera(arm_of(robot), other, POSE, rng, CameraCalibrationOptions(), CameraClockOptions())
+        calibration.calibrate_camera(arm_of(robot), other, POSE, rng, CameraCalibrationOptions(), CameraClockOptions())

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +14,7 @@ from matplotlib.image import imread
 from yid_ocp.cli import build_argument_parser, main
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording_hdf5 import read_recording
+from yid_ocp.vision import TrackOptions
 from yid_ocp.vision.track import FrameTracker
 
 CONFIG = """\
@@ -163,3 +166,28 @@ def test_a_flag_keeps_the_told_pose(repository):
     asked = [build_argument_parser().parse_args(["track", config, *flags]) for flags in ([], ["--fix-pose"])]
     runs = [load_config(config, arguments.overrides) for arguments in asked]
     assert [run.track.options.calibration.fix_pose for run in runs] == [False, True]
+
+
+@pytest.fixture(scope="module")
+def text(repository):
+    return (repository / "docs" / "vision.md").read_text(encoding="utf-8")
+
+
+def test_the_example_runs(text, repository, tmp_path, monkeypatch, capsys):
+    [block] = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.chdir(repository)
+    exec(compile(block.replace('"tracked.h5"', repr(str(tmp_path / "tracked.h5"))), "docs/vision.md", "exec"), {})
+    assert read_recording(tmp_path / "tracked.h5").points[-1].names == ("w_T1", "w_T3")
+    assert "clock offset" in capsys.readouterr().out
+
+
+def test_the_settings_exist(text):
+    options = TrackOptions()
+    known = {field.name for field in dataclasses.fields(options)}
+    for part in ("filters", "skeleton", "shape_fit", "clock", "calibration"):
+        known |= {field.name for field in dataclasses.fields(getattr(options, part))}
+    _, _, table = text.partition("| stage |")
+    rows = [line for line in table.splitlines()[1:] if line.startswith("| ") and line.count("|") == 4]
+    named = [name for row in rows for name in re.findall(r"`([\w.]+)`", row.split("|")[3])]
+    assert len(named) > 20
+    assert {name.rpartition(".")[2] for name in named} <= known

@@ -108,23 +108,9 @@ def test_what_sizes_do_to_points():
     covariance = np.diag([0.01**2, 0.02**2])
     change = np.array([0.05, 0.05])  # five and two and a half standard deviations
 
-    def std(used):
-        return TubeDimensionCheck(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5).point_std(moves)[0]
-
-    assert std((False, False)) == pytest.approx([0.05, 0.0, 0.0])
-    assert std((True, False)) == pytest.approx([0.01, 0.0, 0.0])
-    assert std((True, True)) == pytest.approx([0.01, 0.02, 0.0])
-
-
-def test_a_refusal_names_the_sizes_that_cannot_be_right():
-    """Only what contradicts the frames and has no estimate in its place, with the value that fits."""
-    covariance, change = np.diag([0.01**2, 0.02**2]), np.array([0.1, 0.05])
-
-    def clause(used):
-        return TubeDimensionCheck(
-            ("a.length", "a.radius"), np.ones(2), change, covariance, used, 5
-        ).contradiction_message
-
-    told = "the object seems to be other than the model says (a.length 1000 mm where 1105 mm fits)"
-    assert clause((False, False)) == told
-    assert clause((True, False)) == ""
+    told = "the object seems to be other than the model says (a.length 1000 mm where 1051 mm fits)"
+    for used, std in (((False, False), [0.05, 0, 0]), ((True, False), [0.01, 0, 0]), ((True, True), [0.01, 0.02, 0])):
+        check = TubeDimensionCheck(("a.length", "a.radius"), np.ones(2), change, covariance, used, 5)
+        assert check.point_std(moves)[0] == pytest.approx(std)
+        # a refusal names what contradicts the frames and has no estimate in its place
+        assert check.contradiction_message == ("" if used[0] else told)

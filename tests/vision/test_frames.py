@@ -1,5 +1,8 @@
+"""Frames on disk and their files, lenses, and what hides what."""
+
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import shutil
@@ -16,6 +19,7 @@ from yid_ocp.vision import (
     read_frames,
     write_frame_folder,
 )
+from yid_ocp.vision.frames import OcclusionMap
 
 CLOUD = np.array([[0.1, -0.2, 2.0], [0.0, 0.3, 1.5], [-0.4, 0.1, 2.25]])
 POSE = look_at_pose([2.0, 0.5, 0.3], [0.0, 0.0, 0.0])
@@ -188,3 +192,206 @@ def test_broken_files_fail_when_loaded(folder, capfd):
     shutil.rmtree(folder)
     with pytest.raises(DataError, match="no such folder"):
         read_frames(folder)
+
+
+VERTICES = np.random.default_rng(0).normal(size=(7, 3))
+COLUMNS = [("red", "u1"), ("x", "f4"), ("nx", "f8"), ("y", "f4"), ("z", "f4")]
+NAMES = {"u1": "uchar", "f4": "float", "f8": "double", "i2": "short"}
+
+
+def ply_head(form: str, count: object = 7, before: str = "") -> bytes:
+    rows = "".join(f"property {NAMES[kind]} {name}\n" for name, kind in COLUMNS)
+    return f"ply\nformat {form} 1.0\ncomment made\n{before}element vertex {count}\n{rows}end_header\n".encode()
+
+
+def ply_body(order: str) -> bytes:
+    rows = np.zeros(7, [(name, order + kind) for name, kind in COLUMNS])
+    for axis, column in zip("xyz", VERTICES.T, strict=True):
+        rows[axis] = column
+    return rows.tobytes()
+
+
+TEXT = "".join(f"255 {x:.9g} 0.5 {y:.9g} {z:.9g}\n" for x, y, z in VERTICES).encode()
+FACES = b"element face 1\nproperty list uchar int vertex_indices\n"
+CAMERA = "element camera 2\nproperty short view\n"
+SOUND = {
+    "little": ply_head("binary_little_endian") + ply_body("<"),
+    "big": ply_head("binary_big_endian") + ply_body(">"),
+    "text": ply_head("ascii") + TEXT,
+    "text without a last newline": ply_head("ascii") + TEXT[:-1],
+    "windows": (ply_head("ascii") + TEXT).replace(b"\n", b"\r\n"),
+    "another element before": ply_head("binary_little_endian", before=CAMERA) + b"\x01\x00\x02\x00" + ply_body("<"),
+    "the same as text": ply_head("ascii", before=CAMERA) + b"1\n2\n" + TEXT,
+    "a comment longer than any buffer": (ply_head("ascii") + TEXT).replace(b"made", b"made" + b"9" * 5000),
+    "faces after": ply_head("ascii").replace(b"end_header", FACES + b"end_header") + TEXT + b"3 0 1 2\n",
+}
+
+
+@pytest.fixture(scope="module")
+def read(tmp_path_factory):
+    """The points of a file with some bytes."""
+    folder = tmp_path_factory.mktemp("frames")
+    write_frame_folder(FrameSequence.from_clouds([0.0], [VERTICES], np.eye(4)), folder)
+    sequence = read_frames(folder)
+
+    def points(data):
+        (folder / sequence.frame_names[0]).write_bytes(data)
+        return sequence.load_cloud(0)
+
+    return points
+
+
+@pytest.mark.parametrize("kind", SOUND)
+def test_points_are_read(read, kind):
+    assert np.allclose(read(SOUND[kind]), VERTICES, atol=1e-6)
+
+
+WRONG = {
+    "no ply": (b"plx\n", "has no head"),
+    "no end": (ply_head("ascii")[:-12], "has no head"),
+    "no format": (ply_head("ascii").replace(b"format ascii 1.0\n", b"") + TEXT, "does not say the format"),
+    "another format": (ply_head("ascii").replace(b"ascii", b"utf") + TEXT, "head says 'format utf 1.0'"),
+    "another type": (ply_head("ascii").replace(b"float", b"flaot", 1) + TEXT, "head says 'property flaot x'"),
+    "no z": (ply_head("ascii").replace(b"float z", b"float w") + TEXT, "no x, y and z"),
+    "two of a name": (ply_head("ascii").replace(b"double nx", b"double x") + TEXT, "no x, y and z"),
+    "lists before": (ply_head("ascii", before=FACES.decode()) + TEXT, "lists of 'face'"),
+    "too many": (ply_head("binary_little_endian", 3_000_000_000) + ply_body("<"), r"declares 3e\+09 points"),
+    "negative": (ply_head("ascii", -1) + TEXT, "element vertex -1"),
+    "none": (ply_head("ascii", 0), "has no vertices"),
+    "cut": (SOUND["little"][:-5], "declares 7 points"),
+    "cut by one byte": (SOUND["little"][:-1], "declares 7 points"),
+    "cut text": (ply_head("ascii") + TEXT[:90], "a vertex is not|vertices are missing|declares"),
+    "words": (ply_head("ascii") + TEXT.replace(b"0.5", b"0.5 one", 1), "a vertex is not"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_damage_is_said(read, kind):
+    data, message = WRONG[kind]
+    with pytest.raises(DataError, match=message):
+        read(data)
+
+
+def test_whatever_is_damaged_is_read_or_refused(read):
+    rng = np.random.default_rng(1)
+    for data in SOUND.values():
+        for _ in range(100):
+            made = bytearray(data)
+            for at in rng.integers(len(made), size=3):
+                made[at] = int(rng.integers(256))
+            with contextlib.suppress(DataError):
+                assert read(bytes(made)).shape[1] == 3
+
+
+LENSES = {
+    "none": CameraIntrinsics(64, 48, 60.0, 61.0, 31.0, 24.5),
+    "plumb_bob": CameraIntrinsics(64, 48, 60.0, 61.0, 31.0, 24.5, "plumb_bob", (-0.25, 0.08, 1e-3, -2e-3, 0.01)),
+    "four": CameraIntrinsics(64, 48, 60.0, 61.0, 31.0, 24.5, "plumb_bob", (0.1, -0.05, 1e-3, 2e-3)),
+    "rational": CameraIntrinsics(
+        64, 48, 60.0, 61.0, 31.0, 24.5, "rational_polynomial", (0.5, 0.1, 1e-3, -1e-3, 0, 0.6, 0.2, 0)
+    ),
+    "equidistant": CameraIntrinsics(64, 48, 30.0, 30.0, 31.0, 24.5, "equidistant", (0.02, -0.01, 0.003, 0.0)),
+}
+
+
+def pixels(lens, points):
+    """Where points (..., 3) before a camera appear."""
+    x, y = lens._distort(points[..., 0] / points[..., 2], points[..., 1] / points[..., 2])
+    return np.stack([lens.fx * x + lens.cx, lens.fy * y + lens.cy], axis=-1)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_a_ray_appears_at_its_pixel(name):
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    assert np.abs(pixels(LENSES[name], LENSES[name].pixel_rays) - np.stack([u, v], axis=-1)).max() < 2e-3
+
+
+def test_the_formula_of_ros():
+    """Worked out by hand for one point: r^2 = 0.05, and the equidistant angle."""
+    point = np.array([0.4, 0.2, 2.0])
+    x, y, square = 0.2, 0.1, 0.05
+    k1, k2, p1, p2, k3 = (-0.25, 0.08, 1e-3, -2e-3, 0.01)
+    factor = 1 + k1 * square + k2 * square**2 + k3 * square**3
+    u = 60 * (x * factor + 2 * p1 * x * y + p2 * (square + 2 * x**2)) + 31.0
+    v = 61 * (y * factor + p1 * (square + 2 * y**2) + 2 * p2 * x * y) + 24.5
+    assert np.allclose(pixels(LENSES["plumb_bob"], point), [u, v])
+    angle = np.arctan(np.sqrt(square))
+    bent = angle + 0.02 * angle**3 - 0.01 * angle**5 + 0.003 * angle**7
+    assert np.allclose(
+        pixels(LENSES["equidistant"], point),
+        [30 * x * bent / np.sqrt(square) + 31.0, 30 * y * bent / np.sqrt(square) + 24.5],
+    )
+
+
+def test_pixels_that_a_lens_does_not_have_are_no_points():
+    """A barrel that turns back: its corners have no direction."""
+    lens = CameraIntrinsics(64, 48, 30.0, 30.0, 31.5, 23.5, "plumb_bob", (-0.6, 0.0, 0.0, 0.0))
+    assert np.isnan(lens.pixel_rays[0, 0]).any()
+    cloud = lens.points_from_depth(np.ones((48, 64)))
+    assert np.isfinite(cloud).all()
+    assert len(cloud) < 48 * 64
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients", "message"),
+    [
+        ("inverse_brown", (0.1, 0, 0, 0, 0), "the distortion is 'inverse_brown'"),
+        ("plumb_bob", (0.1, 0.2), "has the coefficients"),
+        ("equidistant", (np.nan, 0, 0, 0), "has the coefficients"),
+    ],
+)
+def test_unknown_distortions_are_refused(model, coefficients, message):
+    with pytest.raises(DataError, match=message):
+        CameraIntrinsics(64, 48, 60.0, 60.0, 32.0, 24.0, model, coefficients)
+    assert not CameraIntrinsics(64, 48, 60.0, 60.0, 32.0, 24.0, model, (0.0,) * 5).has_distortion
+
+
+HOME = np.eye(4)  # at the origin, looking along z
+PLACE, RADIUS = np.array([[0.0, 0.0, 2.0]]), np.array([0.02])
+
+
+def patch(centre, size, step=0.004):
+    """Points of an upright square."""
+    across = np.arange(-size / 2, size / 2, step)
+    x, y = np.meshgrid(across, across)
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) + centre
+
+
+@pytest.mark.parametrize(
+    ("points", "hidden"),
+    [
+        (patch([0.0, 0.0, 3.0], 1.0), False),  # looked through, on what is behind
+        (patch([0.0, 0.0, 1.0], 0.1), True),  # something before it
+        (patch([0.0, 0.0, 1.99], 0.1), False),  # its own surface
+        (patch([0.4, 0.0, 3.0], 0.1), False),  # nothing in that direction
+        (patch([-0.04, 0.0, 1.0], 0.05), True),  # in the shadow of something beside the line of sight
+        (patch([-0.2, 0.0, 1.0], 0.05), False),  # too far beside it for a shadow
+        (patch([-0.072, 0.0, 0.4], 0.02), True),  # the nearer it is, the further its shadow falls
+    ],
+)
+def test_a_place_without_points_is_hidden_or_empty(points, hidden):
+    assert OcclusionMap(points, HOME).is_hidden(PLACE, RADIUS, 0.01).tolist() == [hidden]
+    # what is expected to be asked about saves work and changes nothing
+    for expected in (PLACE, PLACE + 0.3, np.empty((0, 3))):
+        assert OcclusionMap(points, HOME, expected_points=expected).is_hidden(PLACE, RADIUS, 0.01).tolist() == [hidden]
+
+
+def test_nothing_is_seen_beside_the_picture():
+    camera = CameraIntrinsics(320, 240, 300.0, 300.0, 159.5, 119.5)
+    behind = patch([0.0, 0.0, 4.0], 1.0)
+    places = np.array([[0.0, 0.0, 2.0], [1.2, 0.0, 2.0], [0.0, 0.0, -1.0]])
+    assert OcclusionMap(behind, HOME, camera).is_hidden(places, np.full(3, 0.02), 0.01).tolist() == [
+        False,
+        True,
+        True,
+    ]
+
+
+def test_the_picture_ends_where_points_stand_along_its_side():
+    wall = patch([0.0, 0.0, 4.0], 2.0, 0.02)  # fills the picture, which is 0.5 wide in x/z
+    places = np.array([[0.2, 0.0, 2.0], [0.6, 0.0, 2.0]])
+    radius = np.full(2, 0.02)
+    assert OcclusionMap(wall, HOME).is_hidden(places, radius, 0.01).tolist() == [False, True]
+    # a cloud of the object alone has no such side: what is missing beside it is missing
+    rod = np.column_stack([np.linspace(-0.2, 0.2, 200), np.zeros(200), np.full(200, 2.0)])
+    assert OcclusionMap(rod, HOME).is_hidden(places, radius, 0.01).tolist() == [False, False]

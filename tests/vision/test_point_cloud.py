@@ -7,9 +7,10 @@ from yid_ocp.errors import ConfigError
 from yid_ocp.vision import CloudFilterOptions, ShapeFitOptions, SkeletonOptions, TrackOptions
 from yid_ocp.vision.point_cloud import (
     ReachableObjectRegion,
+    WeightedCloud,
+    extract_skeleton,
     is_statistical_inlier,
     voxel_averages,
-    weighted_median,
 )
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
 
@@ -25,11 +26,6 @@ def test_voxels_keep_weight_and_centroid():
     assert len(cloud) <= 13**3
     assert len(voxel_averages(points, 1e-5)) == 5000
     assert len(voxel_averages(np.empty((0, 3)), 0.05)) == 0
-
-
-def test_weighted_median():
-    assert weighted_median(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 1.0])) == 2.0
-    assert weighted_median(np.array([3.0, 1.0, 2.0]), np.array([5.0, 1.0, 1.0])) == 3.0
 
 
 @pytest.mark.parametrize("share", [0.0, 0.2])
@@ -92,3 +88,76 @@ def test_where_the_object_can_be(system, run):
 def test_options_are_checked(options, name):
     with pytest.raises(ConfigError, match=f"{name} = -1"):
         options(**{name: -1.0})
+
+
+FOOT, FORK = np.zeros(3), np.array([0.0, 0.0, 0.8])
+ENDS = (np.array([0.0, 0.4, 1.2]), np.array([0.0, -0.5, 1.3]))
+BONES = ((FOOT, FORK), (FORK, ENDS[0]), (FORK, ENDS[1]))
+
+
+def letter(seed=0, count=900, spread=0.008):
+    rng = np.random.default_rng(seed)
+    parts = []
+    for start, end in BONES:
+        t = rng.uniform(0, 1, count)
+        parts.append(start + t[:, None] * (end - start) + spread * rng.standard_normal((count, 3)))
+    points = np.concatenate(parts)
+    return WeightedCloud(points, np.ones(len(points)))
+
+
+def from_bones(points):
+    best = np.full(len(points), np.inf)
+    for start, end in BONES:
+        edge = end - start
+        t = np.clip((points - start) @ edge / (edge @ edge), 0, 1)
+        best = np.minimum(best, np.linalg.norm(points - start - t[:, None] * edge, axis=1))
+    return best
+
+
+def test_nodes_and_edges_are_a_tree_on_the_centre_lines_from_the_lowest_point():
+    cloud = letter()
+    found, again, other = (extract_skeleton(cloud, np.random.default_rng(seed)) for seed in (0, 0, 2))
+    nodes, label = found.nodes, found.node_of_point
+    assert np.median(from_bones(nodes)) < 0.005
+    assert from_bones(nodes).max() < 0.02
+    assert found.has_skeleton_node.mean() > 0.9
+    for i in range(len(nodes)):
+        mine = cloud.points[label == i]
+        assert len(mine) <= 50
+        assert np.allclose(mine.mean(0), nodes[i])
+    assert np.linalg.norm(nodes[0] - FOOT) < 0.05
+    # from there the walk goes on to neighbours
+    assert np.linalg.norm(np.diff(nodes[:6], axis=0), axis=1).max() < 0.1
+    assert len(set(found.component_of_node.tolist())) == 1
+    assert len(found.edges) == len(nodes) - 1
+    assert from_bones(nodes[found.edges].mean(axis=1)).max() < 0.02
+    assert np.array_equal(nodes, again.nodes)
+    assert abs(len(other.nodes) - len(nodes)) < 0.15 * len(nodes)
+
+
+def test_two_parts_and_a_stray_heap():
+    cloud = letter()
+    far = np.random.default_rng(3).normal([0.5, 0.5, 0.5], 0.01, (60, 3))
+    near = np.abs(cloud.points[:, 2] - 0.4) > 0.15  # a gap across the trunk
+    points = np.concatenate([cloud.points[near], far])
+    found = extract_skeleton(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0))
+    assert set(found.component_of_node.tolist()) == {0, 1}
+    assert not found.has_skeleton_node[-60:].any()
+    weights = np.bincount(found.component_of_node[found.node_of_point[found.has_skeleton_node]])
+    assert weights[0] > weights[1]
+
+
+def test_too_little_gives_nothing_and_points_at_one_place_do_not_hang_it():
+    few = WeightedCloud(np.random.default_rng(0).uniform(-1, 1, (30, 3)), np.ones(30))
+    assert len(extract_skeleton(few, np.random.default_rng(0)).nodes) == 0
+    empty = extract_skeleton(WeightedCloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0))
+    assert len(empty.nodes) == len(empty.edges) == len(empty.node_of_point) == 0
+    cloud = WeightedCloud(np.zeros((500, 3)), np.ones(500))
+    found = extract_skeleton(cloud, np.random.default_rng(0))
+    assert len(found.nodes) == 10
+    assert found.has_skeleton_node.all()
+    ring = WeightedCloud(
+        0.069 * np.column_stack([np.cos(np.arange(40)), np.sin(np.arange(40)), np.zeros(40)]), np.ones(40)
+    )
+    lonely = SkeletonOptions(neighbour_radius=0.01, min_segment_points=1)
+    assert len(extract_skeleton(ring, np.random.default_rng(0), lonely).nodes)
