@@ -114,19 +114,16 @@ def test_bag_round_trip(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert read_any(tmp_path / "run.h5", progress=heard).point_names == ("w_T1", "w_T2")
 
 
-def test_bag_order_of_joints_may_change(tmp_path: Path) -> None:
-    first = joint_state(("a", "b"), START, position=[1.0, 2.0])
-    second = joint_state(("b", "a"), START + SECOND, position=[4.0, 3.0])
-    path = write_bag(tmp_path, "bag", [("/joint_states", START, first), ("/joint_states", START + SECOND, second)])
-    assert np.array_equal(joints_of(read_any(path, joints=["a", "b"])).position, [[1, 2], [3, 4]])
-    assert np.array_equal(np.sort(joints_of(read_bag(path)).position), [[1, 2], [3, 4]])
-
-
-def test_bag_with_different_sets_of_joints(tmp_path: Path) -> None:
+def test_bag_order_and_sets_of_joints_may_change(tmp_path: Path) -> None:
     """Baxter's grippers come on the topic of its arms, in messages of their own."""
     arm = joint_state(("a", "b"), START, position=[1.0, 2.0])
+    second = joint_state(("b", "a"), START + SECOND, position=[4.0, 3.0])
+    path = write_bag(tmp_path, "bag", [("/joint_states", START, arm), ("/joint_states", START + SECOND, second)])
+    assert np.array_equal(joints_of(read_any(path, joints=["a", "b"])).position, [[1, 2], [3, 4]])
+    assert np.array_equal(np.sort(joints_of(read_bag(path)).position), [[1, 2], [3, 4]])
     gripper = joint_state(("finger",), START, position=[0.5])
-    path = write_bag(tmp_path, "bag", [("/joint_states", START, arm), ("/joint_states", START, gripper)])
+    (tmp_path / "other").mkdir()
+    path = write_bag(tmp_path / "other", "bag", [("/joint_states", START, arm), ("/joint_states", START, gripper)])
     with pytest.raises(DataError, match="2 different sets of joints") as caught:
         read_bag(path)
     assert "--joints" in caught.value.hint
@@ -184,19 +181,17 @@ def test_joint_topics_that_do_not_fit_together(tmp_path: Path) -> None:
     assert "--joint-topic" in caught.value.hint
 
 
-def test_a_gap_of_one_topic_stays_a_gap(tmp_path: Path) -> None:
+def test_a_gap_of_one_topic_stays_a_gap_and_commands_are_held_until_the_next(tmp_path: Path) -> None:
     lost = [m for m in two_arms() if m[0] != "/left" or not 5 <= round(100 * (m[1] - START) / SECOND) < 15]
-    joints = joints_of(read_bag(write_bag(tmp_path, "mcap", lost)))
+    joints = joints_of(read_bag(write_bag(tmp_path, "db3", lost)))
     assert not ((joints.t > 0.041) & (joints.t < 0.149)).any()
     assert np.allclose(joints.position[:, 0], joints.t)
-
-
-def test_commands_are_held_until_the_next(tmp_path: Path) -> None:
     messages = list(two_arms())
     for k in range(4):
         stamp = START + (5 * k + 1) * SECOND // 100 + 1000
         messages.append(("/command", stamp, joint_state(("a",), stamp, position=[10.0 + k])))
-    path = write_bag(tmp_path, "mcap", messages)
+    (tmp_path / "held").mkdir()
+    path = write_bag(tmp_path / "held", "mcap", messages)
     joints = joints_of(read_any(path, joint_topics=["/left"], command_topic="/command"))
     wanted = [10.0] * 7 + [11.0] * 5 + [12.0] * 5 + [13.0] * 3
     assert np.array_equal(joints.channels["position_command"][:, 0], wanted)
@@ -269,8 +264,11 @@ def test_an_orientation_becomes_points_on_the_axes(tmp_path: Path) -> None:
         read_any(path, pose_axes=0.0)
 
 
-def test_currents_become_torques(tmp_path: Path) -> None:
+def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", two_arms())
+    joints = joints_of(read_any(path, joints=["b=elbow", "a"]))
+    assert set(joints.names) == {"elbow", "a"}
+    assert np.allclose(joints.position[:, joints.names.index("elbow")], joints.t - 0.005)
     efforts = joints_of(read_bag(path)).channels["effort"]
     options: dict[str, Any] = {
         "units": {"effort": "mA"},
@@ -283,13 +281,6 @@ def test_currents_become_torques(tmp_path: Path) -> None:
         read_any(path, units={"effort": "A"}, torque_constants={"b": 1.0})
     with pytest.raises(DataError, match="but the efforts are no currents"):
         read_any(path, torque_constants={"*": 1.0})
-
-
-def test_joints_are_renamed(tmp_path: Path) -> None:
-    joints = joints_of(read_any(write_bag(tmp_path, "mcap", two_arms()), joints=["b=elbow", "a"]))
-    assert set(joints.names) == {"elbow", "a"}
-    at = joints.names.index("elbow")
-    assert np.allclose(joints.position[:, at], joints.t - 0.005)
 
 
 @pytest.mark.parametrize("stamps", [(0, 0), (START - SECOND // 2, 0)])
@@ -365,12 +356,16 @@ def test_truncated_bags(kind: str, share: float, tmp_path: Path) -> None:
     assert caught.value.where == str(path)
 
 
-def test_bags_that_are_none(tmp_path: Path) -> None:
+def test_bags_that_are_none_and_no_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rosbags", reason=NO_ROSBAGS)
     with pytest.raises(DataError, match="the bag cannot be read"):
         read_any(tmp_path)
     with pytest.raises(DataError, match="no such file"):
         read_bag(tmp_path / "absent.bag")
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(DataError, match="needs the package rosbags") as caught:
+        read_any(tmp_path)
+    assert caught.value.hint == "pip install 'yid-ocp[bags]'"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the system cannot limit memory")
@@ -387,11 +382,3 @@ def test_metadata_of_a_bag_that_take_long_are_refused(tmp_path: Path) -> None:
         file.write("more: [" + "1, " * 100_000 + "1]\n")
     with pytest.raises(DataError, match="more than can be meant"):
         read_any(path)
-
-
-def test_bags_without_rosbags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_bag(tmp_path, "bag", arm_and_camera())
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(DataError, match="needs the package rosbags") as caught:
-        read_any(path)
-    assert caught.value.hint == "pip install 'yid-ocp[bags]'"

@@ -20,6 +20,7 @@ PATHS = {
     "v2.1": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
     "v3.0": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
 }
+FIRST = "data/chunk-000/episode_000000.parquet"
 
 
 def write_dataset(folder: Path, version: str, names: Any = NAMES, **more: Any) -> Path:
@@ -40,14 +41,9 @@ def write_dataset(folder: Path, version: str, names: Any = NAMES, **more: Any) -
     (folder / "meta" / "info.json").write_text(json.dumps(info))
     tables = []
     for episode in range(2):
-        state = [[100.0 * episode + 10.0 * k + j for j in range(3)] for k in range(4)]
-        columns = {
-            "observation.state": state,
-            "action": [[value + 1 for value in row] for row in state],
-            "frame_index": list(range(4)),
-            "episode_index": [episode] * 4,
-        }
-        tables.append(pyarrow.table(columns))
+        state = 100.0 * episode + 10.0 * np.arange(4)[:, None] + np.arange(3)
+        columns = {"observation.state": state.tolist(), "action": (state + 1).tolist()}
+        tables.append(pyarrow.table({**columns, "frame_index": list(range(4)), "episode_index": [episode] * 4}))
     chunk = folder / "data" / "chunk-000"
     chunk.mkdir(parents=True)
     if version == "v3.0":
@@ -81,8 +77,8 @@ def test_names_of_older_datasets(names: Any, tmp_path: Path) -> None:
 
 def test_velocities_and_currents_among_the_state(tmp_path: Path) -> None:
     path = write_dataset(tmp_path / "arm", "v3.0", ["a.pos", "a.vel", "a.current"])
-    joints = joints_of(read_lerobot_episode(path, units={"position": "deg", "position_command": "deg", "effort": "mA"},
-                                    torque_constants={"a": 2.0}, gears={"a": 100.0}))  # fmt: skip
+    units = {"position": "deg", "position_command": "deg", "effort": "mA"}
+    joints = joints_of(read_lerobot_episode(path, units=units, torque_constants={"a": 2.0}, gears={"a": 100.0}))
     assert joints.names == ("a",)
     assert np.array_equal(joints.channels["velocity"][:, 0], [1, 11, 21, 31])
     assert np.allclose(joints.channels["effort"][:, 0], 0.2 * np.array([2, 12, 22, 32]))
@@ -153,9 +149,7 @@ def test_frame_numbers_that_are_none_are_refused(column: list[Any], tmp_path: Pa
     from pyarrow import parquet
 
     table = {"observation.state": [[1.0, 2, 3]] * 2, "action": [[1.0, 2, 3]] * 2, "episode_index": [0, 0]}
-    parquet.write_table(
-        pyarrow.table({**table, "frame_index": column}), path / "data" / "chunk-000" / "episode_000000.parquet"
-    )
+    parquet.write_table(pyarrow.table({**table, "frame_index": column}), path / FIRST)
     with pytest.raises(DataError):
         read_lerobot_episode(path)
 
@@ -167,24 +161,19 @@ def test_texts_that_unpack_to_very_many_bytes_are_refused_by_their_type(name: st
     import pyarrow
     from pyarrow import parquet
 
-    file = path / "data" / "chunk-000" / "episode_000000.parquet"
-    table = parquet.read_table(file).to_pydict()
+    table = parquet.read_table(path / FIRST).to_pydict()
     text = pyarrow.DictionaryArray.from_arrays(pyarrow.array([0] * len(table[name])), ["x" * 1_000_000])
-    parquet.write_table(pyarrow.table({**table, name: text}), file, store_schema=False)
+    parquet.write_table(pyarrow.table({**table, name: text}), path / FIRST, store_schema=False)
     with pytest.raises(DataError, match=f"{name} holds string where numbers are expected"):
         read_lerobot_episode(path)
 
 
-def test_a_table_that_unpacks_to_more_than_fits_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_table_too_large_or_damaged_and_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_dataset(tmp_path / "arm", "v2.1")
     monkeypatch.setattr("yid_ocp.files.MAX_INPUT_NUMBERS", 30)  # four frames of eight numbers and three lists
     with pytest.raises(DataError, match="more than can be meant"):
         read_lerobot_episode(path)
-
-
-def test_a_damaged_table_and_a_missing_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_dataset(tmp_path / "arm", "v2.1")
-    (path / "data" / "chunk-000" / "episode_000000.parquet").write_bytes(b"PAR1 and no more")
+    (path / FIRST).write_bytes(b"PAR1 and no more")
     with pytest.raises(DataError, match="table of the episode cannot be read"):
         read_lerobot_episode(path)
     monkeypatch.setitem(sys.modules, "pyarrow", None)

@@ -93,9 +93,7 @@ def found_of(robot, seed, *, turn=0.0, shift=0.0, scale=1.0, latency=0.0, drift=
     motion = options.pop("motion", lively)
     times = 1.0 + (np.arange(frames) + rng.uniform(0.1, 0.9, frames)) * duration / frames
     stamps = times + latency + drift * times + options.pop("late", np.zeros(frames))
-    seen = [
-        CalibrationFrame(float(s), c) for s, c in zip(stamps, clouds(robot, times, rng, motion, scale), strict=True)
-    ]
+    seen = list(map(CalibrationFrame, stamps.tolist(), clouds(robot, times, rng, motion, scale)))
     clock = options.pop("clock", CameraClockOptions())
     pose = told_pose(turn, shift, rng)
     found = calibration.calibrate_camera(
@@ -114,10 +112,12 @@ def clean(robot):
 def displaced(found, true):
     """By how much, and in how many standard deviations, points of the world are off, shape (N, 3)."""
     error = found.camera_state.measured_to_world_points(true.world_to_measured_points(POINTS)) - POINTS
-    nothing = np.zeros_like(POINTS)
-    return error, error / found.point_std_from_calibration(
-        POINTS, nothing, np.full(len(POINTS), found.camera_state.clock_reference_stamp)
-    )
+    stamps = np.full(len(POINTS), found.camera_state.clock_reference_stamp)
+    return error, error / found.point_std_from_calibration(POINTS, 0 * POINTS, stamps)
+
+
+def std_of(found, index=CLOCK_OFFSET_INDEX):
+    return math.sqrt(found.state_covariance[index, index])
 
 
 def test_slopes_of_the_state_are_derivatives():
@@ -127,12 +127,9 @@ def test_slopes_of_the_state_are_derivatives():
     assert np.allclose(state.measured_to_world_points(seen), POINTS, atol=1e-12)
     slopes = state.world_point_jacobian(POINTS)
     for k in range(CLOCK_OFFSET_INDEX):
-        change = np.zeros(CAMERA_STATE_SIZE)
-        change[k] = 1e-6
-        ahead, behind = (
-            state.with_state_increment(change).measured_to_world_points(seen),
-            state.with_state_increment(-change).measured_to_world_points(seen),
-        )
+        change = 1e-6 * np.eye(CAMERA_STATE_SIZE)[k]
+        both = (state.with_state_increment(by) for by in (change, -change))
+        ahead, behind = (other.measured_to_world_points(seen) for other in both)
         # the offset acts on measured depths, the factor on those with it: the same to first order in both
         assert np.allclose((ahead - behind) / 2e-6, slopes[:, :, k], atol=0.05 * np.abs(slopes[:, :, k]).max() + 1e-6)
     change = 0.05 * rng.standard_normal(CAMERA_STATE_SIZE)
@@ -149,12 +146,9 @@ def test_slopes_of_the_rows_are_derivatives(robot):
     rows = arm.linearized_surface_distances(state, glimpse, 0.1, along=True)
     moved = {TRANSLATION_SLICE.start: 1e-4, TRANSLATION_SLICE.start + 2: 1e-4, 0: 1e-4, DEPTH_SCALE_INDEX: 1e-4}
     for k, step in {**moved, CLOCK_OFFSET_INDEX: 1e-3, CLOCK_DRIFT_INDEX: 1e-3}.items():
-        change = np.zeros(CAMERA_STATE_SIZE)
-        change[k] = step
-        ahead, behind = (
-            arm.linearized_surface_distances(state.with_state_increment(sign * change), glimpse, 0.1, along=True)
-            for sign in (1, -1)
-        )
+        change = step * np.eye(CAMERA_STATE_SIZE)[k]
+        both = (state.with_state_increment(by) for by in (change, -change))
+        ahead, behind = (arm.linearized_surface_distances(other, glimpse, 0.1, along=True) for other in both)
         if len(ahead.residuals) == len(behind.residuals) == len(rows.residuals):
             slope = (ahead.residuals - behind.residuals) / (2 * step)
             off = np.abs(slope - rows.jacobian[:, k])
@@ -168,9 +162,8 @@ def test_pose_depth_and_clock_are_found(robot, clean, wrong):
     error, relative = displaced(found, true)
     assert np.abs(error).max() < 0.01
     assert np.abs(relative).max() < 4
-    std = math.sqrt(found.state_covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
-    assert std < 0.01
-    assert abs(found.camera_state.clock_offset - true.clock_offset) < 4 * std
+    assert std_of(found) < 0.01
+    assert abs(found.camera_state.clock_offset - true.clock_offset) < 4 * std_of(found)
     assert found.arm_visibility.there > 0.9
     assert ("the told camera sees the arm" in found.message) == bool("turn" in wrong or "scale" in wrong)
 
@@ -191,12 +184,11 @@ def test_standard_deviations_are_honest(robot):
 def rows_of(errors, places):
     """Frames of points that all have the slope one by the first unknown."""
     slope = np.eye(1, CAMERA_STATE_SIZE)
-    return [
-        _CalibrationEquations(
-            np.repeat(slope, len(error), axis=0), error, np.column_stack([place, np.zeros((len(place), 3), int)])
-        )
-        for error, place in zip(errors, places, strict=True)
-    ]
+    rows = []
+    for error, place in zip(errors, places, strict=True):
+        patch = np.column_stack([place, np.zeros((len(place), 3), int)])
+        rows.append(_CalibrationEquations(np.repeat(slope, len(error), axis=0), error, patch))
+    return rows
 
 
 def test_errors_alike_in_a_frame_or_on_a_patch_count_as_one_and_others_only_once():
@@ -230,13 +222,13 @@ def test_one_frame_at_its_minimum_has_the_errors_of_its_patches():
 
 def test_drift_is_found_where_the_recording_is_long(robot, clean):
     found, _ = found_of(robot, 5, drift=1e-3, duration=60.0, frames=8, latency=0.05)
-    std = math.sqrt(found.state_covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX])
+    std = std_of(found, CLOCK_DRIFT_INDEX)
     assert std < 2.5e-4
     assert abs(found.camera_state.clock_drift - 1e-3) < 4 * std
     assert "drift" in found.message
     assert np.abs(found.camera_state.stamps_to_joint_clock(61.0 + 0.05 + 0.061) - 61.0) < 0.02
     short, _ = clean  # four seconds tell little of it
-    assert math.sqrt(short.state_covariance[CLOCK_DRIFT_INDEX, CLOCK_DRIFT_INDEX]) > 2 * std
+    assert std_of(short, CLOCK_DRIFT_INDEX) > 2 * std
     assert "drift" not in short.message
 
 
@@ -244,9 +236,7 @@ def test_frames_stamped_late_do_not_pull(robot):
     late = np.zeros(8)
     late[[2, 5]] = 0.15
     found, true = found_of(robot, 6, late=late)
-    assert abs(found.camera_state.clock_offset - true.clock_offset) < max(
-        4 * math.sqrt(found.state_covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX]), 0.004
-    )
+    assert abs(found.camera_state.clock_offset - true.clock_offset) < max(4 * std_of(found), 0.004)
     rng = np.random.default_rng(0)
     [cloud] = clouds(robot, [2.6], rng)
     for by, expected in ((0.0, False), (0.15, True)):
@@ -277,8 +267,7 @@ def test_speed_and_time_enter_the_standard_deviation(clean):
     found, _ = clean
     about = found.camera_state.clock_reference_stamp
     rest, fast = (found.point_std_from_calibration(POINTS, np.full((3, 3), v), np.full(3, about)) for v in (0.0, 2.0))
-    clock = math.sqrt(found.state_covariance[CLOCK_OFFSET_INDEX, CLOCK_OFFSET_INDEX])
-    assert (fast > 0.8 * 2.0 * clock).all()
+    assert (fast > 0.8 * 2.0 * std_of(found)).all()
     assert (found.point_std_from_calibration(POINTS, np.full((3, 3), 2.0), np.full(3, about + 100)) > fast).all()
     assert (rest > 0).all()
     nothing = calibration.calibration_without_estimation(POSE, CameraClockOptions(initial_offset=0.1))
@@ -296,9 +285,7 @@ def test_refused_where_the_arm_does_not_tell(robot):
     assert "as given" in found.message
     away = look_at_pose([1.9, 0.6, 0.8], [4.0, 0.6, 0.8])
     rng = np.random.default_rng(0)
-    nothing = [
-        CalibrationFrame(t, c) for t, c in zip((1.0, 2.0, 3.0), clouds(robot, [1.0, 2.0, 3.0], rng), strict=True)
-    ]
+    nothing = list(map(CalibrationFrame, (1.0, 2.0, 3.0), clouds(robot, [1.0, 2.0, 3.0], rng)))
     options = CameraCalibrationOptions(fix_pose=True)
     with pytest.raises(DataError, match="in view in 0 frames"):
         calibration.calibrate_camera(arm_of(robot), nothing, away, rng, CameraCalibrationOptions(), known, "there")
@@ -311,9 +298,6 @@ def test_refused_where_the_camera_sees_through_the_arm(robot):
     """Another motion than the recorded one: nowhere does the arm lie on the clouds."""
     rng = np.random.default_rng(0)
     times = np.linspace(1.0, 4.0, 4)
-    other = [
-        CalibrationFrame(t, c)
-        for t, c in zip(times, clouds(robot, times, rng, lambda t: lively(1.7 * t + 9)), strict=True)
-    ]
+    other = list(map(CalibrationFrame, times, clouds(robot, times, rng, lambda t: lively(1.7 * t + 9))))
     with pytest.raises(DataError, match="cannot be calibrated"):
         calibration.calibrate_camera(arm_of(robot), other, POSE, rng, CameraCalibrationOptions(), CameraClockOptions())

@@ -37,14 +37,11 @@ def changed(folder, **entries):
     (folder / "camera.json").write_text(json.dumps({key: value for key, value in head.items() if value is not None}))
 
 
-def test_xtion_is_58_degrees_wide():
+def test_depth_to_cloud_of_a_camera_of_58_degrees_and_another():
     left, right = XTION_INTRINSICS.pixel_rays[240, 0], XTION_INTRINSICS.pixel_rays[240, -1]
     cosine = left @ right / np.linalg.norm(left) / np.linalg.norm(right)
     assert np.degrees(np.arccos(cosine)) == pytest.approx(58.0, abs=0.2)
     assert (XTION_INTRINSICS.width, XTION_INTRINSICS.height) == (640, 480)
-
-
-def test_depth_to_cloud():
     camera = CameraIntrinsics(4, 3, 2.0, 4.0, 1.0, 1.0)
     depth = np.full((3, 4), np.nan)
     depth[2, 3] = 2.0
@@ -54,12 +51,9 @@ def test_depth_to_cloud():
         camera.points_from_depth(np.ones((4, 3)))
 
 
-def test_look_at_puts_the_target_ahead():
+def test_a_sequence_survives_the_disk(folder):
     assert np.allclose(np.linalg.inv(POSE) @ [0, 0, 0, 1], [0, 0, np.linalg.norm([2.0, 0.5, 0.3]), 1])
     assert POSE[2, 1] < 0  # y points down
-
-
-def test_a_sequence_survives_the_disk(folder):
     sequence = read_frames(folder)
     assert np.array_equal(sequence.stamps, [0.5, 0.9])
     assert np.allclose(sequence.camera_pose, POSE)
@@ -283,13 +277,12 @@ def test_whatever_is_damaged_is_read_or_refused(read):
                 assert read(bytes(made)).shape[1] == 3
 
 
+SIZE = 64, 48, 60.0, 61.0, 31.0, 24.5
 LENSES = {
-    "none": CameraIntrinsics(64, 48, 60.0, 61.0, 31.0, 24.5),
-    "plumb_bob": CameraIntrinsics(64, 48, 60.0, 61.0, 31.0, 24.5, "plumb_bob", (-0.25, 0.08, 1e-3, -2e-3, 0.01)),
-    "four": CameraIntrinsics(64, 48, 60.0, 61.0, 31.0, 24.5, "plumb_bob", (0.1, -0.05, 1e-3, 2e-3)),
-    "rational": CameraIntrinsics(
-        64, 48, 60.0, 61.0, 31.0, 24.5, "rational_polynomial", (0.5, 0.1, 1e-3, -1e-3, 0, 0.6, 0.2, 0)
-    ),
+    "none": CameraIntrinsics(*SIZE),
+    "plumb_bob": CameraIntrinsics(*SIZE, "plumb_bob", (-0.25, 0.08, 1e-3, -2e-3, 0.01)),
+    "four": CameraIntrinsics(*SIZE, "plumb_bob", (0.1, -0.05, 1e-3, 2e-3)),
+    "rational": CameraIntrinsics(*SIZE, "rational_polynomial", (0.5, 0.1, 1e-3, -1e-3, 0, 0.6, 0.2, 0)),
     "equidistant": CameraIntrinsics(64, 48, 30.0, 30.0, 31.0, 24.5, "equidistant", (0.02, -0.01, 0.003, 0.0)),
 }
 
@@ -376,18 +369,12 @@ def test_a_place_without_points_is_hidden_or_empty(points, hidden):
         assert OcclusionMap(points, HOME, expected_points=expected).is_hidden(PLACE, RADIUS, 0.01).tolist() == [hidden]
 
 
-def test_nothing_is_seen_beside_the_picture():
+def test_nothing_is_seen_beside_the_picture_which_ends_where_points_stand_along_its_side():
     camera = CameraIntrinsics(320, 240, 300.0, 300.0, 159.5, 119.5)
     behind = patch([0.0, 0.0, 4.0], 1.0)
     places = np.array([[0.0, 0.0, 2.0], [1.2, 0.0, 2.0], [0.0, 0.0, -1.0]])
-    assert OcclusionMap(behind, HOME, camera).is_hidden(places, np.full(3, 0.02), 0.01).tolist() == [
-        False,
-        True,
-        True,
-    ]
-
-
-def test_the_picture_ends_where_points_stand_along_its_side():
+    view = OcclusionMap(behind, HOME, camera)
+    assert view.is_hidden(places, np.full(3, 0.02), 0.01).tolist() == [False, True, True]
     wall = patch([0.0, 0.0, 4.0], 2.0, 0.02)  # fills the picture, which is 0.5 wide in x/z
     places = np.array([[0.2, 0.0, 2.0], [0.6, 0.0, 2.0]])
     radius = np.full(2, 0.02)
