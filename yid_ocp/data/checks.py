@@ -281,10 +281,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
 
 
 def _transitions(one: JointOrPointGroup, other: JointOrPointGroup) -> tuple[IntArray, IntArray]:
-    """Changes of the samples of two groups as numbers: from what to what, and after how long, are equal where they are.
-
-    Samples that repeat the one before them, as at rest, are passed over.
-    """
+    """Numbers of the changes of two groups' samples, equal where what changes, and after how long, is; no rests."""
     changes = []
     for group in (one, other):
         rows = _rows(group)

@@ -145,9 +145,8 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             required = ("names", "sensor", "frame")
             points.append(PointGroup(name, **_read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, required)))
     truth = _json(texts["truth"] or "{}", f"{origin}, attribute truth")
-    require_data(
-        isinstance(truth, dict), "the JSON text is not an object", f"{origin}, attribute truth", '{"name": number, ...}'
-    )
+    where, allowed = f"{origin}, attribute truth", '{"name": number, ...}'
+    require_data(isinstance(truth, dict), "the JSON text is not an object", where, allowed)
     notes = _json(texts["notes"] or "[]", f"{origin}, attribute notes")
     good = isinstance(notes, list) and all(isinstance(note, str) for note in notes)
     require_data(good, "the JSON text is not a list of text", f"{origin}, attribute notes", '["sentence", ...]')
@@ -269,10 +268,7 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
 
 @contextlib.contextmanager
 def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
-    """Context manager of a new HDF5 file in memory, written atomically when the block ends without error.
-
-    `OutputError` where the file cannot be written; one that was there before is left as it was.
-    """
+    """Context manager of a new HDF5 file in memory, written when the block ends well; errors as `atomic_write`."""
     with files.atomic_write(Path(path)) as temporary:
         with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
             yield file

@@ -318,10 +318,7 @@ def initial_camera_states(
 def _add_costs(
     total: Array, arm: ArmSurface, told: CameraState, glimpse: CalibrationFrame, delays: Array, cells: IntArray
 ) -> None:
-    """Mean costs of the arm's visible points as they were `delays` [s] earlier, shifted by cells of the camera's frame.
-
-    Added to `total` (delays, cells); nothing where the camera would see too little of the arm.
-    """
+    """Add to `total` (delays, cells) costs of the arm's points as they were `delays` [s] earlier, shifted by cells."""
     from scipy.ndimage import distance_transform_edt  # slow to import, and only for a camera whose place is sought
 
     points, part = arm.visible_surface_points(told, glimpse.stamp)

@@ -61,31 +61,25 @@ class ShapeFitOptions:
     node_loss_scales: Annotated[
         tuple[PositiveFloat, ...],
         OptionInfo(
-            "scale of the robust loss on the nodes, pass after pass: wide first, to catch a start some decimetres off",
+            "scale of the robust loss on the nodes, pass by pass: wide first, to catch a start far off",
             "m",
         ),
     ] = (0.15, 0.05)
     surface_loss_scales: Annotated[
         tuple[PositiveFloat, ...],
-        OptionInfo(
-            "the same on the points of the cloud; empty for a fit to the nodes alone, as in the source paper", "m"
-        ),
+        OptionInfo("the same on the cloud's points; empty for a fit to the nodes alone, as in the source paper", "m"),
     ] = (0.03, 0.015)
-    surface_noise_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
-    ] = 0.006
-    correlated_points: Annotated[
-        PositiveFloat, OptionInfo("of how many points the errors are alike; divides the weight of all points together")
-    ] = 8.0
-    grasp_position_std: Annotated[
-        PositiveFloat, OptionInfo("standard deviation between a gripper, by its joint angles, and what it holds", "m")
-    ] = 0.004
-    grasp_direction_std: Annotated[
-        PositiveFloat, OptionInfo("the same of the axes that grasps of kind axis and weld make coincide", "rad")
-    ] = 0.05
+    surface_noise_std: Annotated[PositiveFloat, OptionInfo("of an averaged point from the surface", "m")] = 0.006
+    correlated_points: Annotated[PositiveFloat, OptionInfo("points that err alike; divides the weight of all")] = 8.0
+    grasp_position_std: Annotated[PositiveFloat, OptionInfo("of a gripper by its joints from what it holds", "m")] = (
+        0.004
+    )
+    grasp_direction_std: Annotated[PositiveFloat, OptionInfo("the same of axes that grasps make coincide", "rad")] = (
+        0.05
+    )
     bend_prior_std: Annotated[
         PositiveFloat,
-        OptionInfo("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad"),
+        OptionInfo("bend of a joint of mean stiffness that costs one standard deviation", "rad"),
     ] = 0.3
     max_iterations: Annotated[int, Ge(1), OptionInfo("at most so many in a pass")] = 25
     max_point_weight: Annotated[PositiveFloat, OptionInfo("a point counts at most for so many of the camera's")] = 6.0
@@ -333,9 +327,8 @@ class ShapeFitter:
         corners = self._links_at(q)
         touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING
         # the spread across the links about each point
-        wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(
-            shape_evidence.across_links(corners, sight.camera_position)
-        )
+        across = shape_evidence.across_links(corners, sight.camera_position)
+        wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across)
         swath = np.max(np.where(touching[..., None], wide[:, None], 0.0), axis=0)
         off_end, noise = np.zeros(places.shape), max(self.options.surface_noise_std, evidence.noise_std)
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
@@ -363,9 +356,8 @@ class ShapeFitter:
         """Cost, gradient and Gauss-Newton Hessian by the free bends."""
         out, jacobian = self._corners(q)
         corners, by_q = np.array(out).reshape(-1, 2, 3), np.array(jacobian)
-        surface = shape_evidence.nearest_surface_residuals(
-            corners, self.link_radii, task.points, task.camera, task.share
-        )
+        seen = task.points, task.camera, task.share
+        surface = shape_evidence.nearest_surface_residuals(corners, self.link_radii, *seen)
         link, error = surface.link_indices, surface.signed_distance
         square = (error / task.scale) ** 2
         cost = 0.5 * task.scale**2 * float(np.sum(task.weight * square / (1 + square)))

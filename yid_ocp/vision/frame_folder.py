@@ -246,10 +246,7 @@ def read_frame_folder(
 
 
 def write_frame_folder(sequence: FrameSequence, folder: str | os.PathLike[str]) -> None:
-    """Write a frame sequence as a folder of binary PLY clouds for `read_frame_folder`.
-
-    `OutputError` where the folder or a file cannot be written.
-    """
+    """Write a frame sequence as binary PLY clouds for `read_frame_folder`; `OutputError` where that is not possible."""
     path, o3d = files.make_folder(folder), import_open3d()
     names = [f"{i:06d}{_CLOUD_SUFFIXES[0]}" for i in range(len(sequence))]
     for i, name in enumerate(names):

@@ -215,10 +215,7 @@ class _InitialShape(NamedTuple):
 
 
 def system_with_free_root(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
-    """System with its object on six additional free joints, without grasps, and the names of these joints.
-
-    They are the root's place [m], then its turns about x, y and z [rad].
-    """
+    """System without grasps, its object on six free joints (place [m], turns about x, y, z [rad]), and their names."""
     tree = system.numeric_mechanism(values)
     q = ca.SX.sym("q", system.n_coordinates)
     base = tree.joint_index(next(s for s in system.segment_layouts if s.parent_segment is None).link_joints[0][0])
@@ -240,10 +237,7 @@ class _Link(NamedTuple):
 
 
 class InitialShapeFinder:
-    """Finder of initial shapes for an object of a numeric mechanism, which may bend some joints from rest (n,).
-
-    `lengths` are those of the links of every segment [m].
-    """
+    """Finder of initial shapes of an object that may bend some joints from rest (n,); `lengths` of its links [m]."""
 
     def __init__(
         self, system: System, tree: Mechanism, rest: Array, bends: Sequence[int], lengths: Mapping[str, Sequence[float]]
@@ -318,9 +312,8 @@ class InitialShapeFinder:
         anchors, width = [], trace.slice_width
         for corner, end in zip(self._corners, ends, strict=True):
             ahead = trace.outward_direction(end)
-            anchors.append(
-                ObservedObjectEnd(corner, ahead, trace.nodes[end] + 0.5 * width * ahead, width / np.sqrt(12.0))
-            )
+            middle = trace.nodes[end] + 0.5 * width * ahead
+            anchors.append(ObservedObjectEnd(corner, ahead, middle, width / np.sqrt(12.0)))
         return _InitialShape(q, place, tuple(anchors))
 
     def _rotations(self, q: Array) -> list[Array]:

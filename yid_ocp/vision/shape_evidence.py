@@ -283,10 +283,7 @@ def _swath(tubes: TubeLinks, seen: ProcessedFrameCloud, counted: BoolArray, link
 
 
 def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: float) -> tuple[float, BoolArray]:
-    """Where points end along the axis of a tube's last link, from its tip [m], NaN where that cannot be seen.
-
-    And which points lie about the axis between the tip and there.
-    """
+    """Where points end along a tube's last link, from its tip [m], NaN if unseen, and which lie in between."""
     (start, tip), radius, axis = tubes.link_ends[link], float(tubes.radius[link]), link_axes(tubes.link_ends)[link]
     thick = max(radius, 2 * seen._point_spacing)
     behind = max(3, int(float(np.linalg.norm(tip - start)) / thick))

@@ -168,10 +168,7 @@ class ArticulatedSurfaces:
     def is_within_surface_distance(
         self, points: Array, q: ArrayLike, reach: float, *, moving_only: bool = False
     ) -> BoolArray:
-        """Whether world points (N, 3) lie within `reach` [m] of a surface at a configuration (n,), shape (N,).
-
-        `moving_only` leaves out what is fixed to the world.
-        """
+        """Whether world points (N, 3) are within `reach` [m] of any, or any moving, surface at a configuration."""
         result = np.zeros(len(points), bool)
         for part, pose in enumerate(self.part_poses_at(q)):
             asked = np.flatnonzero(~result)
@@ -182,10 +179,7 @@ class ArticulatedSurfaces:
         return result
 
     def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
-        """Nearest moving surface of world points: distance (N,) [m], unit normal (N, 3) towards the point, part (N,).
-
-        Beyond `within` [m] they are infinite, zero and -1.
-        """
+        """Distance [m], unit normal towards the point and surface part; infinite, zero and -1 beyond `within` [m]."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
         for part, pose in enumerate(self.part_poses_at(q)):
@@ -389,10 +383,7 @@ def tube_link_lengths_and_radii(
 
 
 def tube_meshes_by_joint(system: System, values: Mapping[str, float] | None = None) -> dict[int, TriangleMesh]:
-    """Cylinders along the links of the object's tubes, with balls at the joints between them, in the joints' frames.
-
-    `DataError` where the system has no tubes.
-    """
+    """Cylinders along the object's links with balls between them, by joint, in its frame; `DataError` without tubes."""
     if not system.segment_layouts:
         raise DataError("the model has no object to see", hint="give it segments")
     meshes, sizes = dict[int, TriangleMesh](), tube_link_lengths_and_radii(system, values)
@@ -437,10 +428,7 @@ class DepthCamera:
     outlier_depth_range: float = 0.4  # [m], to either side of the true depth
 
     def _simulate_depth_image(self, depth: Array, cosine: Array, rng: np.random.Generator) -> Array:
-        """Measured depth image [m], NaN where nothing was measured.
-
-        From the true one [m], infinite where there is nothing, and the cosine of ray and normal, all (height, width).
-        """
+        """Measured depth [m], NaN for none, from true depth, infinite for none, and the cosine of ray and normal."""
         from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter  # slow to import
 
         scale, shape = self.intrinsics.fx * self.baseline, depth.shape

@@ -183,10 +183,8 @@ class FrameTracker:
         if looks:
             places = self.shape_fitter.points_at(looks[0].q)
             shared = float(calibration.point_std_from_calibration(places, 0 * places, np.zeros(len(places))).max())
-        asked = self.options.estimated_dimensions
-        sizes = sequence_calibration.estimate_and_check_dimensions(
-            self.system, self.parameter_values, asked, (noise, shared), fitted
-        )
+        of = self.system, self.parameter_values, self.options.estimated_dimensions
+        sizes = sequence_calibration.estimate_and_check_dimensions(*of, (noise, shared), fitted)
         if self.options.background_estimation == "frames":
             good = (pair for pair in last if not frame_selection.frame_rejection_reason(pair[1], pair[0], self.options))
             shapes = [shape.tube_links_at(fit.q) for shape, fit in good]
@@ -325,9 +323,8 @@ class FrameTracker:
         """Tracking result of the frames; `DataError` if none is good."""
         columns = [self.system.point_frames.index(name) for name in self.point_names]
         things = self.foreign_objects(frames)
-        measured = frame_selection.tracked_states_and_points(
-            frames, columns, common, things, self.options, self.sequence.source
-        )
+        of = common, things, self.options, self.sequence.source
+        measured = frame_selection.tracked_states_and_points(frames, columns, *of)
         place = self._shape(common.dimensions).points_at
         return TrackResult(
             self.point_names,
@@ -396,9 +393,8 @@ class FrameTracker:
             kept = ~self.robot_surfaces.is_within_surface_distance(cloud.points, q, filters.robot_padding)
         kept[kept] = ~background.is_near_background(cloud.points[kept])
         # beside the robot's points: among all surfaces, wrong points are few
-        cloud = cloud.select(
-            point_cloud.is_statistical_inlier(cloud, filters.outlier_neighbours, filters.outlier_z_max, kept)
-        )
+        alone = filters.outlier_neighbours, filters.outlier_z_max
+        cloud = cloud.select(point_cloud.is_statistical_inlier(cloud, *alone, kept))
         work.filtered = cloud
         work.say(n_filtered_points=len(cloud))
         if len(cloud) < filters.min_points:

@@ -196,10 +196,7 @@ def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Pictur
 
 
 def draw_tracked_points(track: TrackResult, file: str | os.PathLike[str]) -> None:
-    """Write a picture of the points over time: the good frames with two standard deviations, and the spline between.
-
-    `OutputError` where the file cannot be written.
-    """
+    """Write a picture of the points over time, two standard deviations and the spline; errors as `atomic_write`."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 2.2 * len(track.point_names) + 0.8), layout="constrained")

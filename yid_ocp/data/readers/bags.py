@@ -61,10 +61,7 @@ _MAX_METADATA_BYTES = 1 << 18  # of a bag's YAML, which is read slowly
 
 
 class OpenBag:
-    """An open ROS 1 bag, ROS 2 bag or MCAP file, with its `topics` and the `reader` of rosbags.
-
-    `DataError` where `rosbags` is not installed or the bag cannot be read.
-    """
+    """An open ROS 1 bag, ROS 2 bag or MCAP file, with the `reader` of rosbags; `DataError` where it cannot be read."""
 
     def __init__(self, path: Path) -> None:
         highlevel, typesys = (

@@ -67,10 +67,7 @@ _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 
 
 def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
-    """Unit of each quantity, from words such as `deg`, `mm`, or `velocity=rpm`, which goes before them.
-
-    `DataError` of what is no unit, and of two units of one quantity.
-    """
+    """Unit of each quantity, from words such as `deg` or, before these, `velocity=rpm`; `DataError` for none or two."""
     units, exact = dict[str, str](), dict[str, str]()
     for word in words:
         quantity, equals, unit = word.partition("=")
@@ -113,10 +110,7 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
 
 
 def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
-    """Mapping from recorded names to new names, parsed from `name` or `recorded=name`.
-
-    `DataError` for an empty name, or one that is given twice.
-    """
+    """Recorded names to new names, from `name` or `recorded=name`; `DataError` for an empty or a repeated one."""
     found: dict[str, str] = {}
     for entry in entries:
         recorded, equals, name = (part.strip() for part in entry.partition("="))

@@ -144,9 +144,8 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     for name, meaning, ok, column in zip(names, meanings, numeric, table.T, strict=True):
         kind, count = "numbers" if ok else "text", int(np.isfinite(column).sum())
         becomes, note = ":".join(filter(None, meaning or ())), "" if meaning else "its name does not say what it is"
-        sources.append(
-            base.FileDataSourceSummary(name, kind, count, base.mean_sample_rate(t) if ok else math.nan, becomes, note)
-        )
+        rate = base.mean_sample_rate(t) if ok else math.nan
+        sources.append(base.FileDataSourceSummary(name, kind, count, rate, becomes, note))
     notes = [f"{bad} of {n_lines} lines are no rows of numbers"] if bad else []
     clean = table[np.isfinite(t)]
     try:
