@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import scipy.special
+from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.data.issues import (
@@ -48,11 +49,11 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
             continue
         same = np.all(np.diff(values.reshape(len(t), -1), axis=0) == 0, axis=1)
         quantity, _, name = channel.partition(".")
-        velocity = None
+        turned_by = np.zeros(len(t))
         if joints is not None and quantity == "position" and joints.velocity is not None:
-            velocity = joints.velocity[:, joints.names.index(name)]
+            turned_by = cumulative_trapezoid(joints.velocity[:, joints.names.index(name)], t, initial=0)
         runs = [
-            (begin, end, 0.0 if velocity is None else _rotation(t[begin : end + 1], velocity[begin : end + 1]))
+            (begin, end, float(np.ptp(turned_by[begin : end + 1])))
             for begin, end in _repeated_stretches(same)
             if end - begin >= QUALITY_LIMITS.min_stuck_samples and t[end] - t[begin] >= QUALITY_LIMITS.min_stuck_time
         ]
@@ -79,12 +80,6 @@ def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
             what += f", while its velocity turns it by {turned:.2g} rad" if turned > unseen else ""
             advice = "leave that stretch or that channel out, and look at the sensor"
             yield Issue("stuck", what, "not_trusted", evidence, advice, "", group, channel, start, stop)
-
-
-def _rotation(t: Array, velocity: Array) -> float:
-    """Range of the angle that a velocity turns through [rad]."""
-    area = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t))])
-    return float(np.ptp(area))
 
 
 def _comes_to_rest(values: Array, begin: int, end: int) -> bool:
@@ -171,7 +166,7 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
             yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
             continue
         seen = max(white_noise_std(t, column) for column in columns)
-        if _clock(recording, group) == "nominal":
+        if next(entry.clock for entry in recording.groups if entry.name == group) == "nominal":
             # when a sample was taken is known to half a period, which looks like noise wherever something moves
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:
@@ -223,10 +218,6 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
         setting = f"sensors.{sensor}.std: {line}" if len(low) == len(entries) or line[0] == "{" else ""
         group = sensor.partition(".")[0]
         yield Issue("noise_overstated", what, "warning", ratio, advice, "", group, channel, setting=setting)
-
-
-def _clock(recording: Recording, name: str) -> str:
-    return next(group.clock for group in recording.groups if group.name == name)
 
 
 def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:

@@ -12,6 +12,7 @@ from itertools import chain, combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data import channel_checks
@@ -202,7 +203,7 @@ def _windowed_rates(t: Array, values: Array, rates: Array) -> tuple[Array, Array
     starts = np.arange(0, max(len(t) - width, 1), max(1, width // 2))
     ends = np.minimum(starts + width, len(t) - 1)
     length = (t[ends] - t[starts])[:, None]
-    area = np.vstack([np.zeros(rates.shape[1]), np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(t)[:, None], 0)])
+    area = cumulative_trapezoid(rates, t, axis=0, initial=0)
     good = (length[:, 0] > 0) & (length[:, 0] < 3 * np.median(length))
     by_value, by_rate = ((x[ends] - x[starts])[good] / length[good] for x in (values, area))
     return by_value, by_rate
@@ -284,7 +285,9 @@ def _transitions(one: JointOrPointGroup, other: JointOrPointGroup) -> tuple[IntA
     """Numbers of the changes of two groups' samples, equal where what changes, and after how long, is; no rests."""
     changes = []
     for group in (one, other):
-        rows = _rows(group)
+        rows = np.nan_to_num(group.position.reshape(len(group.t), -1))
+        if isinstance(group, JointGroup) and group.effort is not None:
+            rows = np.hstack([rows, np.nan_to_num(group.effort)])
         kept = np.concatenate([[True], np.any(np.diff(rows, axis=0) != 0, axis=1)])
         rows, t = rows[kept], group.t[kept]
         changes.append(np.hstack([rows[:-1], rows[1:], np.rint(np.diff(t) / _INTERVAL_GRID)[:, None]]))
@@ -320,12 +323,6 @@ def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
     first = (again + 1) / (pairs + 1)
     going_on = (again_twice + first) / (again + 1)
     return math.log(len(one) * len(other) * first) + (length - 1) * math.log(going_on)
-
-
-def _rows(group: JointOrPointGroup) -> Array:
-    if isinstance(group, PointGroup):
-        return np.nan_to_num(group.position.reshape(len(group.t), -1))
-    return group.position if group.effort is None else np.hstack([group.position, np.nan_to_num(group.effort)])
 
 
 def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:

@@ -30,14 +30,8 @@ JOINT_CHANNEL_UNITS: Mapping[str, str] = {
 }
 """Channels of a joint group and their units."""
 
-JOINT_CONSTANT_NAMES = (
-    "position_std",
-    "velocity_std",
-    "effort_std",
-    "effort_bias_std",
-    "position_resolution",
-    "proportional_gain",
-)
+_STD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
+JOINT_CONSTANT_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
 """Constants that a joint group may have, not negative, of all joints or one for each."""
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""

@@ -81,31 +81,28 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
         if recording.true_parameters:
             file.attrs["truth"] = json.dumps({key: float(value) for key, value in recording.true_parameters.items()})
         if recording.joints is not None:
-            _write_group(file.create_group("joints"), recording.joints, _JOINT_UNITS, _JOINT_ATTRIBUTES)
+            _write_group(file.create_group("joints"), vars(recording.joints), _JOINT_UNITS, _JOINT_ATTRIBUTES)
         for group in recording.points:
             attributes = [name for name in _POINT_ATTRIBUTES if name != "std"]
-            _write_group(file.create_group(group.name), group, _POINT_UNITS, attributes)
+            _write_group(file.create_group(group.name), vars(group), _POINT_UNITS, attributes)
         for channels in recording.channel_groups:
-            target, declared = file.create_group(channels.name), declared_channel_kinds(channels.name)
-            units = {"t": "s"} | {c.quantity: c.unit for c in declared}
-            for name, values in {"t": channels.t, **channels.values}.items():
-                target.create_dataset(name, data=values).attrs["unit"] = units[name]
-            names = np.array(channels.names, dtype=h5py.string_dtype())
-            target.attrs.update(names=names, clock=channels.clock, **channels.stds)
+            units = {"t": "s"} | {c.quantity: c.unit for c in declared_channel_kinds(channels.name)}
+            content = {**vars(channels), **channels.values, **channels.stds}
+            _write_group(file.create_group(channels.name), content, units, ("names", "clock", *channels.stds))
         if recording.marker_reference_pose is not None:
             file.create_dataset(_STRAIGHT, data=recording.marker_reference_pose).attrs["unit"] = "m"
 
 
 def _write_group(
-    target: h5py.Group, group: JointGroup | PointGroup, units: Mapping[str, str], attributes: Iterable[str]
+    target: h5py.Group, content: Mapping[str, Any], units: Mapping[str, str], attributes: Iterable[str]
 ) -> None:
     for name, unit in units.items():
-        if getattr(group, name) is not None:
-            target.create_dataset(name, data=getattr(group, name)).attrs["unit"] = unit
+        if content.get(name) is not None:
+            target.create_dataset(name, data=content[name]).attrs["unit"] = unit
     for name in attributes:
-        if getattr(group, name) is not None:
-            value = getattr(group, name)
-            target.attrs[name] = np.array(value, dtype=h5py.string_dtype()) if name == "names" else value
+        if content[name] is not None:
+            own = content[name]
+            target.attrs[name] = np.array(own, dtype=h5py.string_dtype()) if name == "names" else own
 
 
 def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:

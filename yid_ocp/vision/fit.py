@@ -42,10 +42,7 @@ from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
 _Left = tuple[BoolArray, BoolArray]
 """Which of a frame's nodes and points count."""
-_GRASP_FRAMES = ("holder_frame", "held_frame")
-_NODE_RADIUS_FRACTION = math.pi / 4
-"""Distance of the mean of a tube's visible half from its axis, as a fraction of its radius."""
-
+_NODE_RADIUS_FRACTION = math.pi / 4  # of a tube's, at which the mean of its visible half lies from its axis
 _SIGMAS = 3.0  # of a point, beyond which an end stands elsewhere than the shape has it
 _NEAR = 3.0  # times the last scale, beyond which a point says nothing of the shape
 _TOUCHING = 1e-3  # [m]
@@ -150,7 +147,10 @@ class ShapeFitter:
             return ca.Function("places", [q], ca.cse([entry, slope]))
 
         self._corners, self._seen, self._held = with_slope(corners), with_slope(seen), with_slope(held)
-        ends = [[kinematics.frame_position(getattr(g, name)) for g in system.grasps] for name in _GRASP_FRAMES]
+        ends = [
+            [kinematics.frame_position(getattr(g, name)) for g in system.grasps]
+            for name in ("holder_frame", "held_frame")
+        ]
         grippers, taken = (ca.densify(ca.vertcat(ca.SX(0, 1), *places)) for places in ends)
         self._holders, self._gap = ca.Function("holders", [q], [grippers]), ca.Function("gap", [q], [ca.densify(gap)])
         # how all this moves as the tubes grow

@@ -300,7 +300,9 @@ class InitialShapeFinder:
         reaches = zip(ends[1:], self._root_to_tip_lengths, strict=True)
         courses = [_Course(trace.path_between(ends[0], end), reach) for end, reach in reaches]
         q, first = self._rest.copy(), self._links[0]
-        turned = self._rotations(q)
+        turned: list[Array] = []  # orientation of every joint's moving frame in the world
+        for j, parent in enumerate(self._parent):
+            turned.append((turned[parent] if parent >= 0 else np.eye(3)) @ self._own(j, q[j]))
         aim = courses[first.tip].direction(first.begin, first.end)
         carry = Rotation.align_vectors(aim, turned[first.joints[-1]][:, 2])[0].as_matrix()
         for link in self._links[1:]:
@@ -315,13 +317,6 @@ class InitialShapeFinder:
             middle = trace.nodes[end] + 0.5 * width * ahead
             anchors.append(ObservedObjectEnd(corner, ahead, middle, width / np.sqrt(12.0)))
         return _InitialShape(q, place, tuple(anchors))
-
-    def _rotations(self, q: Array) -> list[Array]:
-        """Orientation of every joint's moving frame in the world."""
-        turned: list[Array] = []
-        for j, parent in enumerate(self._parent):
-            turned.append((turned[parent] if parent >= 0 else np.eye(3)) @ self._own(j, q[j]))
-        return turned
 
     def _own(self, joint: int, value: float) -> Array:
         if not self._turns[joint] or value == 0.0:

@@ -24,16 +24,12 @@ _PROGRESS_INTERVAL = 5000  # messages from one word of progress to the next
 JOINT_STATE_MESSAGE_TYPE = "sensor_msgs/msg/JointState"
 """ROS type name of joint state messages."""
 _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
-_POSES = (
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "geometry_msgs/msg/TransformStamped",
-)
+_POSES = tuple(f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance", "Transform"))
 _TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PLACES = (_POINT_STAMPED, *_POSES)
 _KNOWN = (JOINT_STATE_MESSAGE_TYPE, *_PLACES)
+# last parts of topics that say what a message is, not what was seen
 _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom")
-"""Last parts of topics that say what a message is, not what was seen."""
 
 
 # -- an open bag ------------------------------------------------------------------------------------------------------
@@ -158,10 +154,6 @@ class BagOptions(base.SelectionAndUnitOptions):
 _DEFAULTS = BagOptions()
 
 
-@base.READERS.register(".bag")
-@base.READERS.register(".mcap")
-@base.READERS.register(".db3")
-@base.READERS.register("folder")
 def read_bag(
     path: str | os.PathLike[str], options: BagOptions = _DEFAULTS, progress: Progress = NULL_PROGRESS
 ) -> Recording:
@@ -203,10 +195,6 @@ def read_bag(
     return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, points=None))
 
 
-@base.FILE_PREVIEWERS.register(".bag")
-@base.FILE_PREVIEWERS.register(".mcap")
-@base.FILE_PREVIEWERS.register(".db3")
-@base.FILE_PREVIEWERS.register("folder")
 def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> base.FilePreview:
     """What a bag holds: its topics, what they would become, and units that their values look like."""
     path = Path(path)
@@ -235,6 +223,11 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     return base.FilePreview(tuple(sources), options, (*notes, *why))
 
 
+for _kind in (".bag", ".mcap", ".db3", "folder"):
+    base.READERS.register(_kind)(read_bag)
+    base.FILE_PREVIEWERS.register(_kind)(_preview_bag)
+
+
 def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Contents:
     """Decode what can be used of a bag; of trees of transforms the named frames, all of them for None."""
     bag, states, places = OpenBag(path), list[BagMessage](), list[BagMessage]()
@@ -248,23 +241,19 @@ def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _C
                 progress.report_parts_done(done, total, "messages")
             content: Any = reader.deserialize(data, connection.msgtype)
             if connection.msgtype in _TREES:
-                found = _tree(connection.topic, logged, content)
-                places += [message for message in found if trees is None or message.source in trees]
+                for part in content.transforms:
+                    source = f"{connection.topic}:{part.child_frame_id.strip('/')}"
+                    if trees is None or source in trees:
+                        places.append(_message(source, logged, part, _POSES[2]))
                 continue
-            plain = _plain(content, connection.msgtype)
-            message = BagMessage(connection.topic, int(logged), _stamp(content), plain)
+            message = _message(connection.topic, logged, content, connection.msgtype)
             (states if connection.msgtype == JOINT_STATE_MESSAGE_TYPE else places).append(message)
     return _Contents(bag, states, places)
 
 
-def _stamp(content: Any) -> int:
-    return int(content.header.stamp.sec) * 10**9 + int(content.header.stamp.nanosec)
-
-
-def _tree(topic: str, logged: int, content: Any) -> Iterator[BagMessage]:
-    for transform in content.transforms:
-        plain = _plain(transform, _POSES[2])
-        yield BagMessage(f"{topic}:{transform.child_frame_id.strip('/')}", int(logged), _stamp(transform), plain)
+def _message(source: str, logged: int, content: Any, kind: str) -> BagMessage:
+    stamp = int(content.header.stamp.sec) * 10**9 + int(content.header.stamp.nanosec)
+    return BagMessage(source, int(logged), stamp, _plain(content, kind))
 
 
 def _plain(content: Any, kind: str) -> SimpleNamespace:

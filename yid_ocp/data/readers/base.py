@@ -144,26 +144,22 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAnd
     """
     factors = _factors(options.units or {}, where)
     group = raw.joints
-    if group is not None and options.joints is not None:
-        group = _chosen_joints(group, parse_renamings(options.joints, "joint", where), where)
     if group is not None:
-        channels: dict[str, Any] = {name: factors[name] * values for name, values in group.channels.items()}
+        names = {name: name for name in group.names}
+        if options.joints is not None:
+            names = parse_renamings(options.joints, "joint", where)
+            _check_known(names, group.names, "joint", where)
+        at = [group.names.index(name) for name in names]
+        channels: dict[str, Any] = {name: factors[name] * values[:, at] for name, values in group.channels.items()}
         if "effort" in channels:
-            channels["effort"] = channels["effort"] * _torque_factors(group.names, options, where)
-        group = replace(group, t=factors["t"] * group.t, **channels)
+            channels["effort"] = channels["effort"] * _torque_factors(tuple(names.values()), options, where)
+        group = replace(group, names=tuple(names.values()), t=factors["t"] * group.t, **channels)
     seen = []
     for entry in raw.points if options.points is None else _chosen_points(raw.points, options.points, where):
         std = None if entry.std is None else factors["points"] * entry.std
         t, position = factors["t"] * entry.t, factors["points"] * entry.position
         seen.append(replace(entry, t=t, position=position, std=std))
     return validate_recording(replace(raw, joints=group, points=tuple(seen)), where=where)
-
-
-def _chosen_joints(group: JointGroup, chosen: Mapping[str, str], where: str) -> JointGroup:
-    _check_known(chosen, group.names, "joint", where)
-    at = [group.names.index(name) for name in chosen]
-    channels: dict[str, Any] = {name: values[:, at] for name, values in group.channels.items()}
-    return replace(group, names=tuple(chosen.values()), **channels)
 
 
 def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], where: str) -> tuple[PointGroup, ...]:

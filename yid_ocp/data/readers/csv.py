@@ -133,7 +133,11 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     meanings = [_conventional_meaning(name) for name in names]
     if "header" in options and len(table) > 1 and np.all(np.diff(table[:, 0]) > 0):
         meanings[0] = ("t", "")
-    unknown = {name: _proposed(name, bool(ok)) for name, m, ok in zip(names, meanings, numeric, strict=True) if not m}
+    unknown = {}
+    for name, meaning, ok in zip(names, meanings, numeric, strict=True):
+        if not meaning:  # one to be filled in
+            guess = "CHANNEL:JOINT" if name.isdecimal() else f"CHANNEL:{name}"
+            unknown[name] = guess if ok else base.SKIPPED_COLUMN_MEANING
     if "header" in options and meanings[0]:
         unknown = {names[0]: "t", **unknown}
     if unknown:
@@ -155,13 +159,6 @@ def _preview_csv(path: str | os.PathLike[str]) -> base.FilePreview:
     if units:
         options["units"] = units
     return base.FilePreview(tuple(sources), options, (*notes, *why))
-
-
-def _proposed(name: str, numeric: bool) -> str:
-    """A meaning to be filled in for a column whose name does not say it."""
-    if not numeric:
-        return base.SKIPPED_COLUMN_MEANING
-    return "CHANNEL:JOINT" if name.isdecimal() else f"CHANNEL:{name}"
 
 
 _ALLOWED = "one header row with names such as t, q_<joint>, effort_<joint>, <point>_x"
