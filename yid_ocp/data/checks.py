@@ -16,20 +16,12 @@ from scipy.integrate import cumulative_trapezoid
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data import channel_checks
-from yid_ocp.data.issues import (
-    DEGREES_PER_RADIAN,
-    MAX_ISSUE_EVIDENCE,
-    MIN_UNIX_TIME_SECONDS,
-    QUALITY_LIMITS,
-    SECONDS_PER_CLOCK_UNIT,
-    Issue,
-    JointOrPointGroup,
-    SensorOptionsLookup,
-    median_sample_period,
-)
+from yid_ocp.data.issues import MAX_ISSUE_EVIDENCE, QUALITY_LIMITS, Issue, SensorOptionsLookup, median_sample_period
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.display import count_with_noun
 
+_CLOCK_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}  # [s]
+_MIN_UNIX_TIME = 1e8  # from which on a time stamp is taken as seconds since 1970 instead of since power-on [s]
 _MAX_SAMPLE_GAP = 0.1  # between samples that is interpolated; arm motion has a bandwidth of 5 Hz [s]
 _MAX_MISSING_PERIODS = 5  # sample periods that may always be missing
 _MIN_PART_DURATION = 0.5  # of a part of a recording that is kept [s]
@@ -141,7 +133,7 @@ def _units_of_time(recording: Recording) -> Iterator[Issue]:
         if step <= slowest:
             continue
         what, advice = f"{group.name}/t has a sample every {step:.4g} s", "write times in seconds"
-        for unit, size in SECONDS_PER_CLOCK_UNIT.items():
+        for unit, size in _CLOCK_UNITS.items():
             if 2e-4 <= step * size <= 2 * slowest:
                 what += f": in {unit} it would be {1 / (step * size):.4g} Hz"
                 advice += f" (divide by {1 / size:.0e})"
@@ -158,7 +150,7 @@ def _common_clock(recording: Recording) -> Iterator[Issue]:
         begin, end = group.t[0], group.t[-1]
         if end < first or begin > last:
             far = min(abs(begin - last), abs(first - end))
-            epoch = (abs(begin) > MIN_UNIX_TIME_SECONDS) != (abs(first) > MIN_UNIX_TIME_SECONDS)
+            epoch = (abs(begin) > _MIN_UNIX_TIME) != (abs(first) > _MIN_UNIX_TIME)
             since = "one of them counts from 1970: " if epoch else ""
             spans = f"from {first:.10g} to {last:.10g} s, {group.name} from {begin:.10g} to {end:.10g} s"
             ratio = MAX_ISSUE_EVIDENCE if epoch else 1 + far / max(last - first, 1e-9)
@@ -232,7 +224,7 @@ def _velocities(recording: Recording) -> Iterator[Issue]:
     if alike and typical > 0 and len(known) >= min(2, len(names)):
         cause, channel = "time_scale", "t"
         advice = f"multiply times by {typical:.3g}, or find what is wrong with velocities"
-        if abs(typical / DEGREES_PER_RADIAN - 1) < 0.1:
+        if abs(typical / math.degrees(1.0) - 1) < 0.1:
             cause, channel, advice = "degrees", "position", "convert angles to radians"
         what = f"all angles turn {typical:.3g} times as fast as the recorded velocities say"
         ratio_beyond = max(typical, 1 / typical) / QUALITY_LIMITS.max_rate_ratio
@@ -281,7 +273,7 @@ def _standstill(recording: Recording) -> Iterator[Issue]:
 # -- several recordings -----------------------------------------------------------------------------------------------
 
 
-def _transitions(one: JointOrPointGroup, other: JointOrPointGroup) -> tuple[IntArray, IntArray]:
+def _transitions(one: JointGroup | PointGroup, other: JointGroup | PointGroup) -> tuple[IntArray, IntArray]:
     """Numbers of the changes of two groups' samples, equal where what changes, and after how long, is; no rests."""
     changes = []
     for group in (one, other):

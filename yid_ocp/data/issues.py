@@ -10,17 +10,12 @@ from typing import Literal
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.recording import JointGroup, PointGroup
 from yid_ocp.sensors import SensorOptions
 
-JointOrPointGroup = JointGroup | PointGroup
 Severity = Literal["warning", "not_trusted", "refused"]
 
 MAX_ISSUE_EVIDENCE = 1e3
 """Largest value of `Issue.evidence`; larger ratios are clipped."""
-SECONDS_PER_CLOCK_UNIT: Mapping[str, float] = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
-MIN_UNIX_TIME_SECONDS = 1e8
-"""Smallest time stamp that is taken as seconds since 1970 (Unix time) instead of since power-on [s]."""
 DEGREES_PER_RADIAN = math.degrees(1.0)
 MIN_DIFFERENCES_FOR_NOISE_STD = 30
 """Smallest number of differences between samples from which a channel's noise is estimated."""

@@ -14,6 +14,7 @@ of the coefficients: sensor_msgs/CameraInfo of ROS (REP 104).
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import math
 from collections.abc import Callable, Sequence
@@ -54,13 +55,11 @@ class CameraIntrinsics:
     coefficients: tuple[float, ...] = ()  # empty for a lens without distortion
 
     def __post_init__(self) -> None:
-        if not any(self.coefficients):
-            return
-        if self.model not in _DISTORTION_COEFFICIENT_COUNTS:
+        if self.has_distortion and self.model not in _DISTORTION_COEFFICIENT_COUNTS:
             known = unknown_name_details(self.model, _DISTORTION_COEFFICIENT_COUNTS)
             raise DataError(f"the distortion is '{self.model}'", where="intrinsics", **known)
-        count = _DISTORTION_COEFFICIENT_COUNTS[self.model]
-        if len(self.coefficients) not in count or not np.isfinite(self.coefficients).all():
+        count = _DISTORTION_COEFFICIENT_COUNTS.get(self.model, ())
+        if self.has_distortion and (len(self.coefficients) not in count or not np.isfinite(self.coefficients).all()):
             what = f"the distortion '{self.model}' has the coefficients {self.coefficients}"
             raise DataError(what, where="intrinsics", allowed=f"{' or '.join(map(str, count))} numbers")
 
@@ -96,8 +95,7 @@ class CameraIntrinsics:
         """Whether each pixel of a depth image is measured, shape (height, width); `DataError` for another size."""
         if depth.shape != (self.height, self.width):
             raise DataError(f"the depth image has shape {depth.shape}", allowed=f"({self.height}, {self.width})")
-        measured = np.isfinite(depth) & (depth > 0)
-        return np.asarray(measured & np.isfinite(self.pixel_rays[..., 0])) if self.has_distortion else measured
+        return np.asarray(np.isfinite(depth) & (depth > 0) & np.isfinite(self.pixel_rays[..., 0]))
 
     def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
         square = x**2 + y**2
@@ -153,13 +151,11 @@ XTION_INTRINSICS = CameraIntrinsics.from_field_of_view(640, 480, math.radians(58
 def import_open3d() -> ModuleType:
     """The open3d package; `DataError` where it is not installed or cannot be loaded."""
     hint = "pip install 'yid-ocp[vision]'"
-    try:
+    with contextlib.suppress(ImportError, OSError):  # the system may have its own
         # the wheel of open3d wants the system's libusb, which a bare machine does not have
         import libusb_package
 
         ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
-    except (ImportError, OSError):
-        pass  # the system may have its own
     try:
         import open3d
     except (ImportError, OSError) as error:
@@ -263,9 +259,7 @@ class OcclusionMap:
         if hidden.all():
             return hidden
         tree, distance = self._about(asked[~hidden], wide[~hidden])
-        if not len(distance):
-            return hidden
-        for i in np.flatnonzero(~hidden):
+        for i in np.flatnonzero(~hidden) if len(distance) else ():
             there = distance[tree.query_ball_point(asked[i], wide[i])]
             limit = depth[i] - radius[i] - margin
             before = len(there) and np.mean(there < limit) > _HALF

@@ -364,9 +364,8 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
         # the package's folder is the URDF's own or one above it, whether or not it still has its name
         parts = Path(package).parts
         candidates = [above / Path(*rest) for above in urdf.parents for rest in (parts, parts[1:]) if rest]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
+    if found := next((candidate for candidate in candidates if candidate.is_file()), None):
+        return found
     raise ModelError(f"the mesh '{name}' is not there", where=str(urdf), hint="keep meshes beside the URDF's package")
 
 

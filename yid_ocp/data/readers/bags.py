@@ -355,7 +355,9 @@ def _on_one_clock(
     for entry in groups:
         if entry.command:
             group = _joint_group(entry, seconds, f"{where}: {entry.topic}")
-            together = replace(together, position_command=base.zero_order_hold_positions(group, together.t))
+            # each command is held until the next; before the first it is that
+            held = group.position[np.maximum(np.searchsorted(group.t, together.t + 1e-9, side="right") - 1, 0)]
+            together = replace(together, position_command=held)
     return together, notes
 
 

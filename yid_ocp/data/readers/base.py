@@ -293,11 +293,6 @@ def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str)
     return replace(clock, names=names, t=t, **channels), tuple(notes)
 
 
-def zero_order_hold_positions(group: JointGroup, t: Array) -> Array:
-    """Joint positions at other times by zero-order hold, shape (N, nj); the first sample's before it."""
-    return group.position[np.maximum(np.searchsorted(group.t, t + 1e-9, side="right") - 1, 0)]
-
-
 def _can_interpolate(known: Array, t: Array) -> BoolArray:
     """Whether each time is a sample or lies between two samples close enough to interpolate."""
     after = np.searchsorted(known, t)
