@@ -341,7 +341,6 @@ class _Parser(argparse.ArgumentParser):
     """An argument parser that raises `ConfigError` with the nearest known name."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """Parse as in `argparse`; unknown arguments are an error of the command."""
         found, rest = super().parse_known_args(args, namespace)
         if rest:
             flag, flags = rest[0].partition("=")[0], [name for name in self._option_string_actions if name[:2] == "--"]
@@ -351,7 +350,6 @@ class _Parser(argparse.ArgumentParser):
         return found, rest
 
     def error(self, message: str) -> NoReturn:
-        """Raise a `ConfigError` for argparse's message."""
         chosen = re.fullmatch(r"argument (\S+): invalid choice: '?(.*?)'? \(choose from (.*)\)", message, re.DOTALL)
         if chosen:
             known = [name.strip(" '") for name in chosen[3].split(",")]
@@ -385,7 +383,6 @@ class _LossyStream:
         self._stream = stream
 
     def write(self, text: str) -> int:
-        """Write text as far as that is possible; returns its length."""
         try:
             self._stream.write(text)
             self._stream.flush()
@@ -486,7 +483,6 @@ def _parsed_and_carried_out(argv: Sequence[str] | None, as_json: bool) -> int:
 
 
 def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
-    """Run a command; returns its exit code."""
     try:
         os.getcwd()
     except OSError as error:
@@ -515,7 +511,6 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
 
 
 def _failed(error: Exception, as_json: bool) -> int:
-    """Print why a command failed; returns its exit code."""
     if isinstance(error, YidError):
         return _wrong(error, as_json)
     if isinstance(error, BrokenPipeError):

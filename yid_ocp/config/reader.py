@@ -260,7 +260,6 @@ class _Reader:
         return f"{self.origin}: {key}" if key else self.origin
 
     def build(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
-        """A value of the given type."""
         sections, entries = schema.section_variants_from_annotation(hint), options.tuple_entry_type(hint)
         inner = schema.section_variants_from_annotation(options.mapping_value_type(hint))
         if sections is not None:

@@ -152,7 +152,6 @@ class _Proof:
     workers: WorkerConfig | Executor
 
     def config_file(self, name: str) -> Path:
-        """The copy of a configuration."""
         return self.folder / "configs" / f"{name}.yaml"
 
     def commit(self) -> tuple[dict[str, Any], list[Task]]:
@@ -178,7 +177,6 @@ class _Proof:
         return said, tasks
 
     def _draw(self, commitment: Path, configs: Mapping[str, str]) -> None:
-        """Draw the cases and commit to their labels."""
         cases, prepared = self.folder / "cases", self.folder / "prepared"
         try:
             for part in (self.folder / "configs", prepared, cases, self.folder / "sealed/drawn"):
@@ -323,13 +321,11 @@ class _ExperimentVariation:
     has_prescribed_arms: bool = False
 
     def simulation_overrides(self) -> tuple[str, ...]:
-        """Setting overrides of the model that simulates the recordings."""
         # what is said of the object and of what sees it means nothing without it
         bare = ("model.object=null", "model.grasp={}", "model.points=null", "sensors={}", "parameters={}")
         return bare if self.is_without_object else ()
 
     def diagnosis_overrides(self, driven: Sequence[str]) -> list[str]:
-        """Setting overrides of the model that is diagnosed."""
         own = list(self.simulation_overrides())
         if self.is_without_object:
             free = {f"{name}.damping": {"free": True, "bounds": [0.0, 50.0]} for name in driven}
@@ -365,7 +361,6 @@ class BlindExperiment:
         return load_config(self.config_file, EXPERIMENT_VARIATIONS[self.variation].simulation_overrides())
 
     def _recording_conditions(self) -> blind.SyntheticRecordingConditions:
-        """Conditions under which the recordings are simulated, without the camera."""
         varied = EXPERIMENT_VARIATIONS[self.variation]
         noise = ArmSensorNoise()
         if varied.has_torque_noise:
@@ -398,13 +393,12 @@ class BlindExperiment:
         raise ModelError(what, where=f"{self.config_file.name}, {varied.description}", hint=hint)
 
     def _build_ensemble(self, first: Path) -> tuple[RunSettings, blind.BlindCaseGenerator]:
-        """Settings of the diagnosed model and the ensemble, built from the first recording."""
         return _ensemble(self, first, first.stat().st_mtime_ns)
 
 
 @functools.lru_cache(maxsize=1)
 def _ensemble(experiment: BlindExperiment, first: Path, written: int) -> tuple[RunSettings, blind.BlindCaseGenerator]:
-    """See `BlindExperiment._build_ensemble`; kept with its compiled step for the next task of the same experiment."""
+    """Settings of the diagnosed model and the ensemble, kept for the next task of the same experiment."""
     del written
     varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
     simulated = build_system(simulated_run)
@@ -423,7 +417,6 @@ def _ensemble(experiment: BlindExperiment, first: Path, written: int) -> tuple[R
 
 
 def _require_compatible(run: RunSettings) -> None:
-    """Raise an error for configurations that a blind validation does not support."""
     if run.diagnosis.noise_fraction < 1 or any(entry.std is not None for entry in run.sensors.values()):
         what = "virtual recordings have the noise of `run_virtual_experiment`, not that of these settings"
         raise run.config_error(what, "sensors", hint="leave sensors.*.std and diagnosis.noise_fraction out")

@@ -126,7 +126,6 @@ def arms_are_estimated_states(run: RunSettings) -> bool:
 
 
 def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float], float]:
-    """Damping of every joint of the robot, and of the object's joints."""
     said, has_object = run.model.damping, run.model.object is not None
     if isinstance(said, Mapping):
         known = (*joints, _OBJECT_DAMPING_KEY) if has_object else joints
@@ -151,7 +150,6 @@ def _dampings(run: RunSettings, joints: Sequence[str]) -> tuple[dict[str, float]
 
 
 def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
-    """The system of an object that brings its clamps."""
     for key in ("robot", "grasp", "springs", "clamps", "frames"):
         if getattr(run.model, key):
             what = f"a {kind} takes no {key}: its clamps hold it"
@@ -296,7 +294,6 @@ def system_with_second_arm(run: RunSettings, system: System) -> System | None:
 
 
 def _clamp_mechanism(run: RunSettings) -> Mechanism | None:
-    """Mechanism of the clamps that move an object without a robot; None without clamps."""
     model, arms = run.model, run.model.arms
     if model.robot is not None:
         if model.clamps:

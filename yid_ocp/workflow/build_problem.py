@@ -143,13 +143,12 @@ def initial_grasp_closure_errors(problem: EstimationProblem, episode: Episode) -
     names = (*system.driven, *system.prescribed)
     posture = dict(zip(names, map(float, episode.initial_known_coordinates), strict=True))
     theta = problem.theta.copy()
-    for name, value in problem.options.parameters_by_recording.get(episode.name, {}).items():
+    for name, value in episode.known_parameters.items():
         theta[system.parameters.index(name)] = value
     return min_grasp_closure_errors(system, posture, theta)
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
-    """Raise an error for recordings at whose first configuration a grasp cannot be closed."""
     hint = "check the object's lengths and mount, the grasp's frames and the recording's joints"
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
         hint = f"first look at what is in doubt: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
@@ -254,7 +253,6 @@ def _once(
 
 
 def _duplicate(others: Sequence[Recording], recording: Recording) -> tuple[Issue, Recording] | None:
-    """What says that a recording is one of the others, and which."""
     return next(((same, other) for other in others if (same := duplicate_data_issue(other, recording))), None)
 
 
@@ -297,7 +295,6 @@ def _excitation(
 
 
 def _is_modelled(system: System, doubt: Issue) -> bool:
-    """Whether an effect of the model already accounts for the issue."""
     kinds = _EFFECTS_BY_CAUSE.get(doubt.cause, ())
     places = {effect.location for effect in system.effects if effect.kind in kinds}
     if "camera_latency" in kinds and "camera_latency" not in doubt.setting:  # no camera's clock

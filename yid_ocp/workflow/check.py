@@ -42,7 +42,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResult[None]:
-    """Validate a run without solving it; warnings say what will work but should be looked at."""
     with atomic_run_folder(run, out, "check") as folder:
         folder.record_run_start(run, "check")
         warnings: list[str] = []

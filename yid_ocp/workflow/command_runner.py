@@ -103,7 +103,6 @@ class _RemainingTime:
         self._first: tuple[int, float] | None = None
 
     def remaining_text(self, done: int, total: int) -> str:
-        """Text with the remaining time of a stage; empty for short stages or before an estimate exists."""
         now = time.monotonic()
         # what stood there before this run began took no time
         known, begun = self._first = self._first or (done, now)
@@ -172,7 +171,6 @@ class _BarProgress(Progress):
             self._bars.update(self._task, description=words, completed=done, total=total)
 
     def finish_stage(self) -> None:
-        """Finish the running stage and print its duration."""
         if self._task is not None:
             self._bars.remove_task(self._task)
             self._task = None

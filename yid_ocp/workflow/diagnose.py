@@ -194,7 +194,6 @@ def _held_out_predictions(finding: DiagnosisResult) -> list[HeldOutPredictionPai
 
 
 def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]) -> list[Animation]:
-    """What was predicted of every held-out recording, without the effects and with them."""
     fits = {"nominal model": finding.nominal_model}
     fits |= {"with the effects": finding.final_model} if finding.accepted_effects else {}
     scenes = []

@@ -109,11 +109,9 @@ class _CalibratedModel:
         return build_system(replace(run, model=replace(run.model, effects=effects), parameters=parameters))
 
     def values_for(self, system: System) -> dict[str, float]:
-        """Values of the parameters that a system has."""
         return {name: value for name, value in self.parameter_values.items() if name in system.parameters}
 
     def text(self, form: str, system: System) -> str:
-        """A system of this model with its values, as a file of a format."""
         values = self.values_for(system)
         if form == "mjcf":
             return mujoco_xml(system, values, emulate=True, actuators=True)
@@ -239,7 +237,6 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
 def _replayed(
     text: str, system: System, recordings: Sequence[Recording], progress: Progress, round_: int = 0
 ) -> dict[str, ReplayMismatch]:
-    """Errors of all recordings together, by channel."""
     found: dict[str, list[ReplayMismatch]] = {}
     for i, recording in enumerate(recordings):
         progress.report_parts_done(round_ * len(recordings) + i, 2 * len(recordings), recording.name)

@@ -151,7 +151,6 @@ def _identifiability_result(
     ranking: what_if.ExperimentRanking | None,
     asked: IdentifiabilityOptions,
 ) -> dict[str, Any]:
-    """`yid-identifiability/1` without inputs and versions."""
     result: dict[str, Any] = {
         "format": "yid-identifiability/1",
         "status": "not_solved" if solution is None else solution.status.value,
@@ -232,7 +231,6 @@ class _IdentifiabilityTasks:
         return [own for _, own in sorted(zip(order, found, strict=True), key=lambda pair: pair[0])]
 
     def _done(self, function: Callable[..., Any], tasks: Mapping[str, Mapping[str, Any]]) -> list[Any]:
-        """What a function finds for tasks of these names and further arguments."""
         listed = [Task(name, {"common": self.common, **own}) for name, own in tasks.items()]
         self.results_folder.parent.mkdir(parents=True, exist_ok=True)
         report = self.progress.report_parts_done

@@ -117,7 +117,6 @@ def _pairs(entries: Sequence[str], option: str) -> dict[str, Any]:
 
 
 def _import_command_line(file: str | Path, options: Mapping[str, Any]) -> str:
-    """Shell command that imports a file with the given reader options."""
     words = ["yid-ocp", "import", str(file)]
     for key, value in options.items():
         if isinstance(value, bool):

@@ -107,7 +107,6 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
 
 
 def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
-    """Recordings by file, those that are imported with their contents."""
     options = reader_options_from_arguments(arguments)
     made: dict[Path, Recording | None] = {}
     for file in map(Path, arguments.files):
@@ -272,7 +271,6 @@ def _arms(proposal: ConfigProposal) -> Iterator[str]:
 
 
 def _object(item: InitCommandObject, proposal: ConfigProposal) -> Iterator[str]:
-    """The object, what holds it, its damping, and points on it."""
     holder, grasps = proposal.holder_frame, proposal.grasps
     yield "  object:"
     if item.stands_in_world:

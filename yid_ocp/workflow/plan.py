@@ -171,7 +171,6 @@ def _plan_result(run: RunSettings, found: TargetMotionPlan) -> dict[str, Any]:
 
 
 def _read_parameter_run(run: RunSettings, commands: Sequence[str]) -> tuple[dict[str, Any], Path]:
-    """Contents of result.json in the folder of `plan.parameter_run`, and the folder."""
     folder, where = Path(str(run.plan.parameter_run)), ("plan", "parameter_run")
     file = folder / "result.json"
     if not file.is_file() or not (folder / "trajectories.h5").is_file():
@@ -204,7 +203,6 @@ def _plan_from_settings(run: RunSettings, progress: Progress) -> tuple[Informati
 
 
 def _require_same_effects(run: RunSettings, found: Iterable[str], own: Collection[str]) -> None:
-    """Raise an error where the run has parameters of effects that the plan's model lacks."""
     lacking = sorted({name.rpartition(".")[0] for name in found if "@" in name and name not in own})
     if lacking:
         what = f"{run.plan.parameter_run} was solved with {', '.join(lacking)}, which this model does not have"
@@ -224,7 +222,6 @@ def parameter_and_effect_values(result: Mapping[str, Any]) -> tuple[dict[str, fl
 
 
 def _information_plan_result(run: RunSettings, found: InformativeMotionPlan) -> dict[str, Any]:
-    """Entries of `yid-plan/1` for an informative motion."""
     stds = "std_relative_before=std_recorded std_relative_after=std_planned std_relative_together=std_combined verdict"
     rest = "unseen=unobservable_parameters open=unidentifiable_directions"
     starts = "first=initial_criterion value=final_criterion judged=configured_criterion finished=is_converged"

@@ -104,7 +104,6 @@ class _Lines(logging.Handler):
 
 
 def _grouped(notes: list[str]) -> list[str]:
-    """Notes on the same key of many entries as one."""
     groups: dict[str, list[str]] = {}
     for note in notes:
         groups.setdefault(note.rpartition(".")[2], []).append(note)
@@ -251,7 +250,6 @@ def _locked(temporary: Path) -> FileLock | None:
 
 @contextlib.contextmanager
 def _logged(folder: RunFolder) -> Iterator[None]:
-    """Enter the library's messages in log.jsonl while the block runs."""
     lines, logger = _Lines(folder), logging.getLogger("yid_ocp")
     level = logger.level
     logger.addHandler(lines)

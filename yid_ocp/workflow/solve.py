@@ -225,7 +225,6 @@ def measure_discretisation_shifts(
 def _refined_problem(
     run: RunSettings, problem: EstimationProblem, what: _Refinement
 ) -> discretisation.FinerDiscretisationProblem:
-    """The problem with half the time step or with twice the links."""
     recordings, options = [episode.recording for episode in problem.episodes], problem.options
     if what == "time_step":
         step = step_with_time_step(problem.step, problem.step.time_step / 2)

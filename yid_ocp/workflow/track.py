@@ -300,7 +300,6 @@ class _FrameTasks:
     own_files: tuple[Path, ...] = ()
 
     def calibrate_sequence(self) -> SequenceCalibration:
-        """Sequence calibration common to all frames, computed in this process."""
         [found] = require_task_values(self._run(_calibrate_sequence_task, {"what is common": {}}, InlineExecutor()))
         if "refused" in found:
             raise DataError(**found["refused"])
@@ -309,7 +308,6 @@ class _FrameTasks:
     def track_frames(
         self, tracker: FrameTracker, common: SequenceCalibration, workers: WorkerConfig | Executor, progress: Progress
     ) -> list[FrameReport]:
-        """Tracking results of all frames, ordered by stamp."""
         names, told = tracker.sequence.frame_names, to_lossless_plain_data(common)
         tasks = {names[i]: {"common": told, "index": i} for i in tracker.frame_order}
         results = self._run(_track_frame_task, tasks, workers, progress.report_parts_done)
@@ -333,7 +331,6 @@ class _FrameTasks:
         return run_tasks(function, listed, self.work_folder / _RESULTS_FOLDER, workers, report)
 
     def delete_files(self) -> None:
-        """Remove what stands beside the run folder."""
         for path in (*self.own_files, self.work_folder):
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
@@ -385,7 +382,6 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
 
 
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
-    """Task: tracking result of one frame as plain data."""
     del inputs
     tracker = _tracker(read_input_text(config), config)
     found = tracker.track_frame(index, dataclass_from_plain_data(SequenceCalibration, common))
