@@ -82,14 +82,13 @@ def test_configuration(cli, pendulum, left_nothing, old, new, words):
 
 
 def test_no_such_configuration(cli, pendulum):
-    assert_refused(
-        cli("solve", pendulum.parent / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?"
-    )
-    assert_refused(cli("check", pendulum.parent), "cannot be read")
-    (pendulum.parent / "list.yaml").write_text("- 1\n")
-    assert_refused(cli("solve", pendulum.parent / "list.yaml"), "keys and values")
-    (pendulum.parent / "latin.yaml").write_bytes(b"description: \xe9\n")
-    assert_refused(cli("solve", pendulum.parent / "latin.yaml"), "UTF-8")
+    folder = pendulum.parent
+    assert_refused(cli("solve", folder / "pendolum.yaml"), "no such configuration", "did you mean 'pendulum.yaml'?")
+    assert_refused(cli("check", folder), "cannot be read")
+    (folder / "list.yaml").write_text("- 1\n")
+    assert_refused(cli("solve", folder / "list.yaml"), "keys and values")
+    (folder / "latin.yaml").write_bytes(b"description: \xe9\n")
+    assert_refused(cli("solve", folder / "latin.yaml"), "UTF-8")
 
 
 def test_nothing_to_solve(cli, pendulum, pendulum_data, left_nothing):

@@ -66,9 +66,7 @@ def test_every_command_is_a_function_of_workflow_and_prints_json():
 def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path):
     done = cli("solve", pendulum)
     assert done.code == 0, done.err
-    folders = list((tmp_path / "runs").iterdir())
-    assert len(folders) == 1
-    folder = folders[0]
+    [folder] = (tmp_path / "runs").iterdir()
     assert folder.name.startswith("pendulum-20")
     assert {entry.name for entry in folder.iterdir()} >= {
         "config.yaml", "result.json", "trajectories.h5", "report.html", "log.jsonl"
@@ -76,8 +74,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
 
     result = json.loads((folder / "result.json").read_text(), parse_constant=pytest.fail)
     assert set(result) == SOLVE_KEYS
-    assert result["format"] == "yid-solve/1"
-    assert result["status"] == "converged"
+    assert (result["format"], result["status"]) == ("yid-solve/1", "converged")
     assert all(set(entry) == PARAMETER_KEYS for entry in result["parameters"].values())
     for name, value in pendulum_data.truth.items():
         entry = result["parameters"][name]
@@ -85,8 +82,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
         assert abs(entry["value"] - value) < 4 * entry["std"] < 0.2 * value
         assert entry["verdict"] == "identifiable"
     assert result["parameters"]["shoulder.rest"]["verdict"] == "fixed"
-    assert result["fit"]["explains"] is True
-    assert result["fit"]["worse_than_guess"] == []
+    assert (result["fit"]["explains"], result["fit"]["worse_than_guess"]) == (True, [])
     assert 0.01 < result["fit"]["p_value"] <= 1
     assert "the model explains the recordings to within their noise" in done.out
     channel = result["residuals"]["joints.effort.shoulder"]
@@ -97,8 +93,7 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
         assert abs(moved["time_step"]) < 0.01 * pendulum_data.truth[name]
         assert 0 < moved["std"] <= result["parameters"][name]["std"]
     assert done.out.count("with half the time step") == 1
-    assert set(channel) == {"rmse", "unit", "n"}
-    assert channel["unit"] == "N m"
+    assert (set(channel), channel["unit"]) == ({"rmse", "unit", "n"}, "N m")
     assert 0.005 < channel["rmse"] < 0.02
     held_out = result["held_out"][0]
     assert set(held_out) == {"recording", "rmse", "baselines"}
@@ -107,11 +102,8 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
     assert all(len(digest) == 64 for digest in result["inputs"].values())
     assert {"python", "yid-ocp", "casadi", "numpy"} <= set(result["versions"])
 
-    lines = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
-    events = [line["event"] for line in lines]
-    assert events[0] == "start"
-    assert events[-1] == "end"
-    assert events.count("iterate") >= 2
+    events = [json.loads(line)["event"] for line in (folder / "log.jsonl").read_text().splitlines()]
+    assert (events[0], events[-1], events.count("iterate") >= 2) == ("start", "end", True)
 
     assert load_config(folder / "config.yaml").solver == load_config(pendulum).solver
     with h5py.File(folder / "trajectories.h5") as file:
@@ -441,9 +433,8 @@ def test_keys_that_may_be_set(tmp_path):
     assert settable_keys_with_prefix("parameters.") == settable_keys_with_prefix("nothing.") == []
     assert settable_keys_with_prefix("compare.methods.multi") == ["compare.methods.multiple_shooting."]
     assert "model.object.links=" in settable_keys_with_prefix("model.object.l", file)
-    assert "compare.methods.multiple_shooting.condensing=" in settable_keys_with_prefix(
-        "compare.methods.multiple_shooting."
-    )
+    method = "compare.methods.multiple_shooting."
+    assert f"{method}condensing=" in settable_keys_with_prefix(method)
 
 
 def test_without_the_package_the_command_says_so_and_the_shell_gets_nothing(cli, monkeypatch):

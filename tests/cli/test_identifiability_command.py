@@ -15,6 +15,7 @@ from yid_ocp.workflow.build import build_system, system_with_second_arm
 from yid_ocp.workflow.identifiability import IdentifiabilityOptions, run_identifiability
 
 VERDICTS = {"identifiable", "weak", "not_identifiable", "at_bound", "not_trusted"}
+EVERY = IdentifiabilityOptions(interval_parameters="all")
 COMMANDS, NO_REPORT = ("solve", "identifiability", "compare"), ("output.write_report=false",)
 PARTS = {
     "": {"format", "status", "parameters", "directions", "what_if", "inputs", "versions", "correlations"},
@@ -149,9 +150,8 @@ def read(outcome):
 
 def test_workers_find_what_one_process_does(repository, tmp_path):
     run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
-    asked = IdentifiabilityOptions(
-        interval_parameters="all", rank_changes=True, start_knowledge="unknown", grasp_offset_std=0.01
-    )
+    known = {"start_knowledge": "unknown", "grasp_offset_std": 0.01}
+    asked = IdentifiabilityOptions(interval_parameters="all", rank_changes=True, **known)
     alone = run_identifiability(run, tmp_path / "alone", options=asked)
     shared = run_identifiability(run, tmp_path / "shared", options=asked, workers=InlineExecutor())
     assert read(shared) == read(alone)
@@ -160,7 +160,6 @@ def test_workers_find_what_one_process_does(repository, tmp_path):
 
 def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
     run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
-    asked = IdentifiabilityOptions(interval_parameters="all")
     names, done = [], identifiability_command.profile_likelihood_task
 
     def twice(name, **arguments):
@@ -172,10 +171,10 @@ def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
     twice.__module__, twice.__qualname__ = done.__module__, done.__qualname__
     monkeypatch.setattr(identifiability_command, "profile_likelihood_task", twice)
     with pytest.raises(KeyboardInterrupt):
-        run_identifiability(run, tmp_path / "run", options=asked, workers=InlineExecutor())
+        run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
     assert len(list((tmp_path / "run.partial" / "tasks").glob("*.json"))) == 1
     monkeypatch.setattr(identifiability_command, "profile_likelihood_task", done)
-    outcome = run_identifiability(run, tmp_path / "run", options=asked, workers=InlineExecutor())
+    outcome = run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
     assert set(outcome.result["profiles"]) == {"spring_1.stiffness", "spring_2.stiffness"}
     assert not (tmp_path / "run.partial").exists()
 
@@ -189,9 +188,7 @@ def test_a_part_that_fails_is_said(repository, tmp_path, monkeypatch):
     run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
     words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
     with pytest.raises(WorkerError, match=words):
-        run_identifiability(
-            run, tmp_path / "run", options=IdentifiabilityOptions(interval_parameters="all"), workers=InlineExecutor()
-        )
+        run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
 
 
 def test_the_other_arm_of_a_robot(repository):

@@ -35,12 +35,8 @@ def test_the_embedded_default_is_the_one_in_configs(repository):
 
 
 def test_numbers_as_in_yaml_1_2(written):
-    run = load_config(
-        written(
-            "problem: {time_step: 1e-3, huber_threshold: .inf, path_cutoff: 5}\n"
-            "solver: {max_iterations: 010}\ndescription: 'yes'\n"
-        )
-    )
+    text = "problem: {time_step: 1e-3, huber_threshold: .inf, path_cutoff: 5}\n"
+    run = load_config(written(f"{text}solver: {{max_iterations: 010}}\ndescription: 'yes'\n"))
     assert run.problem.time_step == 1e-3
     assert math.isinf(run.problem.huber_threshold)
     assert run.solver == GaussNewton(max_iterations=10)
@@ -49,13 +45,8 @@ def test_numbers_as_in_yaml_1_2(written):
 
 
 def test_paths_are_relative_to_the_file(written, tmp_path):
-    run = load_config(
-        written(
-            "model: {robot: ../arm.urdf}\n"
-            "recordings: {estimate: [a/b.h5, default:x.h5], held_out: [/elsewhere/c.h5]}\n"
-            "output: {runs_folder: results}\n"
-        )
-    )
+    text = "recordings: {estimate: [a/b.h5, default:x.h5], held_out: [/elsewhere/c.h5]}\n"
+    run = load_config(written(f"{text}model: {{robot: ../arm.urdf}}\noutput: {{runs_folder: results}}\n"))
     assert run.model.robot == str((tmp_path.parent / "arm.urdf").resolve())
     assert run.recordings.estimate == (str(tmp_path.resolve() / "a" / "b.h5"), "default:x.h5")
     assert run.recordings.held_out == ("/elsewhere/c.h5",)
@@ -175,9 +166,8 @@ def test_set_merges_sections(written):
     run = load_config(file, ["sensors={points: {std: 0.001}, camera: {use: false}}"])
     assert (run.sensors["points"].std, run.sensors["points"].use) == (0.001, True)
     assert (run.sensors["joints.effort"].std, run.sensors["camera"].use) == (0.1, False)
-    run = load_config(
-        file, ["parameters.T1.bend.initial=4", "parameters={T1.bend: {bounds: [1, 9]}, T2.*: {free: true}}"]
-    )
+    both = ["parameters.T1.bend.initial=4", "parameters={T1.bend: {bounds: [1, 9]}, T2.*: {free: true}}"]
+    run = load_config(file, both)
     bend = run.parameters["T1.bend"]
     assert (bend.free, bend.initial, bend.bounds) == (True, 4.0, (1.0, 9.0))
     assert run.parameters["T2.*"].free
@@ -244,9 +234,7 @@ def numbers(hint, wrap=lambda value: value, path=(), option=None):
     sections = section_variants_from_annotation(hint)
     for word, kind in (sections.classes if sections is not None else {}).items():
         options = dataclass_options(kind)
-        needed = {
-            name: needed_value(entry.type_hint) for name, entry in options.items() if entry.default_value is MISSING
-        }
+        needed = {key: needed_value(own.type_hint) for key, own in options.items() if own.default_value is MISSING}
         needed |= {sections.selector_key: word} if sections.selector_key else {}
         for name, entry in options.items():
             yield from numbers(entry.type_hint, within(wrap, name, needed), (*path, name), entry.type_hint)

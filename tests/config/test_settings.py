@@ -113,9 +113,8 @@ def test_written_back_every_setting_is_there(written):
 
 
 def test_sections_are_what_their_users_take(written):
-    run = load_config(
-        written("problem: {path_cutoff: 3}\ndiagnosis: {max_effects: 1}\nsensors: {points: {std: 0.1}}\n")
-    )
+    text = "problem: {path_cutoff: 3}\ndiagnosis: {max_effects: 1}\nsensors: {points: {std: 0.1}}\n"
+    run = load_config(written(text))
     assert isinstance(run.problem, ProblemOptions)
     assert run.problem.path_cutoff == 3.0
     assert isinstance(run.diagnosis, Thresholds)

@@ -186,9 +186,8 @@ def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(built):
     assert (finer["b.bend"].lower, finer["b.bend"].upper) == (1, 8)
     finer = built(SEGMENTED.split("parameters:")[0], 3).parameters
     assert [finer[name].value for name in ("a.bend", "a.twist", "b.bend")] == [9, 9, 3]
-    finer = built(
-        "model: {object: {kind: foam_y}, damping: 0.02}\nparameters: {T1.bend: {initial: 10}}\n", 2
-    ).parameters
+    foam = "model: {object: {kind: foam_y}, damping: 0.02}\nparameters: {T1.bend: {initial: 10}}\n"
+    finer = built(foam, 2).parameters
     assert [finer[name].value for name in ("T1.bend", "T2.bend", "T1.damping")] == [20, 6, 0.04]
 
 
@@ -199,9 +198,8 @@ def test_link_lengths_as_parameters(built):
     assert "a.length" not in names
 
 
-BY_JOINT = (
-    "model:\n  robot: {urdf}\n  arms: {{mode: passive}}\n  object: {{kind: foam_y}}\n  damping: {{hinge: 0.2{more}}}\n"
-)
+BY_JOINT = "model:\n  robot: {urdf}\n  arms: {{mode: passive}}\n  object: {{kind: foam_y}}\n"
+BY_JOINT += "  damping: {{hinge: 0.2{more}}}\n"
 
 
 def test_damping_by_joint_says_that_of_the_object_too(built, urdf_folder):

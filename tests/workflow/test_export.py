@@ -125,10 +125,8 @@ def test_sdf_has_springs_too(found, tmp_path, exported) -> None:
     assert [joint.get("name") for joint in model.findall("joint")] == list(system.mechanism.joint_names)
     dynamics = model.find("joint[@name='T1_2_y']/axis/dynamics")
     bend = manifest["parameters"]["T1.bend"]["value"]
-    sizes = {entry.tag: float(entry.text) for entry in dynamics}
-    assert sizes == pytest.approx(
-        {"damping": 0.05 + 0.05 * bend, "friction": 0.0, "spring_stiffness": bend, "spring_reference": 0.0}
-    )
+    sizes = {"damping": 0.05 + 0.05 * bend, "friction": 0.0, "spring_stiffness": bend, "spring_reference": 0.0}
+    assert {entry.tag: float(entry.text) for entry in dynamics} == pytest.approx(sizes)
     masses = [float(entry.text) for entry in model.findall("link/inertial/mass")]
     assert sum(masses) == pytest.approx(20.16662, abs=1e-5)
     assert min(masses) > 0

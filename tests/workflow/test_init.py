@@ -44,9 +44,7 @@ def moved(
     rng = np.random.default_rng(seed)
     phase = np.ones_like(t) if moving else np.clip(t / 0.5 - 0.4, 0, 1) ** 2
     if rest is not None:
-        phase = phase * np.where(
-            t < rest[0], np.clip((rest[0] - t) / 0.3, 0, 1) ** 2, np.clip((t - rest[1]) / 0.3, 0, 1) ** 2
-        )
+        phase = phase * np.clip(np.where(t < rest[0], rest[0] - t, t - rest[1]) / 0.3, 0, 1) ** 2
     angles = np.stack([0.4 * np.sin(3 * t) * phase, 0.3 * np.sin(2 * t) * phase], axis=1)
     along = (turned(0, angles[:, 0]) @ turned(1, angles[:, 1]))[:, :, 2]
     points = np.array(parts)[None, :, None] * LENGTH * along[:, None] + far
@@ -228,9 +226,7 @@ REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_missing_is_named_and_nothing_is_written(
-    case: str, bench: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_missing_is_named_and_nothing_is_written(case, bench, capsys) -> None:
     words, said, where = REFUSED[case]
     before = sorted(bench.iterdir())
     assert init(*words) == 2

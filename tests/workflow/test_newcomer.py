@@ -123,9 +123,7 @@ SERVO = Newcomer(
     {"w_rod": "tip", "rod:50%": "middle"},
     {"cable.bend": 0.03, "cable.damping": 4e-4},
 )  # fmt: skip
-SERVOS = {
-    f"{joint}.servo_{name}": value for joint in ("lift", "elbow", "wrist_flex") for name, value in SERVO_VALUES.items()
-}
+SERVOS = {f"{joint}.servo_{key}": x for joint in ("lift", "elbow", "wrist_flex") for key, x in SERVO_VALUES.items()}
 
 
 def write_mcap(recording: Recording, folder: Path) -> Path:

@@ -118,9 +118,8 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
     swept = made.predictor.predict_episode(episode, *made.split(made.initial_unknowns, 0), False)
     joints = replace(first.joints, position=swept.rollout.state[:, :1], effort=torque + 0.3)
     recordings = [replace(first, joints=joints, name=name) for name in ("first", "second")]
-    return EstimationProblem(
-        step, recordings[:1], ("elbow.stiffness",), options, None, recordings[1:] if held_out else ()
-    )
+    apart = recordings[1:] if held_out else ()
+    return EstimationProblem(step, recordings[:1], ("elbow.stiffness",), options, None, apart)
 
 
 def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
@@ -228,9 +227,7 @@ def test_the_best_guess_counts():
 
 
 @pytest.mark.parametrize(("factor", "believed"), [(1.0, True), (0.4, False)])
-def test_a_held_out_recording_that_a_guess_predicts_better_withholds_trust(
-    carried_out, pendulum_data, tmp_path, factor, believed
-):
+def test_a_held_out_recording_that_a_guess_predicts_better(carried_out, pendulum_data, tmp_path, factor, believed):
     recording = read_recording(pendulum_data.folder / "held_out.h5")
     less = replace(recording, joints=replace(recording.joints, effort=factor * recording.joints.effort))
     write_recording(less, tmp_path / "held_out.h5")

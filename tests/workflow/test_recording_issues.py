@@ -150,9 +150,8 @@ NAMED = {"of the group": ("points: [w_T1, w_T4]", "'w_T4'"), "of the model": ("f
 def test_points_listed_by_name_that_are_not_there_are_an_error(repository, what):
     setting, name = NAMED[what]
     file = repository / "configs" / "single_arm_vision.yaml"
-    run = load_config(
-        file, [f"sensors.points_camera={{{setting}}}", "problem.use_compiler=false", "model.object.links=1"]
-    )
+    quick = ("problem.use_compiler=false", "model.object.links=1")
+    run = load_config(file, [f"sensors.points_camera={{{setting}}}", *quick])
     with pytest.raises(DataError, match=name) as caught:
         build_problem(run)
     assert "did you mean 'w_T" in str(caught.value)
