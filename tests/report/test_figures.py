@@ -74,8 +74,8 @@ def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
     assert [motion.name for motion in made.motions] == ["predicted", "measured"]
     assert len(made.t) == 150
     predicted, measured = made.motions
-    assert measured.sticks
-    assert not any(stick.is_object_part for stick in measured.sticks), "an object's shape is not measured"
+    # an object's shape is not measured
+    assert {stick.is_object_part for stick in measured.sticks} == {False}
     k = measured.point_indices["w_T1"]
     shown = np.isfinite(measured.positions[:, k]).all(axis=1)
     # half a period about every frame in which it was seen
@@ -159,9 +159,8 @@ def test_many_rows_share_the_label_of_their_owner(drawn, tmp_path):
     height = _MAX_SINGLE_LABELS + 9
     draw_sparsity_patterns(tmp_path / "p.png", [[pattern(height)]])
     (axes,) = drawn[0].get_axes()
-    labels = [label.get_text() for label in axes.get_yticklabels()]
-    owners = [f"T{1 + i // 3}" for i in range(height - 2)]
-    assert labels == [*dict.fromkeys(owners), "left"]
+    owners = dict.fromkeys(f"T{1 + i // 3}" for i in range(height - 2))
+    assert [label.get_text() for label in axes.get_yticklabels()] == [*owners, "left"]
     # three rows of T1, then of T2, ...: in the middle of each
     assert list(axes.get_yticks())[:2] == [1.0, 4.0]
     assert axes.get_yticks()[-1] == height - 1.5
