@@ -24,7 +24,7 @@ from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, _Overspeed
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
 from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
-from yid_ocp.report.html import _script_name, _shared_script, write_report, write_shared_plotly_script
+from yid_ocp.report.html import _plotly_script, _shared_script, write_report, write_shared_plotly_script
 from yid_ocp.report.sections import REPORT_SECTIONS, ReportData, render_sections
 from yid_ocp.report.terminal import SUMMARY_BY_FORMAT
 from yid_ocp.workflow.build_problem import load_problem
@@ -316,7 +316,7 @@ def test_a_page_finds_the_script_that_its_folder_shares(solved_page, tmp_path):
     page.parent.mkdir(parents=True)
     write_shared_plotly_script(tmp_path)
     told = re.sub(r'<script type="text/plain" id="packed">[^<]+</script>',
-                  f'<script src="../../{_script_name()}"></script>', solved_page.read_text())  # fmt: skip
+                  f'<script src="../../{_plotly_script()[0]}"></script>', solved_page.read_text())  # fmt: skip
     page.write_text(told)
     assert len(told) < 0.6e6
     check_in_browser(page, 1400, "light", tmp_path)
@@ -325,10 +325,10 @@ def test_a_page_finds_the_script_that_its_folder_shares(solved_page, tmp_path):
 def test_a_page_takes_no_script_of_somebody_else(tmp_path):
     page = tmp_path / "runs" / "one" / "report.html"
     page.parent.mkdir(parents=True)
-    (tmp_path / _script_name()).write_text("steal()")
+    (tmp_path / _plotly_script()[0]).write_text("steal()")
     assert _shared_script(page) == ""
     write_shared_plotly_script(tmp_path)
-    assert _shared_script(page) == f"../../{_script_name()}"
+    assert _shared_script(page) == f"../../{_plotly_script()[0]}"
 
 
 @pytest.mark.slow

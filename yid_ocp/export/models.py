@@ -64,11 +64,9 @@ def system_to_sdf(system: System, values: Mapping[str, float]) -> str:
         _sdf_link(model, tree, i)
         _sdf_joint(model, tree, joint, terms.get(joint.name, JointDynamicsTerms()))
     for name, frame in tree.frames.items():
-        on = "world" if frame.joint_index < 0 else f"{tree.joints[frame.joint_index].name}_link"
         # what stands in the world is placed from the model, which stands at its origin
-        attached = {} if frame.joint_index < 0 else {"attached_to": on}
-        element = SubElement(model, "frame", {"name": f"frame_{name}", **attached})
-        _sdf_pose(element, frame.placement)
+        attached = {} if frame.joint_index < 0 else {"attached_to": f"{tree.joints[frame.joint_index].name}_link"}
+        _sdf_pose(SubElement(model, "frame", {"name": f"frame_{name}", **attached}), frame.placement)
     return _xml_text(root)
 
 
@@ -94,10 +92,10 @@ def _sdf_link(model: Element, tree: Mechanism, index: int) -> None:
         body = Inertia.from_values(_MIN_LINK_MASS, np.zeros(3), _MIN_LINK_INERTIA * np.eye(3))
     inertial = SubElement(link, "inertial")
     _sdf_pose(inertial, Placement(ca.SX(ca.DM.eye(3)), body.center_of_mass))
-    _sdf_number(inertial, "mass", float(body.mass))
-    tensor, inertia = np.array(ca.DM(body.inertia_about_com)), SubElement(inertial, "inertia")
-    for key, at in {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}.items():
-        _sdf_number(inertia, key, tensor[at])
+    _add_numbers(inertial, {"mass": float(body.mass)})
+    tensor = np.array(ca.DM(body.inertia_about_com))
+    places = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    _add_numbers(SubElement(inertial, "inertia"), {key: tensor[at] for key, at in places.items()})
 
 
 def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: JointDynamicsTerms) -> None:
@@ -107,17 +105,12 @@ def _sdf_joint(model: Element, tree: Mechanism, joint: Joint, terms: JointDynami
         SubElement(element, tag).text = text
     axis = SubElement(element, "axis")
     SubElement(axis, "xyz").text = format_xml_numbers(joint.axis)
-    limit = SubElement(axis, "limit")
-    for key in ("lower", "upper", "effort", "velocity"):
-        size = getattr(joint, f"{key}_limit")
-        if math.isfinite(size):
-            _sdf_number(limit, key, size)
+    limits = {key: getattr(joint, f"{key}_limit") for key in ("lower", "upper", "effort", "velocity")}
+    _add_numbers(SubElement(axis, "limit"), {key: size for key, size in limits.items() if math.isfinite(size)})
     sizes = {"damping": terms.damping, "friction": terms.dry_friction}
     if terms.stiffness > 0:
         sizes |= {"spring_reference": terms.constant_force / terms.stiffness, "spring_stiffness": terms.stiffness}
-    dynamics = SubElement(axis, "dynamics")
-    for key, size in sizes.items():
-        _sdf_number(dynamics, key, size)
+    _add_numbers(SubElement(axis, "dynamics"), sizes)
 
 
 def _sdf_pose(element: Element, placement: Placement, attributes: Mapping[str, str] | None = None) -> None:
@@ -126,8 +119,9 @@ def _sdf_pose(element: Element, placement: Placement, attributes: Mapping[str, s
     SubElement(element, "pose", dict(attributes or {})).text = text
 
 
-def _sdf_number(element: Element, tag: str, value: float) -> None:
-    SubElement(element, tag).text = format_xml_numbers([value])
+def _add_numbers(element: Element, values: Mapping[str, float]) -> None:
+    for tag, value in values.items():
+        SubElement(element, tag).text = format_xml_numbers([value])
 
 
 @dataclass(frozen=True)

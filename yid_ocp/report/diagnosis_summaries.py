@@ -53,7 +53,13 @@ def diagnose_summary(result: Mapping[str, Any]) -> SummaryParts:
             more = ", …" if len(place["windows"]) > _MAX_WINDOWS else ""
             rows.append((place["location"], f"{100 * place['share']:.1f} %", when + more))
     yield SummaryTable(rows, "Where")
-    yield SummaryTable([*_event_rows(result)], "Events")
+    rows = [("event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit")]
+    for own in result.get("events", ()):
+        peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
+        impulse += f" ± {own['std']:.2g}" if own["impulse"] is not None and own["std"] is not None else ""
+        times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
+        rows.append((own["channel"], own["recording"], *times, peak, impulse, f"{own['unit']}, {own['unit']} s"))
+    yield SummaryTable(rows, "Events")
     yield SummaryTable([*_candidate_rows(result)], "Candidates")
     left = len(result["which"]) - _MAX_CANDIDATES
     yield f"{left} more candidates are in result.json" if left > 0 else ""
@@ -77,15 +83,6 @@ def diagnose_summary(result: Mapping[str, Any]) -> SummaryParts:
         yield "to separate what looks alike, plan a motion:"
         yield CodeBlock(_planning_command(result["next_plan"]))
     yield f"verdict: {result['verdict'].replace('_', ' ')} ({sum(result['seconds'].values()):.1f} s)"
-
-
-def _event_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    yield "event", "recording", "from [s]", "to [s]", "peak", "impulse", "unit"
-    for own in result.get("events", ()):
-        peak, impulse = ("–" if own[key] is None else f"{own[key]:.3g}" for key in ("peak", "impulse"))
-        impulse += f" ± {own['std']:.2g}" if own["impulse"] is not None and own["std"] is not None else ""
-        times = ("–" if own[key] is None else f"{own[key]:.4g}" for key in ("from", "to"))
-        yield own["channel"], own["recording"], *times, peak, impulse, f"{own['unit']}, {own['unit']} s"
 
 
 def _candidate_rows(result: Mapping[str, Any]) -> Iterator[Sequence[str]]:
@@ -165,9 +162,9 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
     for size, entry in result["detection"].items():
         own = result["detection_intervals"][size]
         sizes.append((size, str(entry["cases"]), *(_rate(own[key]) for key in ("gap", "first", "right"))))
-    kinds = result["experiments"].items()
     experiments: TableRows = [("experiment", "cases", "false alarms", "right")]
-    experiments += [(n, str(own["cases"]), _rate(own["false_alarms"]), _rate(own["right"])) for n, own in kinds]
+    for name, own in result["experiments"].items():
+        experiments.append((name, str(own["cases"]), _rate(own["false_alarms"]), _rate(own["right"])))
     told = ("case", "experiment", "sort", "truth", "size", "verdict", "added")
     cases: TableRows = [(*told, "not separable", "place", "closure", "best", "time")]
     for entry in result["marks"]:
@@ -178,22 +175,19 @@ def _blind_tables(result: Mapping[str, Any]) -> list[SummaryTable]:
         shares = (_share(entry["closure"]), _share(entry["best"]))
         cases.append((*kept, *found, *place, *shares, _number(entry["seconds"], ".0f", " s")))
     tables = {"Score": marks, "Detection by size": sizes, "Experiments": experiments, "Cases": cases}
-    if result.get("calibration_of_thresholds") is not None:
-        tables["Thresholds"] = [*_threshold_rows(result["calibration_of_thresholds"])]
+    if (calibration := result.get("calibration_of_thresholds")) is not None:
+        # quantiles beside what is set
+        kinds = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}
+        first = ("diagnosis.", "is", "advised", "what", "quantile", "coverage", "of", "effects beyond it, by size")
+        thresholds: TableRows = [(*first, "strange ones beyond it")]
+        for own in calibration["rules"].values():
+            name, value = own["setting"], _number(own["quantile"], ".3g")
+            beyond = ", ".join(f"{size}: {_rate(found)}" for size, found in own["effects_beyond"].items())
+            cells = (f"{own['is']:.3g}", f"{calibration['settings'][name]:.3g}", own["statistic"], value)
+            cases_of = (_share(own["coverage"]), f"{own['cases']} {kinds[own['of']]}", beyond or "-")
+            thresholds.append((name, *cells, *cases_of, _rate(own["strange_beyond"])))
+        tables["Thresholds"] = thresholds
     return [SummaryTable(rows, title) for title, rows in tables.items()]
-
-
-def _threshold_rows(calibration: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Quantiles of a `yid-calibration/1` beside what is set."""
-    kinds = {"clean": "clean recordings", "named": "effects named right", "refitted": "effects refitted"}
-    head = ("diagnosis.", "is", "advised", "what", "quantile", "coverage", "of", "effects beyond it, by size")
-    yield *head, "strange ones beyond it"
-    for own in calibration["rules"].values():
-        name, value = own["setting"], _number(own["quantile"], ".3g")
-        sizes = ", ".join(f"{size}: {_rate(found)}" for size, found in own["effects_beyond"].items())
-        cells = (f"{own['is']:.3g}", f"{calibration['settings'][name]:.3g}", own["statistic"], value)
-        cases = (_share(own["coverage"]), f"{own['cases']} {kinds[own['of']]}", sizes or "-")
-        yield name, *cells, *cases, _rate(own["strange_beyond"])
 
 
 def _number(value: float | None, form: str, unit: str = "") -> str:

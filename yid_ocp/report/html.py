@@ -58,43 +58,41 @@ def write_report(path: Path, findings: ReportData) -> bool:
 
 def write_shared_plotly_script(folder: Path) -> None:
     """Write one copy of plotly's script to a folder, shared by pages up to two levels below; raises `OutputError`."""
-    if _installed() and not _is_plotly_script(folder / _script_name()):
-        import plotly.offline
-
-        write_text(folder / _script_name(), plotly.offline.get_plotlyjs())
+    if _installed():
+        name, text = _plotly_script()
+        if not _is_plotly_script(folder / name):
+            write_text(folder / name, text)
 
 
 def _installed() -> bool:
     return all(util.find_spec(name) is not None for name in ("jinja2", "plotly"))
 
 
-def _script_name() -> str:
+@functools.cache
+def _plotly_script() -> tuple[str, str]:
+    """Name of the file of plotly's script, and its text."""
     import plotly.offline
 
-    return f"plotly-{plotly.offline.get_plotlyjs_version()}.min.js"
+    return f"plotly-{plotly.offline.get_plotlyjs_version()}.min.js", plotly.offline.get_plotlyjs()
 
 
 def _shared_script(path: Path) -> str:
     """Where a page finds a script that it shares, relative to itself; empty where there is none."""
-    folders = [path.parent, *path.parent.parents][: _SHARED_SCRIPT_LEVELS + 1]
-    found = next((script for folder in folders if _is_plotly_script(script := folder / _script_name())), None)
+    scripts = [folder / _plotly_script()[0] for folder in (path.parent, *path.parent.parents)]
+    found = next(filter(_is_plotly_script, scripts[: _SHARED_SCRIPT_LEVELS + 1]), None)
     return "" if found is None else Path(os.path.relpath(found, path.parent)).as_posix()
 
 
 def _is_plotly_script(path: Path) -> bool:
     """Whether a file is plotly's script to the last byte: anybody may leave a file of that name beside pages."""
-    import plotly.offline
-
-    own = plotly.offline.get_plotlyjs().encode()
+    own = _plotly_script()[1].encode()
     return path.is_file() and path.stat().st_size == len(own) and path.read_bytes() == own
 
 
 @functools.cache
 def _packed_script() -> str:
     """Plotly's script as text that the page unpacks: a third of its size."""
-    import plotly.offline
-
-    small = gzip.compress(plotly.offline.get_plotlyjs().encode(), compresslevel=6, mtime=0)
+    small = gzip.compress(_plotly_script()[1].encode(), compresslevel=6, mtime=0)
     return base64.b64encode(small).decode("ascii")
 
 

@@ -51,10 +51,19 @@ def solve_summary(result: Mapping[str, Any]) -> SummaryParts:
     failed = result["status"] == "failed"
     yield from () if failed else misfit_summary_blocks(result["fit"])
     yield from issue_summary_blocks(result)
-    yield SummaryTable([*_estimate_rows(free, failed)], "Parameters", is_key_table=True)
-    residuals = result["residuals"].items()
-    errors = [(name, *format_error_value_and_unit(own["rmse"], own["unit"]), str(own["n"])) for name, own in residuals]
-    yield SummaryTable([("channel", "error (rms)", "unit", "samples"), *errors], "Errors where it was fitted")
+    head = ("parameter", "value", "± std", "95 % interval", "unit", "verdict", "start", "bounds")
+    rows: TableRows = [head]
+    for name, entry in free.items():
+        std = "" if failed or entry["std"] is None or entry["verdict"] == "at_bound" else f"{entry['std']:.2g}"
+        interval = "" if failed or entry["interval"] is None else interval_text(*entry["interval"])
+        verdict = "" if failed else VERDICT_TABLE_TEXTS[entry["verdict"]]
+        own = (f"{entry['value']:.4g}", std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}")
+        rows.append((name, *own, parameter_bounds_text(entry, 4)))
+    yield SummaryTable(rows, "Parameters", is_key_table=True)
+    rows = [("channel", "error (rms)", "unit", "samples")]
+    for name, entry in result["residuals"].items():
+        rows.append((name, *format_error_value_and_unit(entry["rmse"], entry["unit"]), str(entry["n"])))
+    yield SummaryTable(rows, "Errors where it was fitted")
     yield from _held_out_blocks(result)
     yield SummaryTable(torque_offset_table_rows(result), "How far the torques are off")
     yield from discretisation_shift_sentences(result)
@@ -72,17 +81,6 @@ def solve_summary(result: Mapping[str, Any]) -> SummaryParts:
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
 
 
-def _estimate_rows(free: Mapping[str, Mapping[str, Any]], failed: bool) -> Iterator[Sequence[str]]:
-    yield "parameter", "value", "± std", "95 % interval", "unit", "verdict", "start", "bounds"
-    for name, entry in free.items():
-        known = not failed and entry["std"] is not None and entry["verdict"] != "at_bound"
-        std = f"{entry['std']:.2g}" if known else ""
-        interval = "" if failed or entry["interval"] is None else interval_text(*entry["interval"])
-        verdict = "" if failed else VERDICT_TABLE_TEXTS[entry["verdict"]]
-        own = (f"{entry['value']:.4g}", std, interval, entry["unit"], verdict, f"{entry['initial']:.4g}")
-        yield name, *own, parameter_bounds_text(entry, 4)
-
-
 def _held_out_blocks(result: Mapping[str, Any]) -> SummaryParts:
     """Errors of each shown channel, in each recording and over three or more, with those of guesses without a model."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
@@ -90,7 +88,7 @@ def _held_out_blocks(result: Mapping[str, Any]) -> SummaryParts:
     errors = []
     for entry in result["held_out"]:
         for channel in _shown_channels(entry["rmse"]):
-            guesses = {name: errors[channel] for name, errors in entry["baselines"].items() if channel in errors}
+            guesses = {name: own[channel] for name, own in entry["baselines"].items() if channel in own}
             errors.append((entry["recording"], channel, entry["rmse"][channel], guesses))
             found.setdefault(channel, []).append(errors[-1])
     for channel, own in found.items():

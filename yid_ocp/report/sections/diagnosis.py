@@ -56,7 +56,11 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
 
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
-    floor, changed = _noise_rmse(finding), bool(finding.accepted_effects)
+    changed = bool(finding.accepted_effects)
+    # what noise alone gives; for points that of a distance
+    sensors = [samples.sensor for own in finding.nominal_model.problem.held_out for samples in own.measurements]
+    width = {channel: sensor.outputs_per_channel for sensor in sensors for channel in sensor.channel_names}
+    floor = {own.channel: math.sqrt(width.get(own.channel, 1)) * own.noise_std for own in finding.noise_floor}
     rows = []
     for channel, (error, unit) in before.items():
         factor, shown = display_scale_and_unit(unit)
@@ -91,13 +95,6 @@ def _before_after_figures(
     rows: Sequence[tuple[str, str, ValueBeforeAfter]], axis: str, words: tuple[str, str, str]
 ) -> _TitledFigures:
     return figures_by_unit(rows, lambda own, unit: figures.values_before_after_figure(own, f"{axis} [{unit}]", words))
-
-
-def _noise_rmse(finding: DiagnosisResult) -> dict[str, float]:
-    """Error of every channel that noise alone gives; for points that of a distance."""
-    sensors = [samples.sensor for own in finding.nominal_model.problem.held_out for samples in own.measurements]
-    width = {channel: sensor.outputs_per_channel for sensor in sensors for channel in sensor.channel_names}
-    return {entry.channel: math.sqrt(width.get(entry.channel, 1)) * entry.noise_std for entry in finding.noise_floor}
 
 
 # -- where ------------------------------------------------------------------------------------------------------------

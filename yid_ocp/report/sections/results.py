@@ -312,21 +312,18 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
 @register_report_section("recorded", 30, "What was recorded")
 def _recorded_signals(findings: ReportData) -> Iterator[tuple[str, Any]]:
     """Recorded joint channels and points over time."""
-    for recording in findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]:
-        for title, curve in _recorded_curves(recording, findings.section_data.get("system")):
-            yield f"{title} of {recording.name}", lines_over_time_figure(curve)
-
-
-def _recorded_curves(recording: Recording, system: System | None) -> Iterator[tuple[str, TimePlotData]]:
-    for group in recording.groups:
+    system: System | None = findings.section_data.get("system")
+    recordings: Sequence[Recording] = findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]
+    for recording, group in ((own, group) for own in recordings for group in own.groups):
         if isinstance(group, JointGroup):
             for channel in _JOINT_CHANNEL_UNITS:
                 values = group.channels.get(channel)
                 if values is not None:
                     words, unit = channel.replace("_", " "), _joint_channel_unit(system, group.names, channel)
                     curve = TimePlotData(f"{words} [{unit}]", _lines(group.t, group.names, values))
-                    yield f"Joints: {words}", curve
+                    yield f"Joints: {words} of {recording.name}", lines_over_time_figure(curve)
         else:
             names = [f"{name}.{axis}" for name in group.names[:_MAX_POINTS] for axis in "xyz"]
             lines = _lines(group.t, names, group.position.reshape(len(group.t), -1))
-            yield f"Points: {group.name}", TimePlotData("position [m]", lines)
+            figure = lines_over_time_figure(TimePlotData("position [m]", lines))
+            yield f"Points: {group.name} of {recording.name}", figure
