@@ -83,8 +83,7 @@ def test_readings_have_exact_slopes(which, prescribed, all_effects, sensors) -> 
     at = {name: rng.normal(size=function.numel_in(name)) for name in ("q", "z", "load")}
     exact = np.array(ca.densify(function(**at, theta=theta)["by_theta"]))
     for column, name in enumerate(names):
-        shift = np.zeros(len(theta))
-        shift[system.parameters.index(name)] = 1e-6
+        shift = 1e-6 * np.eye(len(theta))[system.parameters.index(name)]
         above, below = (np.array(function(**at, theta=theta + sign * shift)["y"]) for sign in (1, -1))
         assert np.allclose(exact[:, column], (above - below).ravel() / 2e-6, rtol=1e-6, atol=1e-8), name
 

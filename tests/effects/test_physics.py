@@ -434,8 +434,6 @@ def test_cameras_see_points_elsewhere() -> None:
     assert np.linalg.norm(turned - centre) == pytest.approx(np.linalg.norm(true - centre))
     assert turned - true == pytest.approx(np.cross([0, 0.05, 0], true - centre), abs=2e-3)
     assert seen("camera_scale", scale=1.02) - centre == pytest.approx(1.02 * (true - centre))
-    ray = (centre - true) / np.linalg.norm(centre - true)
-    assert seen("surface_offset", fraction=0.5) - true == pytest.approx(0.5 * RADIUS * ray)
 
 
 def test_latency_belongs_to_cameras_and_late_torque_to_arms() -> None:

@@ -100,8 +100,7 @@ def test_derivatives_agree_with_differences_and_with_the_adjoint(mode, feedback,
     assert result.ok, result.message
     for column, name in enumerate(task.unknown_names):
         width = 1e-5 if name.endswith(("delay", "offset", "width", "compliance", "time_constant")) else 1e-4
-        shift = np.zeros(len(x))
-        shift[column] = width
+        shift = width * np.eye(len(x))[column]
         above, below = (task.evaluate(x + sign * shift, derivatives=False).residual for sign in (1, -1))
         numeric = (above - below) / (2 * width)
         exact = result.jacobian[:, column]
@@ -116,8 +115,7 @@ def test_a_delay_at_a_sample_has_the_mean_slope_of_both_sides(driven, prescribed
         x = task.initial_unknowns
         jacobian = task.evaluate(x).jacobian
         for column in (i for i, name in enumerate(task.unknown_names) if name.endswith(".delay")):
-            shift = np.zeros(len(x))
-            shift[column] = 1e-5
+            shift = 1e-5 * np.eye(len(x))[column]
             above, below = (task.evaluate(x + sign * shift, derivatives=False).residual for sign in (1, -1))
             # a sample that would be looked for before the recording stays at its start
             error = jacobian[:, column] - (above - below) / 2e-5

@@ -186,9 +186,6 @@ def test_a_degenerate_polyline_is_refused(vertices):
         parallel_transport_rotations(vertices)
 
 
-# -- the paper's Y -----------------------------------------------------------------------------------------------------
-
-
 def test_the_paper_y_stands_where_it_should():
     item = foam_y_object()
     foot, junction, left, right = positions(item, ["object_root", "w_T1", "w_T2", "w_T3"])
@@ -213,8 +210,6 @@ def test_a_share_of_the_weight_leaves_the_inertia_whole():
         np.testing.assert_array_equal(numbers(light.inertia_about_com), numbers(body.inertia_about_com))
         assert (body.gravity_fraction, float(light.gravity_fraction)) == (None, 0.5)
 
-
-# -- a tapered rod -----------------------------------------------------------------------------------------------------
 
 LENGTH, MASS, BEND, TIP_MASS, GRAVITY = 1.2, 0.05, 40.0, 0.02, 9.81
 

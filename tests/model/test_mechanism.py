@@ -172,9 +172,6 @@ def test_a_frame_that_the_file_does_not_have(urdf_folder):
         robot.with_added_frame("load", "tips", at)
 
 
-# -- rotations --------------------------------------------------------------------------------------------------------
-
-
 ANGLES = st.floats(-math.pi, math.pi)
 OBLIQUE = ((0.6, 0.0, 0.8), (1 / 3, -2 / 3, 2 / 3))
 AXES = st.sampled_from([*map(tuple, np.eye(3)), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0), *OBLIQUE])

@@ -160,9 +160,6 @@ def test_a_clamp_has_six_massless_coordinates():
     assert floating_clamp("hand").frame("hand").joint_index == 5
 
 
-# -- parameters, and errors that name what is wrong -------------------------------------------------------------------
-
-
 @pytest.fixture
 def three():
     bend, mass = Parameter("T1.bend", 3.0, "N m/rad", 0.0), Parameter("T1.mass", 0.064, "kg", 0.0, 1.0)
