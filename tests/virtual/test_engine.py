@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH, Runs, grasp_gaps, mujoco
+from virtual_examples import SYSTEMS, TRUTH, mujoco
 
 import yid_ocp
 from yid_ocp.data.recording import JointGroup, Recording
@@ -39,6 +40,15 @@ from yid_ocp.virtual.mujoco_simulation import (
 )
 
 DEFAULT_RECORDINGS = Path(yid_ocp.__file__).parent / "data" / "defaults"
+
+
+Runs = Callable[..., SimulationResult]
+
+
+def grasp_gaps(system: System) -> ca.Function:
+    """From a configuration to what the grasps leave open."""
+    q = ca.SX.sym("q", system.n_coordinates)
+    return ca.Function("phi", [q], [system.constraint_residual(forward_kinematics(system.numeric_mechanism(), q))])
 
 
 @pytest.fixture(scope="module")

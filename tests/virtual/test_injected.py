@@ -7,7 +7,7 @@ import math
 import casadi as ca
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH, mujoco, single_arm_xml
+from virtual_examples import SYSTEMS, TRUTH, mujoco
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.effects import EFFECTS, make_effect
@@ -18,9 +18,11 @@ from yid_ocp.virtual import injected
 from yid_ocp.virtual.experiment import VirtualExperiment, recording_with_sensor_error
 from yid_ocp.virtual.injected import OUT_OF_LIBRARY_EFFECTS, InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import random_multisine_motion
+from yid_ocp.virtual.mjcf import mujoco_xml
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 
 SYSTEM = SYSTEMS[1]
+MODEL_XML = mujoco_xml(SYSTEM, TRUTH)
 SIZES = {
     "kelvin_voigt@T1": {"tau": 0.05},
     "joint_viscous@left_s1": {"b": 1.3},
@@ -37,7 +39,7 @@ TWINS = ("payload", "joint_presliding", "effort_lag")
 
 def passive(effects, q, v):
     """MuJoCo's passive forces and joint inertias with effects, in configuration order."""
-    model = mujoco.MjModel.from_xml_string(single_arm_xml())
+    model = mujoco.MjModel.from_xml_string(MODEL_XML)
     order = [model.joint(name).id for name in SYSTEM.mechanism.joint_names]
     data = mujoco.MjData(model)
     terms = injected._InjectedTerms(SYSTEM, TRUTH, effects)
@@ -182,7 +184,7 @@ class Bench:
     """MuJoCo's model with one effect, whose force is asked for at states of one's choice."""
 
     def __init__(self, kind, location, size, running=True):
-        self.model = mujoco.MjModel.from_xml_string(single_arm_xml())
+        self.model = mujoco.MjModel.from_xml_string(MODEL_XML)
         self.data = mujoco.MjData(self.model)
         self.terms = injected._InjectedTerms(SYSTEM, TRUTH, [InjectedEffect(kind, location, {"size": size})])
         self.terms.edit_model(self.model)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
-from virtual_examples import SYSTEMS, TRUTH, assert_same_mechanics, clamped_beam, mujoco
+from virtual_examples import SYSTEMS, TRUTH, mujoco
 
 from yid_ocp.effects import EFFECTS, make_effect
 from yid_ocp.errors import ConfigError, ModelError
@@ -24,7 +24,8 @@ from yid_ocp.model import (
     System,
     flexible_object,
 )
-from yid_ocp.model.mechanism import Frame, Placement
+from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
+from yid_ocp.model.mechanism import Frame, Inertia, Placement
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.mjcf import ParameterEvaluator, compile_mjcf, joint_dynamics_terms, mujoco_xml
@@ -76,6 +77,51 @@ OTHERS = {
 
 # actuators of another system: tests/virtual/test_vocabulary_twins.py
 OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", "back_emf"}
+
+
+def clamped_beam() -> System:
+    beam = flexible_object([Segment("B", 0.5, 0.2, 0.01, links=3)], name="beam")
+    clamp = floating_clamp("clamp")
+    body = Inertia.from_values(0.3, [0.01, 0.02, 0.03], np.diag([1e-3, 2e-3, 2.5e-3]))
+    clamp = replace(clamp, joints=(*clamp.joints[:-1], replace(clamp.joints[-1], bodies=(body,))))
+    return System.build(clamp, objects=[(beam, "clamp", None)], driven=["clamp_x"], damping=0.1)
+
+
+def assert_same_mechanics(system: System, values: dict[str, float]) -> None:
+    """Mass matrix, bias and passive forces, and places of points are in MuJoCo what they are in symbols."""
+    q, v = ca.SX.sym("q", system.n_coordinates), ca.SX.sym("v", system.n_coordinates)
+    kinematics, none = forward_kinematics(system.mechanism, q), ca.SX(0, 1)
+    rigid = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
+    mass = mass_matrix(rigid, system.mechanism)
+    bias = ca.jtimes(rigid.lagrangian_by_v, q, v) - rigid.lagrangian_by_q
+    passive = system.viscous_force(v) - ca.gradient(system.elastic_energy(q), q)
+    for joint, compliance in system.joint_compliances.items():
+        at = system.mechanism.joint_index(joint)
+        passive[at] -= (q[at] + system.joint_relaxation_times[joint] * v[at]) / compliance
+    for effect in system.effects:
+        terms = effect.step_terms(MidpointState(system, kinematics, q, v, none, none, none, none, {}, ca.SX(1)))
+        mass, passive = mass + ca.hessian(terms.lagrangian, v)[0], passive + ca.gradient(terms.lagrangian, q)
+        passive += 0 if terms.dissipative_force is None else terms.dissipative_force
+    points = ca.horzcat(ca.SX(3, 0), *(kinematics.frame_position(name) for name in system.point_frames))
+    ours = ca.Function("ours", [q, v, system.parameters.symbols], [mass, bias, passive, points])
+    model = compile_mjcf(mujoco_xml(system, values))
+    data = mujoco.MjData(model)
+    order = [model.joint(name).id for name in system.mechanism.joint_names]
+    assert model.nv == system.n_coordinates
+    rng = np.random.default_rng(0)
+    for _ in range(2):
+        posture, velocity = rng.uniform(-1, 1, (2, system.n_coordinates))
+        data.qpos[order], data.qvel[order] = posture, velocity
+        mujoco.mj_forward(model, data)
+        full = np.zeros((model.nv, model.nv))
+        for column in range(model.nv):
+            mujoco.mj_mulM(model, data, full[column], np.eye(model.nv)[column])
+        expected = [np.array(ca.densify(e)) for e in ours(posture, velocity, system.parameters.vector(values))]
+        np.testing.assert_allclose(full[np.ix_(order, order)], expected[0], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(data.qfrc_bias[order], expected[1].ravel(), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(data.qfrc_passive[order], expected[2].ravel(), rtol=1e-9, atol=1e-9)
+        seen = np.array([data.site(name).xpos for name in system.point_frames]).reshape(-1, 3)
+        np.testing.assert_allclose(seen, expected[3].T, rtol=0, atol=1e-9)
 
 
 @pytest.fixture(scope="module")
