@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -131,18 +132,8 @@ def test_rest_curvature_is_where_the_object_comes_to_rest() -> None:
 # -- masses, lengths, gravity, air ------------------------------------------------------------------------------------
 
 
-def about_x() -> System:
-    return link(prescribed=("T1_0_x", "T1_0_y", "T1_0_z"))
-
-
-def heavy_link() -> System:
-    return link(gravity=(0, 0, -G))
-
-
-def heavy_hinge() -> System:
-    return hinge(gravity=(0, 0, -G))
-
-
+about_x = partial(link, prescribed=("T1_0_x", "T1_0_y", "T1_0_z"))
+heavy_link, heavy_hinge = (partial(made, gravity=(0, 0, -G)) for made in (link, hinge))
 WEIGHT, LOAD = MASS * G * LENGTH / 2, -MASS * G * LENGTH / 2
 FLAT, BENT = math.pi / 2, KAPPA * math.pi / 2
 
@@ -235,7 +226,7 @@ def test_a_junction_turns_all_branches() -> None:
     assert 8.0 * rest.state[at("junction_compliance@w_T1_y")] == pytest.approx(torque, rel=1e-6)
 
 
-def hanging(kind: str, time_step: float = H, **values: float):
+def hanging(kind: str, **values: float):
     """The one-link tube, its tip held from above by an arm joint prescribed at zero: step, rest, index of its foot."""
     up = Placement.from_matrix(homogeneous_transform(np.eye(3), [0, 0, LENGTH]))
     joint = Joint("left_a", "revolute", -1, up, (0.0, 0.0, 1.0))
@@ -245,7 +236,7 @@ def hanging(kind: str, time_step: float = H, **values: float):
     tree = robot.with_attached_mechanism(Mechanism("rail", (slide,), {"rail": Frame(0, Placement.identity())}))
     parts = {"objects": [(item, "rail", None)], "grasps": [Grasp("left", "left_gripper", "w_T1")]}
     system = System.build(tree, **parts, prescribed=["left_a"], gravity=(0, 0, -G), damping=0.0)
-    step = compile_step(system.with_effects([make_effect(kind, "left", system, values)]), time_step, use_compiler=False)
+    step = compile_step(system.with_effects([make_effect(kind, "left", system, values)]), H, use_compiler=False)
     rest = EquilibriumSolver(step).solve([0.0], step.system.parameters.vector())
     assert rest.is_converged
     return step, rest.state, step.system.mechanism.joint_index("foot")

@@ -1,4 +1,4 @@
-"""What is recorded under effects: inputs corrected, samples shifted; all effects at once: slopes, nothing at neutral."""
+"""Recordings under effects: inputs corrected, samples shifted; all effects at once: slopes, nothing at neutral."""
 
 from __future__ import annotations
 
@@ -87,6 +87,8 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     assert other.residual == pytest.approx(one.residual, rel=1e-9, abs=1e-9)
     assert plain.uses_inputs_as_recorded
     assert full.with_free_subset(["T1.bend", "kelvin_voigt@T3.tau"]).uses_inputs_as_recorded
+    # an arm's own damping leaves the recording as it is
+    assert problem(bench, (), feedback=feedback, free=("left_a.damping",)).uses_inputs_as_recorded
     # the momentum that an LQR filter follows depends on how fast the clock runs
     assert full.with_free_subset(["T1.bend", "clock_scale@clock.scale"]).uses_inputs_as_recorded is (feedback != "lqr")
     for name in ("effort_delay@left.delay", "effort_lag@left_c.time_constant", "camera_latency@camera.delay"):
@@ -219,10 +221,6 @@ def test_the_filter_follows_the_momentum_of_the_effects(driven) -> None:
     assert without == pytest.approx(with_slopes, rel=1e-12)
     assert fixed.evaluate(fixed.initial_unknowns, derivatives=False).cost == pytest.approx(without, rel=1e-12)
     assert other == pytest.approx(without, rel=1e-9)
-
-
-def test_an_arms_own_damping_leaves_the_recording_as_it_is(driven) -> None:
-    assert problem(driven, (), feedback="lqr", free=("left_a.damping",)).uses_inputs_as_recorded
 
 
 # -- all effects at once ----------------------------------------------------------------------------------------------

@@ -36,20 +36,14 @@ def beam() -> System:
 OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", "back_emf", "joint_load_friction"}
 
 
-def with_servos() -> System:
-    """The papers' arm with a position servo on every joint."""
-    system = baxter_foam_y_system(1)
-    servos = PositionServoOptions(motor=MotorOptions("dc"))
-    return System.build(system.mechanism, driven=system.driven, servos=servos, grasps=system.grasps)
-
-
 def test_the_vocabulary_is_the_shared_one(shared) -> None:
     text = (shared / "reference" / "effects.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
     table = {row[0]: row for row in rows[2:]}
     described = {kind.strip() for name in table for kind in name.split(",")}
     assert set(EFFECTS) <= described  # the vocabulary is ahead: kinds of later work stand there as well
-    servos, system = with_servos(), baxter_foam_y_system(1)
+    system, options = baxter_foam_y_system(1), PositionServoOptions(motor=MotorOptions("dc"))
+    servos = System.build(system.mechanism, driven=system.driven, servos=options, grasps=system.grasps)
     places = {kind: (servos, place) for kind, place in candidate_kinds_and_locations(servos, _SENSOR_KINDS)}
     places |= {kind: (system, place) for kind, place in candidate_kinds_and_locations(system, _SENSOR_KINDS)}
     for kind in EFFECTS:

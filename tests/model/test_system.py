@@ -152,7 +152,7 @@ def test_errors_of_build(robot, name):
 
 def test_a_clamp_has_six_massless_coordinates():
     clamp = floating_clamp("hand", frame="palm")
-    assert clamp.joint_names == ("hand_x", "hand_y", "hand_z", "hand_rx", "hand_ry", "hand_rz")
+    assert clamp.joint_names == tuple(f"hand_{name}" for name in ("x", "y", "z", "rx", "ry", "rz"))
     assert [j.kind for j in clamp.joints] == ["prismatic"] * 3 + ["revolute"] * 3
     assert clamp.parent_indices == (-1, 0, 1, 2, 3, 4)
     assert all(merge_bodies(j.bodies) is None for j in clamp.joints)

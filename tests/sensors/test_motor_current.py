@@ -26,19 +26,14 @@ KEY = "motors.current"
 KNOWN = SensorOptions(constants={"torque_constant": CONSTANTS})
 
 
-def moved() -> list[np.ndarray]:
-    """Angles of both joints, their rates and second rates."""
-    size, rate, late = np.array([0.6, 0.5]), np.array([2.9, 3.7]), np.array([0.0, 1.0])
-    turned = T[:, None] * rate + late
-    return [size * np.sin(turned), size * rate * np.cos(turned), -size * rate**2 * np.sin(turned)]
-
-
 @pytest.fixture(scope="module")
 def made(urdf_folder) -> Recording:
     """The motion of a double pendulum and its currents by Pinocchio's inverse dynamics, elbow first."""
     pin = pytest.importorskip("pinocchio", reason="the other engine is Pinocchio: pip install pin")
     model = pin.buildModelFromUrdf(str(urdf_folder / "double_pendulum.urdf"))
-    data, start, (q, v, a) = model.createData(), pin.neutral(model), moved()
+    data, start, size, rate = model.createData(), pin.neutral(model), np.array([0.6, 0.5]), np.array([2.9, 3.7])
+    turned = T[:, None] * rate + [0.0, 1.0]
+    q, v, a = size * np.sin(turned), size * rate * np.cos(turned), -size * rate**2 * np.sin(turned)
     states = zip(q, v, a, strict=True)
     effort = np.array([pin.rnea(model, data, pin.integrate(model, start, x), *row) for x, *row in states])
     effort += v * list(TRUTH.values())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -41,17 +40,12 @@ def system() -> System:
     return System.build(robot, objects=[(flexible_object(segments), None, None)], prescribed=robot.joint_names)
 
 
-@pytest.fixture(scope="session")
-def read() -> Callable[..., np.ndarray]:
-    """read(system, sensor, q, effort): outputs at the parameters' nominal values."""
-
-    def outputs(system: System, sensor: Sensor, q=None, effort=None) -> np.ndarray:
-        n = system.n_coordinates
-        function = sensor_reading_function(system, sensor, ())
-        at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
-        return np.array(ca.densify(function(**at, theta=system.parameters.vector())["y"])).ravel()
-
-    return outputs
+def read(system: System, sensor: Sensor, q=None, effort=None) -> np.ndarray:
+    """Outputs at the parameters' nominal values."""
+    n = system.n_coordinates
+    function = sensor_reading_function(system, sensor, ())
+    at = {name: np.zeros(n) if values is None else values for name, values in (("q", q), ("load", effort))}
+    return np.array(ca.densify(function(**at, theta=system.parameters.vector())["y"])).ravel()
 
 
 class Drift(Effect):
@@ -116,7 +110,7 @@ def test_effects_act_one_after_the_other_on_every_channel(whole: System) -> None
     assert read == pytest.approx([2.0 + drift, 0.8 * 3.0 + drift])
 
 
-def test_a_point_worked_out_by_hand(system: System, read) -> None:
+def test_a_point_worked_out_by_hand(system: System) -> None:
     q = np.zeros(system.n_coordinates)
     a, b = 0.3, -0.7
     q[[system.mechanism.joint_index(name) for name in ("left_a", "left_b")]] = a, b
@@ -125,7 +119,7 @@ def test_a_point_worked_out_by_hand(system: System, read) -> None:
     assert read(system, PointSensor("points_arm", ("hand",), ("left_gripper",)), q) == pytest.approx(expected)
 
 
-def test_every_channel_knows_its_own_frame(system: System, read) -> None:
+def test_every_channel_knows_its_own_frame(system: System) -> None:
     """The near surface lies at the radius of the tube that each point is on: 30 mm for T1, 10 mm for T2."""
     near = system.with_effects([make_effect("surface_offset", "camera", system, {"fraction": 1.0})])
     shift = (read(near, CAMERA) - read(system, CAMERA)).reshape(2, 3)
@@ -135,7 +129,7 @@ def test_every_channel_knows_its_own_frame(system: System, read) -> None:
     assert (np.sum(shift * rays, axis=1) > 0).all()
 
 
-def test_points_along_a_segment(system: System, read) -> None:
+def test_points_along_a_segment(system: System) -> None:
     """Halfway along two links lies the joint between them; a quarter beyond it, half of the second link."""
     q = np.random.default_rng(1).uniform(-0.5, 0.5, system.n_coordinates)
     found = read(system, PointSensor("points", ("a", "b", "c", "d"), ("T1:50%", "T1_0_tip", "T1:75%", "w_T1")), q)
@@ -147,14 +141,14 @@ def test_points_along_a_segment(system: System, read) -> None:
     assert np.linalg.norm(read(near, along, q) - read(system, along, q)) == pytest.approx(0.03)
 
 
-def test_an_effort_sensor_reads_its_joints_in_its_own_order(system: System, read) -> None:
+def test_an_effort_sensor_reads_its_joints_in_its_own_order(system: System) -> None:
     effort = np.arange(1.0, system.n_coordinates + 1)
     a, b = (system.mechanism.joint_index(name) for name in ("left_a", "left_b"))
     assert read(system, EffortSensor(("left_b", "left_a")), effort=effort) == pytest.approx([effort[b], effort[a]])
 
 
 @pytest.mark.parametrize("sensor", [EffortSensor(("x9",)), PointSensor("points", ("p",), ("x9",))])
-def test_a_joint_or_frame_that_is_not_there_is_refused(sensor: Sensor, system: System, read) -> None:
+def test_a_joint_or_frame_that_is_not_there_is_refused(sensor: Sensor, system: System) -> None:
     with pytest.raises(ModelError, match="x9"):
         read(system, sensor)
 

@@ -152,13 +152,6 @@ def test_rates_that_do_not_fit_are_refused(choices: dict[str, Any], match: str) 
         SimulationOptions(**choices)
 
 
-def test_simulations_that_do_not_fit_are_refused() -> None:
-    system = SYSTEMS[1]
-    motion = random_multisine_motion(system, seed=0)
-    with pytest.raises(ModelError, match="driven joints"):
-        simulate_in_mujoco(replace(system, driven=system.driven[:3], prescribed=system.driven[3:]), None, motion)
-
-
 def grippers_beside(system: System, values: dict[str, float], time_step: float, held: System) -> MujocoScene:
     """The scene with the joints a tenth of a radian from where the grippers meet another system's object."""
     scene = MujocoScene.from_model(system, mujoco, compile_mjcf(mujoco_xml(system, values, time_step=time_step)))
@@ -240,7 +233,6 @@ def test_recording_has_what_the_sensors_saw(runs: Runs) -> None:
     assert np.linalg.norm(camera.pose[:3, 3] - run.point_positions[0].mean(0)) == pytest.approx(2.0)
     assert TRUTH.items() <= recording.true_parameters.items()
     assert all(name.rpartition(".")[2] in ("bend", "twist", "damping", "mass") for name in recording.true_parameters)
-    assert "MuJoCo" in recording.description
 
 
 def recorded(run: SimulationResult, seed: int, noise: ArmSensorNoise, camera: PointCamera | None = None) -> Recording:
@@ -294,6 +286,10 @@ def test_experiments_that_do_not_fit_are_refused() -> None:
         run_virtual_experiment(SYSTEMS[1], None, VirtualExperiment(None, None, brief, of_two))
     with pytest.raises(ConfigError, match="arms = 3"):
         baxter_foam_y_system(3)
+    system = SYSTEMS[1]
+    motion = random_multisine_motion(system, seed=0)
+    with pytest.raises(ModelError, match="driven joints"):
+        simulate_in_mujoco(replace(system, driven=system.driven[:3], prescribed=system.driven[3:]), None, motion)
 
 
 @pytest.mark.parametrize(("kind", "arms"), [("ROUGH", 1), ("CLEAN", 2)])

@@ -170,9 +170,6 @@ def test_every_kind_is_done_once_and_what_is_outside_is_not_in_the_library():
         *injected._FORCES,
     }
     assert set(injected._SENSOR_ERROR_KINDS) <= set(injected.INJECTABLE_EFFECT_KINDS)
-
-
-def test_a_kind_that_cannot_be_done_is_refused():
     with pytest.raises(ConfigError, match="grasp_slip"):
         run_experiment_with_effects(SYSTEM, TRUTH, [InjectedEffect("grasp_slip", "left", {})])
 

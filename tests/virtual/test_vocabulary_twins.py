@@ -54,10 +54,10 @@ def recorded(effects: list[InjectedEffect], seed: int = 1, duration: float = 1.6
     return run_experiment_with_effects(arm(), {}, effects, experiment)
 
 
-def fitted(kind: str, place: str, recording: Recording, mode: str, **start: float) -> dict[str, tuple[float, float]]:
+def fitted(kind: str, place: str, recording: Recording, mode: str) -> dict[str, tuple[float, float]]:
     """Value and standard deviation of an effect's quantities, fitted beside the dampings."""
     system = arm(mode)
-    effect = make_effect(kind, place, system, start)
+    effect = make_effect(kind, place, system)
     step = compile_step(system.with_effects([effect]), 0.01, use_compiler=False)
     free = (*effect.parameters.names, "shoulder.damping", "elbow.damping")
     problem = EstimationProblem(step, [recording], free, ProblemOptions(path_cutoff=20.0))
@@ -189,14 +189,15 @@ def evaluated(system: System, recording: Recording) -> tuple[float, np.ndarray]:
     return found.cost, np.asarray(found.episode_predictions[0].rollout.state[::4, : len(JOINTS)])
 
 
-def test_a_virtual_experiment_records_commands_and_no_efforts(recording: Recording) -> None:
+def test_a_virtual_experiment_records_commands_and_no_efforts(servo_arm: System, recording: Recording) -> None:
     joints = recording.joints
     assert joints.effort is None
     np.testing.assert_allclose(joints.position_command[0], list(SERVO_POSTURE.values()), atol=1e-12)
     # it lags and sags
     assert np.ptp(joints.position, axis=0).min() > 0.05
     assert np.abs(joints.position - joints.position_command).max() > 0.05
-    assert "commands of position servos" in recording.description
+    with pytest.raises(ModelError, match="no efforts"):
+        played(servo_arm, InjectedEffect("encoder_offset", "pan", {"offset": 0.01}))
 
 
 def test_both_engines_move_alike(servo_arm: System, recording: Recording) -> None:
@@ -236,11 +237,6 @@ def test_an_injected_effect_is_the_librarys(servo_arm: System, effect: InjectedE
     system = servo_arm.with_effects([make_effect(effect.kind, effect.location, servo_arm, effect.values)])
     without, with_it = (evaluated(made_of, made)[0] for made_of in (servo_arm, system))
     assert with_it < 0.05 * without
-
-
-def test_effects_on_efforts_need_efforts(servo_arm: System) -> None:
-    with pytest.raises(ModelError, match="no efforts"):
-        played(servo_arm, InjectedEffect("encoder_offset", "pan", {"offset": 0.01}))
 
 
 def test_export_says_that_a_servo_is_native_in_mjcf_alone(servo_arm: System) -> None:
