@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -29,12 +28,10 @@ class Bench:
     system: System
     step: Step
 
-    def recording(
-        self, effects: Mapping[str, Mapping[str, float]], seed: int, duration: float = 4.0, torque=None, noise=NOISE
-    ) -> Recording:
-        system = self.system.with_effects(
-            [make_effect(*label.split("@"), self.system, values) for label, values in effects.items()]
-        )
+    def recording(self, effects, seed: int, duration: float = 4.0, torque=None, noise=NOISE) -> Recording:
+        """A recording of a motion with effects, as a mapping of label to values, and noise."""
+        made = [make_effect(*label.split("@"), self.system, values) for label, values in effects.items()]
+        system = self.system.with_effects(made)
         step = compile_step(system, TIME_STEP)
         rng = np.random.default_rng(seed)
         steps = round(duration / TIME_STEP)

@@ -45,13 +45,13 @@ def motion(seed: int, steps: int = 120) -> Recording:
     """Two joints on smooth paths at 100 Hz, efforts still zero."""
     rng = np.random.default_rng(seed)
     t = 0.01 * np.arange(steps + 1)
-    waves = [
-        sum(rng.normal() * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) / f for f in (0.4, 0.9, 1.7)) for _ in range(2)
-    ]
-    position = 0.5 * np.stack(waves, axis=1)
-    joints = JointGroup(
-        ("shoulder", "elbow"), t, position, effort=np.zeros_like(position), effort_std=EFFORT_STD, position_std=0.0
-    )
+
+    def wave():
+        return sum(rng.normal() * np.sin(2 * np.pi * f * t + rng.uniform(0, 6)) / f for f in (0.4, 0.9, 1.7))
+
+    position = 0.5 * np.stack([wave(), wave()], axis=1)
+    stds = {"effort_std": EFFORT_STD, "position_std": 0.0}
+    joints = JointGroup(("shoulder", "elbow"), t, position, effort=np.zeros_like(position), **stds)
     return Recording(joints, source="test", name=f"motion_{seed}")
 
 
@@ -90,16 +90,14 @@ def pendulum_data(tmp_path_factory, urdf_folder):
         write_recording(motion(seed), folder / "motion.h5")
         text = CONFIG.format(urdf=urdf_folder / "double_pendulum.urdf", estimate="motion.h5", held_out="motion.h5")
         (folder / "simulate.yaml").write_text(text)
-        settings = ["--set", "recordings.held_out=[]"]
-        for parameter, value in TRUTH.items():
-            settings += ["--set", f"parameters.{parameter}.initial={value}"]
+        said = ["recordings.held_out=[]", *(f"parameters.{name}.initial={value}" for name, value in TRUTH.items())]
+        settings = [part for setting in said for part in ("--set", setting)]
         out = folder / f"simulate_{name}"
         arguments = ["--out", str(out), "--noise", "--seed", str(seed), "--quiet"]
         assert main(["simulate", str(folder / "simulate.yaml"), *arguments, *settings]) == 0
         (out / "recording.h5").rename(folder / f"{name}.h5")
-    text = CONFIG.format(
-        urdf=urdf_folder / "double_pendulum.urdf", estimate=folder / "estimate.h5", held_out=folder / "held_out.h5"
-    )
+    files = {name: folder / f"{name}.h5" for name in ("estimate", "held_out")}
+    text = CONFIG.format(urdf=urdf_folder / "double_pendulum.urdf", **files)
     return SimpleNamespace(folder=folder, text=text, truth=TRUTH)
 
 
@@ -125,10 +123,8 @@ def rubbing(tmp_path_factory, pendulum_data):
         write_recording(replace(recording, joints=replace(joints, effort=rubbed)), folder / f"{name}.h5")
     text = pendulum_data.text.replace(str(pendulum_data.folder), str(folder))
     file = folder / "rubbing.yaml"
-    file.write_text(
-        f"{text}diagnosis: {{candidates: [joint_coulomb, effort_offset, link_mass@elbow], max_effects: 1}}\n"
-        "output: {write_report: false}\n"
-    )
+    candidates = "diagnosis: {candidates: [joint_coulomb, effort_offset, link_mass@elbow], max_effects: 1}"
+    file.write_text(f"{text}{candidates}\noutput: {{write_report: false}}\n")
     return file
 
 

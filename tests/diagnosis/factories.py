@@ -92,12 +92,9 @@ def point(residual, *signatures: _EffectSignature) -> AllCandidatesLinearization
     return AllCandidatesLinearization(np.asarray(residual, float), signatures)
 
 
-def score(
-    of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step: Mapping[str, float] | None = None
-) -> CandidateScore:
-    return CandidateScore(
-        of, dict.fromkeys(of.amplitude_names, 0.1) if step is None else dict(step), decrease, statistic, p
-    )
+def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step=None) -> CandidateScore:
+    values = dict.fromkeys(of.amplitude_names, 0.1) if step is None else dict(step)
+    return CandidateScore(of, values, decrease, statistic, p)
 
 
 def visible(of: EffectBase, seen=True, detectable=0.1) -> CandidateDetectability:
@@ -128,53 +125,35 @@ def costing(cost: float, rows: int) -> Evaluation:
     return replace(evaluation(np.zeros(rows)), cost=cost)
 
 
-def fit(
-    effects: Sequence[EffectBase] = (),
-    lost: HeldOutLoss | None = None,
-    cost=1.0,
-    values=None,
-    std=None,
-    problem=None,
-    held=None,
-) -> RefittedModel:
+def fit(effects=(), lost=None, cost=1.0, values=None, std=None, problem=None, held=None) -> RefittedModel:
     """A refitted model; values are neutral unless given. `held`: std of amplitudes with shapes held, if others."""
     neutral = {name: value for entry in effects for name, value in entry.neutral_values.items()}
     values = neutral | dict(values or {})
     std = dict.fromkeys(values, 0.01) | dict(std or {})
-    lost = loss(1.0, 1.0) if lost is None else lost
     held = {name: std[name] for entry in effects for name in entry.amplitude_names} | dict(held or {})
-    return RefittedModel(values, std, held, "made up", tuple(effects), problem, cost, evaluation([1.0]), lost)
+    rest = (tuple(effects), problem, cost, evaluation([1.0]), loss(1.0, 1.0) if lost is None else lost)
+    return RefittedModel(values, std, held, "made up", *rest)
 
 
 def closed(value=0.9, low=0.8, high=0.95) -> GapClosure:
     return GapClosure(value, low, high)
 
 
-def added(
-    of: EffectBase,
-    rivals: Sequence[EffectBase] = (),
-    fitted: RefittedModel | None = None,
-    part: GapClosure | None = None,
-):
+def added(of: EffectBase, rivals: Sequence[EffectBase] = (), fitted=None, part=None) -> SelectedEffect:
     """An effect that was added; it is the first of its rivals."""
     return SelectedEffect(of, fitted or fit([of]), part or closed(), (of, *rivals))
 
 
-def carried(
-    label="friction@elbow", name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False
-) -> ParameterTransferCheck:
+def carried(name="a", values=(0.5, 0.9), stds=(0.01, 0.02), agrees=False) -> ParameterTransferCheck:
     """An amplitude on the recordings to estimate on and on the held-out ones."""
-    return ParameterTransferCheck(label, name, "N m", values[0], stds[0], values[1], stds[1], agrees)
+    return ParameterTransferCheck("friction@elbow", name, "N m", values[0], stds[0], values[1], stds[1], agrees)
 
 
 # -- smoother ---------------------------------------------------------------------------------------------------------
 
 FORCE, OTHER_FORCE = SmoothedUnknownGroup("T1", "force"), SmoothedUnknownGroup("T2", "force")
-READ_FORCE, BIAS, OFFSET = (
-    SmoothedUnknownGroup("elbow", "force", True),
-    SmoothedUnknownGroup("camera", "bias"),
-    SmoothedUnknownGroup("left", "offset"),
-)
+READ_FORCE, BIAS = SmoothedUnknownGroup("elbow", "force", True), SmoothedUnknownGroup("camera", "bias")
+OFFSET = SmoothedUnknownGroup("left", "offset")
 
 
 def trace(sources: Sequence[SmoothedUnknownGroup], mean, std, recording="run") -> SmoothedUnknowns:
@@ -188,13 +167,12 @@ def trace(sources: Sequence[SmoothedUnknownGroup], mean, std, recording="run") -
 def smoothed(
     weight: Mapping[SmoothedUnknownGroup, float],
     *,
-    evidence: Mapping[str, float] | None = None,
-    variance: Mapping[SmoothedUnknownGroup, float] | None = None,
-    detectable: Mapping[SmoothedUnknownGroup, float] | None = None,
-    traces: Sequence[SmoothedUnknowns] = (),
+    evidence=None,
+    variance=None,
+    detectable=None,
+    traces=(),
     chi2=(200.0, 100.0),
     degrees=(100.0, 90.0),
-    **more: float,
 ) -> SmootherResult:
     """What the smoother says."""
     return SmootherResult(
@@ -202,12 +180,8 @@ def smoothed(
         group_variance={s: float(w > 0) for s, w in weight.items()} if variance is None else dict(variance),
         log_evidence_drop=dict(weight),
         detectable_std=dict.fromkeys(weight, 0.5) if detectable is None else dict(detectable),
-        chi2_before=chi2[0],
-        chi2_after=chi2[1],
-        dof_before=degrees[0],
-        dof_after=degrees[1],
-        log_evidence={"none": 0.0, "both": 0.0, "plant": 0.0, "sensor": 0.0} | dict(evidence or {}),
-        **more,
+        **dict(zip(("chi2_before", "chi2_after", "dof_before", "dof_after"), (*chi2, *degrees), strict=True)),
+        log_evidence=dict.fromkeys(("none", "both", "plant", "sensor"), 0.0) | dict(evidence or {}),
     )
 
 
@@ -225,6 +199,7 @@ def absorbed(name, before, after, std=0.1, unit="N m/rad") -> NominalParameterCh
 def finding(verdict="effect", **changed) -> DiagnosisResult:
     """A finding; everything that is not named is unremarkable."""
     of = effect()
+    alone = fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5})
     usual = {
         "verdict": verdict,
         "noise_floor": (ChannelNoiseLevel("points.tip", "m", 0.001, 100),),
@@ -236,8 +211,8 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "smoother_result": None,
         "gap_locations": (place(),),
         "nominal_model": fit(lost=loss(2.0, 2.2), problem=SimpleNamespace(has_process_noise=False)),
-        "single_effect_models": (fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5}),),
-        "selected_effects": (added(of, fitted=fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5})),),
+        "single_effect_models": (alone,),
+        "selected_effects": (added(of, fitted=alone),),
         "gap_closure": closed(),
         "remaining_test": outcome(p=0.4, chi2=1.02),
         "remaining_gap_locations": (),

@@ -16,7 +16,6 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.errors import ConfigError
-from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.diagnose import run_diagnose
@@ -107,24 +106,17 @@ def test_a_recording_of_the_baseline_is_refused(beam, tmp_path):
 @pytest.mark.parametrize("times", [0.1, 1.0, 10.0])
 def test_a_move_counts_as_the_difference_of_two_independent_estimates(beam, times):
     """Of one parameter it is (data alone - baseline) over the root of both variances, however tight the baseline is."""
-    run = load_config(
-        beam / "beam.yaml",
-        ("recordings.estimate=[again.h5]", "recordings.held_out=[bare.h5]", "parameters.beam.damping.free=false"),
-    )
-    problem = build_problem(run)
-    alone = refit_with_effects(AllCandidatesProblem(problem.with_parameter_values(TRUTH), (), False), (), {})
-    assert alone is not None
+    files = ("recordings.estimate=[again.h5]", "recordings.held_out=[bare.h5]")
+    run = load_config(beam / "beam.yaml", (*files, "parameters.beam.damping.free=false"))
+    problem = build_problem(run).with_parameter_values(TRUTH)
+    alone = refit_with_effects(AllCandidatesProblem(problem, (), False), (), {})
     std = alone.std["beam.bend"] * times
     before = alone.values["beam.bend"] + 3 * std
     known = RunEstimates("old", ("beam.bend",), np.array([before]), np.array([[std**2]]))
-    both = refit_with_effects(
-        AllCandidatesProblem(with_baseline_prior(problem.with_parameter_values(TRUTH), known), (), False), (), {}
-    )
-    assert both is not None
+    both = refit_with_effects(AllCandidatesProblem(with_baseline_prior(problem, known), (), False), (), {})
     [shift] = BaselineData.from_runs([known], ()).compare_with_baseline(both, Thresholds()).parameter_shifts
     apart = (alone.values["beam.bend"] - before) / np.hypot(std, alone.std["beam.bend"])
     if times < 0.2:
         assert shift.z_score is None  # the recording says nothing beside such a baseline
     else:
         assert shift.z_score == pytest.approx(apart, rel=0.1)
-        assert isinstance(both.problem, EstimationProblem)

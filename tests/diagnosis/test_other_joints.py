@@ -28,11 +28,8 @@ def robot(side: str):
     system = System.build(read_urdf("package:baxter", joints=names), prescribed=names, damping=0.05)
     model = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
     locked = [j for j in range(1, model.njoints) if model.names[j] not in names]
-    return (
-        names,
-        compile_step(system, TIME_STEP, use_compiler=False),
-        pin.buildReducedModel(model, locked, pin.neutral(model)),
-    )
+    step = compile_step(system, TIME_STEP, use_compiler=False)
+    return names, step, pin.buildReducedModel(model, locked, pin.neutral(model))
 
 
 def recording(side: str, seed: int, extra) -> Recording:
@@ -62,26 +59,14 @@ def recording(side: str, seed: int, extra) -> Recording:
 
 def at_one(joint: str, law):
     """Effort that one joint needs beside inverse dynamics, by its angle and speed."""
-
-    def extra(names, q, v):
-        at = names.index(joint)
-        added = np.zeros_like(q)
-        added[:, at] = law(q[:, at], v[:, at])
-        return added
-
-    return extra
+    return lambda names, q, v: np.where(np.array(names) == joint, law(q, v), 0.0)
 
 
 def diagnosed(side: str, extra):
     names, step, _ = robot(side)
-    free = tuple(f"{name}.damping" for name in names)
-    problem = EstimationProblem(
-        step,
-        [recording(side, 1, extra)],
-        free,
-        ProblemOptions(path_cutoff=float("inf")),
-        held_out=[recording(side, 2, extra)],
-    )
+    free, options = tuple(f"{name}.damping" for name in names), ProblemOptions(path_cutoff=np.inf)
+    estimate, held_out = (recording(side, seed, extra) for seed in (1, 2))
+    problem = EstimationProblem(step, [estimate], free, options, held_out=[held_out])
     return diagnose(problem, CANDIDATES, thresholds=Thresholds(max_effects=2, n_refit_per_round=3))
 
 

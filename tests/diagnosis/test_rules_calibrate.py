@@ -49,18 +49,8 @@ def test_too_few_cases_promise_less() -> None:
     assert _conformal_quantile(list(range(40)), "least") == (1, 39 / 41)
 
 
-STATISTICS = {
-    "p_value": 1.0,
-    "chi2_per_dof": 1.0,
-    "largest_channel": 1.0,
-    "candidate": 1.0,
-    "evidence": None,
-    "closure_low": None,
-    "fall": None,
-    "explained": None,
-    "carried": None,
-    "behind": {},
-}
+STATISTICS = dict.fromkeys(("evidence", "closure_low", "fall", "explained", "carried")) | {"behind": {}}
+STATISTICS |= dict.fromkeys(("p_value", "chi2_per_dof", "largest_channel", "candidate"), 1.0)
 
 
 def case(category: str, verdict: str, *effects: InjectedEffect, multiple: float | None = None, **said: Any) -> Any:
@@ -126,15 +116,11 @@ def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
 
 def test_a_tie_is_what_the_truth_may_be_behind_beyond_chance() -> None:
     def behind(error: float, **lost: float | None) -> Any:
-        said = {
-            label.replace("_at_", "@"): {
-                "left": x if x is None else 1.0 + x,
-                "chi2_per_dof": x,
-                "error": error if x else 0.0,
-                "squares": x,
-            }
-            for label, x in lost.items()
-        }
+        said = {}
+        for label, x in lost.items():
+            left = x if x is None else 1.0 + x
+            own = {"left": left, "chi2_per_dof": x, "error": error if x else 0.0, "squares": x}
+            said[label.replace("_at_", "@")] = own
         return case("single", "unknown", DAMPER, multiple=3.0, statistics={"behind": said})
 
     cases = [
@@ -162,9 +148,7 @@ def test_a_tie_is_what_the_truth_may_be_behind_beyond_chance() -> None:
         (None, None, 5.0, 0.75),
     ],
 )
-def test_settings_are_quantiles_within_what_is_of_use(
-    evidence: float | None, explained: float | None, worth: float, asked: float
-) -> None:
+def test_settings_are_quantiles_within_what_is_of_use(evidence, explained, worth, asked) -> None:
     clean = case("null", "no_gap", open=STATISTICS | {"evidence": evidence})
     named = case("single", "effect", DAMPER, multiple=3.0, statistics={"explained": explained})
     labels, marks, answers = zip(clean, named, strict=True)
@@ -190,8 +174,7 @@ def test_cases_that_could_not_be_fitted_do_not_count() -> None:
 
 
 def test_every_rule_is_of_a_threshold() -> None:
-    for rule in _CALIBRATION_RULES.values():
-        assert hasattr(Thresholds(), rule.setting)
+    assert all(hasattr(Thresholds(), rule.setting) for rule in _CALIBRATION_RULES.values())
     wide = permissive_thresholds(Thresholds(n_refit_per_round=3))
     assert wide.n_refit_per_round == 3
     assert wide.significance_level > 1 > Thresholds().significance_level
@@ -206,10 +189,9 @@ def kept():
 
 
 def test_defaults_are_those_that_it_advises(kept):
+    settings = [rule.setting for rule in _CALIBRATION_RULES.values()]
     assert kept["format"] == _CALIBRATION_FORMAT
-    assert kept["settings"] == {
-        rule.setting: getattr(DEFAULT_THRESHOLDS, rule.setting) for rule in _CALIBRATION_RULES.values()
-    }
+    assert kept["settings"] == {setting: getattr(DEFAULT_THRESHOLDS, setting) for setting in settings}
 
 
 def test_its_advice_follows_from_its_samples_by_the_rules_as_they_are(kept):
@@ -217,12 +199,8 @@ def test_its_advice_follows_from_its_samples_by_the_rules_as_they_are(kept):
     assert set(rules) == set(_CALIBRATION_RULES)
     for name, rule in _CALIBRATION_RULES.items():
         own = rules[name]
-        assert (own["setting"], own["of"], own["side"], own["limit"]) == (
-            rule.setting,
-            rule.of,
-            rule.side,
-            rule.limit,
-        )
+        said = (own["setting"], own["of"], own["side"], own["limit"])
+        assert said == (rule.setting, rule.of, rule.side, rule.limit)
         sample = [float("-inf") if value is None else value for value in own["sample"]]
         value, coverage = _conformal_quantile(sample, rule.side, kept["asked"])
         assert own["coverage"] == coverage

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from small_problems import pendulum_step
 
 from yid_ocp.cli import main
 
@@ -32,8 +33,6 @@ def limited_urdf(urdf_folder, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def moved(limited_urdf):
-    from small_problems import pendulum_step
-
     return pendulum_step(limited_urdf.parent, prescribed=("shoulder",))
 
 
@@ -57,8 +56,7 @@ def refused(tmp_path, capsys):
         arguments = [part for setting in settings for part in ("--set", setting)]
         assert main(["plan", str(config), "--out", str(tmp_path / "out"), *arguments]) == 2
         told = capsys.readouterr().err
-        for word in words:
-            assert word in told, told
+        assert all(word in told for word in words), told
         assert not (tmp_path / "out").exists()
 
     return check

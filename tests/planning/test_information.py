@@ -19,21 +19,15 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 
 PAIR = ("joint_coulomb@shoulder", "joint_viscous@shoulder")
 FREE = ("elbow.stiffness", "elbow.damping")
-OPTIONS = PlanOptions(
-    goal="information",
-    duration=1.0,
-    hold_duration=0.4,
-    n_spline_coefficients=4,
-    n_random_starts=2,
-    limits=PlanLimits(max_acceleration=15.0, max_spring_angle=1.0),
-)
+LIMITS = PlanLimits(max_acceleration=15.0, max_spring_angle=1.0)
+SIZES = {"duration": 1.0, "hold_duration": 0.4, "n_spline_coefficients": 4, "n_random_starts": 2}
+OPTIONS = PlanOptions(goal="information", limits=LIMITS, **SIZES)
 
 
 def problem_of(limited_urdf, free=FREE, **how):
     step = pendulum_step(limited_urdf.parent, **how)
-    recording = taken(step, 3, steps=140)
     options = ProblemOptions(path_cutoff=15.0, feedback="none")
-    return EstimationProblem(step, [recording], free, options)
+    return EstimationProblem(step, [taken(step, 3, steps=140)], free, options)
 
 
 @pytest.fixture(scope="module")
@@ -48,21 +42,17 @@ def driven_problem(limited_urdf):
 
 @pytest.fixture(scope="module")
 def moved_experiment(moved_problem):
-    return PlannedExperiment.from_options(moved_problem, values_of(moved_problem), OPTIONS)
+    return PlannedExperiment.from_options(moved_problem, {}, OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def driven_experiment(driven_problem):
-    return PlannedExperiment.from_options(driven_problem, values_of(driven_problem), OPTIONS)
+    return PlannedExperiment.from_options(driven_problem, {}, OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def told(moved_problem):
     return plan_informative_motion(moved_problem, OPTIONS)
-
-
-def values_of(problem):
-    return dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
 
 
 def some_motion(experiment, seed=0, size=0.1):
@@ -77,13 +67,11 @@ def test_sensors_tell_as_much_in_a_second_as_in_the_recording(driven_problem, dr
     for new, old in zip(planned.episodes[0].measurements, base.episodes[0].measurements, strict=True):
         assert new.sensor.channel_names == old.sensor.channel_names
         length = len(new.node) * (new.node[1] - new.node[0]) * base.step.time_step
-        np.testing.assert_allclose(
-            np.sum(new.weight**2, axis=0) / length, np.sum(old.weight**2, axis=0) / spent, rtol=1e-9
-        )
+        after, before = (np.sum(samples.weight**2, axis=0) for samples in (new, old))
+        np.testing.assert_allclose(after / length, before / spent, rtol=1e-9)
     joints = experiment._noise_free_recording(w).joints
-    np.testing.assert_allclose(
-        joints.position[:, 0], experiment.simulator.joint_positions(w)[: len(joints.t), 0], atol=1e-12
-    )
+    path = experiment.simulator.joint_positions(w)[: len(joints.t)]
+    np.testing.assert_allclose(joints.position, path, atol=1e-12)
     assert np.ravel(joints.effort_std) == pytest.approx(0.3)
     # the model itself, driven by these torques, goes where they came from
     evaluation = planned.evaluate(planned.initial_unknowns)
@@ -121,12 +109,11 @@ def test_driven_arms_tell_about_what_the_innovations_say(driven_experiment):
 
 
 ROWS = np.random.default_rng(4).normal(size=(30, 7))
+APART = ((3,), (4, 5)), (np.array([[2.0]]), np.diag([0.5, 3.0])), (0, 1, 2, 3, 4, 5)
 CRITERIA = {
     "all": DOptimalityCriterion((0, 1, 2), (0, 1, 2)),
     "one": DOptimalityCriterion((1,), (0, 1, 2)),
-    "apart": EffectDiscriminationCriterion(
-        ((3,), (4, 5)), (np.array([[2.0]]), np.diag([0.5, 3.0])), (0, 1, 2, 3, 4, 5)
-    ),
+    "apart": EffectDiscriminationCriterion(*APART),
 }
 
 
@@ -141,10 +128,8 @@ def test_criteria_know_their_derivatives(name):
 def test_precision_is_that_of_the_marginal_standard_deviation():
     wide = np.vstack([1e3 * ROWS, np.eye(7)[3:]])
     covariance = np.linalg.inv(wide.T @ wide)
-    one, both = (
-        DOptimalityCriterion(chosen, (0, 1, 2)).value_and_gradient_by_sensitivities(wide)[0]
-        for chosen in ((1,), (0, 1))
-    )
+    criteria = (DOptimalityCriterion(chosen, (0, 1, 2)) for chosen in ((1,), (0, 1)))
+    one, both = (criterion.value_and_gradient_by_sensitivities(wide)[0] for criterion in criteria)
     assert one == pytest.approx(-0.5 * np.log(covariance[1, 1]), abs=1e-5)
     assert both == pytest.approx(-0.5 * np.log(np.linalg.det(covariance[:2, :2])), abs=1e-5)
     # with no data a parameter is known to within 400 %
@@ -177,9 +162,8 @@ def searched(limits, rounds=50):
     values, upper = limits
     bounds = np.full((2, 1), -1.0), np.full((2, 1), 1.5)
     simulator = SimpleNamespace(coefficient_bounds=lambda: bounds, simulate_path=lambda w, slopes=False: w)
-    experiment = SimpleNamespace(
-        simulator=simulator, search_problem_sensitivities=line, sensitivity_derivatives_by_coefficients=slopes
-    )
+    read = {"search_problem_sensitivities": line, "sensitivity_derivatives_by_coefficients": slopes}
+    experiment = SimpleNamespace(simulator=simulator, **read)
     bounded = [SimpleNamespace(unit=np.ones(len(upper)), lower=-np.inf * np.ones(len(upper)), upper=np.array(upper))]
     kept = SimpleNamespace(limit_rows=bounded, limited_quantity_values=lambda rolled, w: values(w.ravel()))
     search = InformativeMotionSearch(experiment, kept, DOptimalityCriterion((0, 1), (0, 1)))
@@ -238,33 +222,26 @@ def test_it_starts_and_ends_at_rest_within_limits(told):
     assert all(names in (("shoulder",), ("elbow",)) for names in told.active_limits.values())
 
 
-def test_one_parameter_is_told_better_where_it_alone_counts(moved_problem, told):
-    alone = plan_informative_motion(moved_problem, replace(OPTIONS, identify=("elbow.damping",)))
-    own, both = (plan.parameter_precisions["elbow.damping"].std_planned for plan in (alone, told))
-    assert own <= 1.02 * both
+QUICK = replace(OPTIONS, n_random_starts=1, max_iterations=1, n_spline_coefficients=2)
 
 
 def test_the_same_seed_gives_the_same_motion(moved_problem):
-    options = replace(OPTIONS, n_random_starts=1, max_iterations=1, n_spline_coefficients=2)
-    first, again, other = (
-        plan_informative_motion(moved_problem, replace(options, seed=seed)).spline_coefficients for seed in (0, 0, 1)
-    )
+    plans = [plan_informative_motion(moved_problem, replace(QUICK, seed=seed)) for seed in (0, 0, 1)]
+    first, again, other = (plan.spline_coefficients for plan in plans)
     np.testing.assert_array_equal(first, again)
     assert not np.allclose(first, other)
 
 
 def test_two_effects_are_moved_apart(driven_problem):
-    found = plan_informative_motion(
-        driven_problem, replace(OPTIONS, discriminate=PAIR, n_random_starts=1, max_iterations=4)
-    )
+    options = replace(OPTIONS, discriminate=PAIR, n_random_starts=1, max_iterations=4)
+    found = plan_informative_motion(driven_problem, options)
     assert set(found.effect_distances) == {PAIR, PAIR[::-1]}
     for before, after in found.effect_distances.values():
         assert after > 1.5 * before
 
 
 def test_effects_of_twice_the_size_lie_twice_as_far_apart(driven_problem):
-    quick = replace(OPTIONS, n_random_starts=1, max_iterations=1, n_spline_coefficients=2, discriminate=PAIR)
-    told = []
+    quick, told = replace(QUICK, discriminate=PAIR), []
     for factor in (1.0, 2.0):
         sizes = {PAIR[0]: {"tau_c": 0.2 * factor}, PAIR[1]: {"b": 0.05 * factor}}
         told.append(plan_informative_motion(driven_problem, quick, None, sizes).effect_distances)
@@ -291,7 +268,6 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
     ("more", "words"),
     [
         ({"identify": ("elbow.stifness",)}, ("no parameter 'elbow.stifness'", "did you mean 'elbow.stiffness'?")),
-        ({"identify": ("lower.mass",)}, ("plan.identify",)),
         ({"identify": ()}, ("no parameter is to be told", "elbow.stiffness")),
         ({"identify": FREE, "discriminate": ("joint_viscous@elbow",)}, ("one of the two",)),
         ({"discriminate": ("joint_viscous@elbow",)}, ("1 effect is to be separated", "two effects or more")),
@@ -302,10 +278,7 @@ def test_a_parameter_that_nothing_sees_is_named_and_the_others_are_told(limited_
         ),
         ({"discriminate": ("joint_viscous@elbw", "joint_coulomb@elbow")}, ("elbw", "elbow")),
         ({"start_joint_positions": {"shoulder": 1.5}}, ("0.3 beyond its limit",)),
-        (
-            {"limits": PlanLimits(effort_fraction=1e-4)},
-            ("pass their limits before they move", "shoulder", "where 0.004"),
-        ),
+        ({"limits": PlanLimits(effort_fraction=1e-4)}, ("pass their limits before they move", "where 0.004")),
         ({"n_random_starts": 0}, ("n_random_starts = 0", "from 1")),
     ],
 )
