@@ -347,9 +347,8 @@ def _followed(
     for margin in TRUNCATION_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
-        composed, cuts = replace(search.problem, problem=nominal.problem).truncate_held_out_recordings(
-            nominal.values, margin
-        )
+        composed = replace(search.problem, problem=nominal.problem)
+        composed, cuts = composed.truncate_held_out_recordings(nominal.values, margin)
         for cut in cuts:
             search.progress.begin_stage(held_out_truncation_message(cut))
         names = {cut.recording for cut in cuts}
@@ -363,11 +362,9 @@ def _followed(
 
 def _offsets_stated(problem: EstimationProblem) -> bool:
     """Whether the size of torque offsets or of constant sensor errors is stated."""
-    return any(
-        episode.has_uncertain_sensor_biases
-        or (episode.input_errors is not None and bool(np.any(episode.input_errors.torque_bias_std > 0)))
-        for episode in problem.episodes
-    )
+    errors = (episode.input_errors for episode in problem.episodes)
+    torques = any(entry is not None and np.any(entry.torque_bias_std > 0) for entry in errors)
+    return torques or any(episode.has_uncertain_sensor_biases for episode in problem.episodes)
 
 
 def _better_nominal_fit(search: RefitContext, nominal: RefittedModel) -> RefittedModel | None:

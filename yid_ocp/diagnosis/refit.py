@@ -293,10 +293,9 @@ def _refit_covariance(problem: EstimationProblem, finish: Evaluation, limits: Th
 def _conditional_amplitude_std(
     names: Sequence[str], effects: Sequence[EffectBase], covariance: Array
 ) -> dict[str, float]:
-    """Standard deviations of the effects' amplitudes with their shape parameters held at their estimates.
+    """Standard deviations of the effects' amplitudes with their shapes held, as a weak effect has any shape.
 
-    Next to nothing an effect has any shape: that of a weak spring is a rest angle as far away as one likes. Whether it
-    is there at all is asked with its shape held (Davies 1987, doi:10.1093/biomet/74.1.33).
+    Davies 1987, doi:10.1093/biomet/74.1.33.
     """
     found = {}
     for effect in effects if len(covariance) else ():

@@ -303,17 +303,13 @@ def score_candidates_jointly(
     point: AllCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
 ) -> AllCandidatesScoreModel:
     """Return the joint linear model of all candidates, at the scores' shape values or the middle of the grid."""
-    shape = {
-        s.effect.label: {k: v for k, v in s.predicted_values.items() if k in s.effect.shape_parameter_names}
-        for s in chosen
-    }
+    shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}
     groups: dict[str, list[_EffectSignature]] = {}
     for signature in point.signatures:
         groups.setdefault(signature.effect.label, []).append(signature)
-    kept = [
-        next((s for s in group if s.shape_values == shape.get(label)), group[len(group) // 2])
-        for label, group in groups.items()
-    ]
+    kept = []
+    for label, group in groups.items():
+        kept.append(next((s for s in group if s.shape_values == shape.get(label)), group[len(group) // 2]))
     every = np.hstack([np.zeros((len(point.projected_residual), 0)), *(s.projected_sensitivity for s in kept)])
     effects, shapes = tuple(s.effect for s in kept), tuple(s.shape_values for s in kept)
     return AllCandidatesScoreModel(effects, shapes, every.T @ every, -(every.T @ point.projected_residual))

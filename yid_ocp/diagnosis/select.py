@@ -137,11 +137,9 @@ def penalized_chi2_difference(fit: RefittedModel, other: RefittedModel) -> float
 
 
 def _bic_prefers(fit: RefittedModel, best: RefittedModel, limits: Thresholds) -> bool:
-    """Whether BIC prefers `fit` with fewer parameters over `best` when model error dominates.
+    """Whether BIC prefers `fit` with fewer parameters over `best` when model error dominates, alike within a block.
 
-    Residuals are then errors of the model, of unknown size and alike for the length of a block: blocks times the
-    logarithm of the losses' ratio against parameters times that of the blocks (Schwarz 1978,
-    doi:10.1214/aos/1176344136).
+    Schwarz 1978, doi:10.1214/aos/1176344136.
     """
     blocks, fewer = len(best.held_out_loss.block_chi2), best.effect_parameter_count - fit.effect_parameter_count
     if _chi2(best) < limits.model_error_chi2 or not np.isfinite(_chi2(fit)) or fewer <= 0:
@@ -183,9 +181,8 @@ def _is_significant(effect: EffectBase, fit: RefittedModel, limits: Thresholds) 
 
 def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds) -> bool:
     """Whether the held-out error, of all channels or of any one, is reduced by the fraction `min_rmse_reduction`."""
-    if _lr_decisive(before, after, limits) or not np.isfinite(before.chi2_per_sample):
-        return True
-    return relative_rmse_reduction(before, after) >= limits.min_rmse_reduction
+    sure = _lr_decisive(before, after, limits) or not np.isfinite(before.chi2_per_sample)
+    return sure or relative_rmse_reduction(before, after) >= limits.min_rmse_reduction
 
 
 def relative_rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
@@ -277,7 +274,8 @@ def select_effects(
                 one = fit.effects[0]
                 if _likely(one, fit, limits) and not _is_amplitude_outside_prior(one, fit, limits):
                     fits.append(fit)
-        fits = _of_a_size(fits, limits) if base else fits
+        # of an unlikely size it would mend what those before it do wrong
+        fits = [fit for fit in fits if not base or not _is_amplitude_outside_prior(fit.effects[-1], fit, limits)]
         if not fits:
             break
         near = _near_best_models(fits, limits)
@@ -321,11 +319,6 @@ def _pairs_to_refit(screened: ScreeningResult, limits: Thresholds, without: Effe
         if not any((same(a, c) and same(b, d)) or (same(a, d) and same(b, c)) for c, d in before):
             chosen.append(((a, b), values))
     return chosen
-
-
-def _of_a_size(fits: Sequence[RefittedModel], limits: Thresholds) -> list[RefittedModel]:
-    """Fits whose last effect is of a size to be expected: beyond it, it mends what those before it do wrong."""
-    return [fit for fit in fits if not _is_amplitude_outside_prior(fit.effects[-1], fit, limits)]
 
 
 def _little_is_left(fit: RefittedModel, limits: Thresholds) -> bool:
@@ -391,7 +384,7 @@ def _revised(
     own = replace(full, effects=(*rest, entry.effect))
     others = refit_with_each_effect(search, rest, [pair for pair in tried if pair[0][0].label != label], without.values)
     if not _is_amplitude_outside_prior(entry.effect, own, limits):
-        others = _of_a_size(others, limits)
+        others = [fit for fit in others if not _is_amplitude_outside_prior(fit.effects[-1], fit, limits)]
     near = _near_best_models([own, *others], limits)
     chosen = next((fit for fit in near if _needed(without, fit, fit.effects[-1], limits)), own)
     rivals = (chosen.effects[-1], *(fit.effects[-1] for fit in near if fit is not chosen))
