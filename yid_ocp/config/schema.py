@@ -102,9 +102,8 @@ def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = ""
     for name, inner in below.items():
         path = f"{at}{name}"
         if prefix.startswith(f"{path}."):
-            yield from iter_settable_key_completions(
-                inner, prefix, raw.get(name) if isinstance(raw, dict) else None, f"{path}."
-            )
+            said = raw.get(name) if isinstance(raw, dict) else None
+            yield from iter_settable_key_completions(inner, prefix, said, f"{path}.")
         elif path.startswith(prefix):
             has_keys = section_variants_from_annotation(inner) or options.mapping_value_type(inner)
             yield f"{path}." if has_keys else f"{path}="

@@ -34,6 +34,8 @@ from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.surface_meshes import ExtraMesh
 
 _Names = tuple[str, ...]
+_Texts = Mapping[str, str] | None
+_Numbers = Mapping[str, float] | None
 _Vector3 = tuple[float, float, float]
 _Vector4 = tuple[float, float, float, float]
 _FilePath = Annotated[str, OptionInfo("a file, relative to the configuration", is_path=True)]
@@ -186,30 +188,25 @@ class ImportSettings:
     command_topic: Annotated[str | None, OptionInfo("of a bag: topic of joint states with commanded positions")] = None
     joints: Annotated[_Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; or all")] = None
     points: Annotated[
-        Mapping[str, str] | None,
-        OptionInfo("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point that it is, such as cable:40%"),
+        _Texts,
+        OptionInfo("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point it is, such as cable:40%"),
     ] = None
-    pose_axes: Annotated[
-        float | None, Gt(0), Le(10), OptionInfo("how far along a pose's axes points NAME_x, _y and _z are made", "m")
-    ] = None
+    pose_axes: Annotated[float | None, Gt(0), Le(10), OptionInfo("from a pose to points NAME_x, _y, _z", "m")] = None
     columns: Annotated[
-        Mapping[str, str] | None,
-        OptionInfo("of a table: column, or pattern such as *_pos, and t, CHANNEL:JOINT, AXIS:POINT or skip"),
+        _Texts, OptionInfo("of a table: column, or pattern such as *_pos, and t, CHANNEL:JOINT, AXIS:POINT or skip")
     ] = None
     header: Annotated[bool | None, OptionInfo("of a table: whether its first row has names, else 1, 2, ...")] = None
     skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether to leave out lines without numbers")] = None
     delimiter: Annotated[str | None, OptionInfo("of a table: one character between cells; a comma when absent")] = None
     units: Annotated[
-        Mapping[str, str] | None,
+        _Texts,
         OptionInfo(
             "of t (s, ms, us, ns), position (rad, deg, rev), velocity (rad/s, deg/s, rpm), effort (N m, N mm, A, mA), "
             "points (m, cm, mm) and so on, where they are not SI"
         ),
     ] = None
-    torque_constants: Annotated[
-        Mapping[str, float] | None, OptionInfo("by joint or pattern, where effort is a motor's current", "N m/A")
-    ] = None
-    gears: Annotated[Mapping[str, float] | None, OptionInfo("motor turns per turn of a joint, pattern; or 1")] = None
+    torque_constants: Annotated[_Numbers, OptionInfo("by joint or pattern, where efforts are currents", "N m/A")] = None
+    gears: Annotated[_Numbers, OptionInfo("turns of the motor per turn of the joint, by joint or pattern; or 1")] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
     clock: Annotated[ClockKind | None, OptionInfo("of a table: whether its times were measured")] = None
     sensor: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
@@ -243,12 +240,10 @@ class DiagnosisSettings(Thresholds):
 
     candidates: Annotated[Literal["all"] | _Names, OptionInfo("effects to try: all, kind or kind@location")] = "all"
     exclude: Annotated[_Names, OptionInfo("candidates not to try, by kind or kind@location")] = ()
-    noise_fraction: Annotated[
-        float, Gt(0), Le(1), OptionInfo("part of all stated std that is noise; the rest stands for the model's error")
-    ] = 1.0
-    baseline: Annotated[
-        tuple[_FilePath, ...], OptionInfo("runs of `solve` or `diagnose` of this model: what differs since is asked")
-    ] = ()
+    noise_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("part of stated std that is noise, not model error")] = (
+        1.0
+    )
+    baseline: Annotated[tuple[_FilePath, ...], OptionInfo("earlier runs of this model, to ask what differs")] = ()
 
     @property
     def null_test_residual_limits(self) -> ExcessResidualCriteria:

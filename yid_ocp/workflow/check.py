@@ -129,10 +129,8 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
             warnings.append(f"{episode.name}: joints come at {recorded:.4g} Hz, the model steps at {rate:.4g} Hz")
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
-            warnings.append(
-                f"{episode.name}: nothing says whether joints/effort is a sample, a mean or a command (attribute "
-                f"effort_kind); it is taken as a {arm.effort_kind_or_default}"
-            )
+            said = "nothing says whether joints/effort is a sample, a mean or a command (attribute effort_kind)"
+            warnings.append(f"{episode.name}: {said}; it is taken as a {arm.effort_kind_or_default}")
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None
@@ -227,10 +225,8 @@ def _frequency_convergence(run: RunSettings, problem: EstimationProblem | None, 
         return {"links": [], "time_step": [], "message": own.message}
     if own.n_unstable_modes:
         remedy = "problem.constraint_force: midpoint, " if rule[1] == "node" and system.grasps else ""
-        warnings.append(
-            f"{own.n_unstable_modes} modes grow from step to step about the first posture: take a shorter "
-            f"problem.time_step, {remedy}or more damping"
-        )
+        grow = f"{own.n_unstable_modes} modes grow from step to step about the first posture"
+        warnings.append(f"{grow}: take a shorter problem.time_step, {remedy}or more damping")
     steps = [_row(h, own)]
     steps += [_row(h / k, frequencies(system, posture, theta, h / k, *rule, guess)) for k in (2, 4)]
     _warn(warnings, "the time step goes", " s", steps)

@@ -96,9 +96,7 @@ class ConfigProposal:
                 group: [attributes_to_json(place, "point frame why=reason") for place in places]
                 for group, places in self.point_placements.items()
             },
-            "noise": {
-                group: attributes_to_json(noise, "std unit why=reason") for group, noise in self.noise_by_group.items()
-            },
+            "noise": {key: attributes_to_json(own, "std unit why=reason") for key, own in self.noise_by_group.items()},
         }
 
     @property

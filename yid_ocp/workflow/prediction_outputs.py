@@ -99,9 +99,8 @@ def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapp
                 advice = "look at the residuals, and let `yid-ocp diagnose` say what the model lacks"
                 sensor, _, channel = group.partition(".")
                 at = (entry["recording"], sensor, channel)
-                found.append(
-                    Issue("worse_than_guess", f"{what} {guess:.3g} {unit}", "not_trusted", evidence, advice, *at)
-                )
+                what = f"{what} {guess:.3g} {unit}"
+                found.append(Issue("worse_than_guess", what, "not_trusted", evidence, advice, *at))
     return found
 
 

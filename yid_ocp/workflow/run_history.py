@@ -48,9 +48,8 @@ def read_estimates(folder: str | Path) -> RunEstimates:
         matrix = np.array(known["matrix"], float).reshape(len(names), len(names))
         units = {name: str(parameters[name]["unit"]) for name in names}
         explains = bool(result["fit"]["explains"]) if "fit" in result else result["verdict"] == "no_gap"
-        effects = effect_parameter_values_by_label(
-            {name: entry["value"] for name, entry in parameters.items() if "@" in name}
-        )
+        all_values = {name: entry["value"] for name, entry in parameters.items() if "@" in name}
+        effects = effect_parameter_values_by_label(all_values)
     except (LookupError, TypeError, ValueError) as error:
         what = "the result does not say how sure its parameters are together"
         allowed = "keys parameters and covariance, as this version writes them"

@@ -83,10 +83,8 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
         raise run.config_error(what, "recordings", "estimate", allowed=allowed, hint=hint)
     progress.begin_stage("simulating a virtual experiment in MuJoCo")
     simulation = SimulationOptions(run.problem.duration or _DEFAULT_DURATION)
-    experiment = VirtualExperiment(
-        simulation=simulation, seed=seed, recording_name=run.name, description=run.description
-    )
-    made = run_virtual_experiment(system, None, experiment)
+    experiment = VirtualExperiment(simulation=simulation, seed=seed, recording_name=run.name)
+    made = run_virtual_experiment(system, None, replace(experiment, description=run.description))
     alone = recording_animation("recorded", system, system.parameters.vector(), made)
     return made, [] if alone is None else [alone]
 

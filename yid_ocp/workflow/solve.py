@@ -208,9 +208,8 @@ def measure_discretisation_shifts(
         progress.begin_stage(f"trying {words}")
         try:
             refined = _refined_problem(run, problem, key)
-            own = discretisation.discretisation_estimate_shifts(
-                refined, problem, x, at_x, model_difference_only=models_alone
-            )
+            shifts = discretisation.discretisation_estimate_shifts
+            own = shifts(refined, problem, x, at_x, model_difference_only=models_alone)
         except YidError as error:
             own = error.what
         if isinstance(own, str):
@@ -247,9 +246,8 @@ def stability_checked_solution(problem: EstimationProblem, solution: Solution) -
     Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not
     stable and leave that place; one that ends there has followed the step's own errors.
     """
-    begin, end = (
-        discretisation.largest_alternating_error_growth(problem, x) for x in (problem.initial_unknowns, solution.x)
-    )
+    growth = discretisation.largest_alternating_error_growth
+    begin, end = growth(problem, problem.initial_unknowns), growth(problem, solution.x)
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
     if end is not None and not end.is_stable:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
