@@ -304,6 +304,7 @@ def _settings(prefix: str, parsed_args: argparse.Namespace, **_: Any) -> list[st
 _SAID_IDENTIFIABILITY = "say which parameters the recordings determine, and which experiment would tell more"
 _SAID_BLIND = "prove the diagnosis on virtual recordings whose effect is withheld; goes on where it was interrupted"
 _SAID_COMPLETION = "print what makes a shell complete commands, options, files and settings"
+_SAID_EXPORT = "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP"
 COMMANDS = tuple(
     _CliCommand(*row)
     for row in (
@@ -322,12 +323,7 @@ COMMANDS = tuple(
         ("inspect", "show the model's equations: names, patterns, single entries, numbers", "inspect.run", _inspect),
         ("track", "measure the object's points in the frames of a depth camera", "track.run", _track),
         ("import", "turn a file of another tool into a recording", "import_recording.run", _import),
-        (
-            "export",
-            "turn a recording into CSV or MCAP, a run into MJCF, URDF, SDF, YAML or MCAP",
-            "export.run",
-            _export,
-        ),
+        ("export", _SAID_EXPORT, "export.run", _export),
         ("completion", _SAID_COMPLETION, _print_completion_script, _completion),
         ("schema", "print the JSON Schema of configuration files, for editors", _print_schema, _schema),
     )

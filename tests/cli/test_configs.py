@@ -37,12 +37,7 @@ QUICK = {
         *UNREFINED,
     ),
     "servo_pendulum": ("problem.duration=0.5", "solver.max_iterations=2", "problem.use_compiler=false", *UNREFINED),
-    "panda_beam": (
-        "problem.duration=0.8",
-        "model.object.segments.beam.links=1",
-        "solver.max_iterations=2",
-        *UNREFINED,
-    ),
+    "panda_beam": ("problem.duration=0.8", "model.object.segments.beam.links=1", "solver.max_iterations=2", *UNREFINED),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "soft_beam": (
         "problem.duration=0.3",

@@ -10,19 +10,11 @@ from dataclasses import MISSING
 import pytest
 from ruamel.yaml import YAML
 
+from yid_ocp import options
 from yid_ocp.config.reader import DEFAULT_CONFIG, load_config
 from yid_ocp.config.schema import section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
-from yid_ocp.options import (
-    _BOUND_MARKERS,
-    dataclass_options,
-    describe_type,
-    mapping_value_type,
-    split_annotated,
-    tuple_entry_type,
-    union_members,
-)
 from yid_ocp.solvers import GaussNewton, SteepestDescent
 
 RENAMED = "names changed in this version: see the table in CHANGELOG.md"
@@ -233,27 +225,27 @@ def numbers(hint, wrap=lambda value: value, path=(), option=None):
     """Every number that a file may hold: its key, what the file around it looks like, its option's type, its bounds."""
     sections = section_variants_from_annotation(hint)
     for word, kind in (sections.classes if sections is not None else {}).items():
-        options = dataclass_options(kind)
-        needed = {key: needed_value(own.type_hint) for key, own in options.items() if own.default_value is MISSING}
+        known = options.dataclass_options(kind)
+        needed = {key: needed_value(own.type_hint) for key, own in known.items() if own.default_value is MISSING}
         needed |= {sections.selector_key: word} if sections.selector_key else {}
-        for name, entry in options.items():
+        for name, entry in known.items():
             yield from numbers(entry.type_hint, within(wrap, name, needed), (*path, name), entry.type_hint)
     if sections is not None:
         return
-    values = mapping_value_type(hint)
+    values = options.mapping_value_type(hint)
     named = section_variants_from_annotation(values)
     if named is not None and named.selector_key == "name":
         for name in named.classes:
             yield from numbers(named.variants_for_mapping_key(name, "").classes[""], within(wrap, name), (*path, name))
     elif values is not None:
         yield from numbers(values, within(wrap, "NAME"), (*path, "NAME"), option)
-    for member in union_members(hint):
-        entries, (bare, markers) = tuple_entry_type(member), split_annotated(member)
+    for member in options.union_members(hint):
+        entries, (bare, markers) = options.tuple_entry_type(member), options.split_annotated(member)
         if entries is not None:
             yield from numbers(entries, lambda value: wrap([value]), path, option)
         if bare in (int, float):
-            kinds = tuple(kind for kind, *_ in _BOUND_MARKERS)
-            bounds = [marker for marker in (*split_annotated(hint)[1], *markers) if isinstance(marker, kinds)]
+            kinds = tuple(kind for kind, *_ in options._BOUND_MARKERS)
+            bounds = [marker for marker in (*options.split_annotated(hint)[1], *markers) if isinstance(marker, kinds)]
             yield ".".join(path), wrap, option, bounds
 
 
@@ -262,8 +254,8 @@ def within(wrap, name, beside=None):
 
 
 def needed_value(hint):
-    bare, _ = split_annotated(hint)
-    return 1.0 if bare is float else [*"abcde"] if tuple_entry_type(hint) is not None else "a"
+    bare, _ = options.split_annotated(hint)
+    return 1.0 if bare is float else [*"abcde"] if options.tuple_entry_type(hint) is not None else "a"
 
 
 NUMBERS = list(numbers(RunSettings))
@@ -273,7 +265,7 @@ def outside():
     """A wrong value for every bound."""
     for key, wrap, option, bounds in NUMBERS:
         for bound in bounds:
-            [value] = [getattr(bound, name) for kind, name, *_ in _BOUND_MARKERS if isinstance(bound, kind)]
+            [value] = [getattr(bound, name) for kind, name, *_ in options._BOUND_MARKERS if isinstance(bound, kind)]
             wrong = {"Gt": value, "Lt": value, "Ge": value - 1, "Le": value + 1}[type(bound).__name__]
             yield pytest.param(key, wrap(wrong), option, id=f"{key}={wrong}")
 
@@ -289,7 +281,7 @@ def test_a_number_outside_its_bounds_is_refused(written, key, data, option):
     YAML(typ="safe").dump(data, stream)
     with pytest.raises(ConfigError) as caught:
         load_config(written(stream.getvalue()))
-    assert caught.value.allowed == describe_type(option)
+    assert caught.value.allowed == options.describe_type(option)
     assert "line" in caught.value.where
     last = [part for part in key.split(".") if part != "NAME"][-1]
     assert last in caught.value.where

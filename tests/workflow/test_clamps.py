@@ -15,14 +15,9 @@ from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis.baseline import with_baseline_prior
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
+from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.run_history import (
-    baseline_estimates,
-    load_reference_recordings,
-    read_estimates,
-    settings_with_baseline_effects,
-)
 from yid_ocp.workflow.run_inputs import read_recordings
 from yid_ocp.workflow.simulate import run_simulate
 
@@ -143,7 +138,7 @@ def folder_of(path, values=(0.02, 5e-5), std=(2e-4, 1e-6), correlation=0.5, **mo
 
 def test_a_baseline_is_a_joint_prior_about_its_values(tmp_path):
     run = settings(tmp_path)
-    known = read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
+    known = run_history.read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
     problem = with_baseline_prior(build_problem(run), known)
     at = [problem.unknown_names.index(name) for name in ("beam.bend", "beam.damping")]
     assert problem.initial_unknowns[at] == pytest.approx([0.018, 4e-5])
@@ -163,7 +158,7 @@ def test_the_baselines_effects_stay_in_the_model(tmp_path):
     )  # fmt: skip
     with pytest.raises(ConfigError, match="the effect kelvin_voigt@beam"):
         with_baseline_prior(build_problem(run), known)
-    problem = with_baseline_prior(build_problem(settings_with_baseline_effects(run, (known,))), known)
+    problem = with_baseline_prior(build_problem(run_history.settings_with_baseline_effects(run, (known,))), known)
     assert "kelvin_voigt@beam.tau" in problem.free
     assert problem.named_values(problem.initial_unknowns)["kelvin_voigt@beam.tau"] == pytest.approx(0.01)
 
@@ -180,7 +175,7 @@ def test_the_baselines_effects_stay_in_the_model(tmp_path):
 )
 def test_a_folder_that_says_nothing_of_parameters_is_refused(tmp_path, change, words):
     with pytest.raises(DataError, match=words):
-        read_estimates(folder_of(tmp_path / "old", **change))
+        run_history.read_estimates(folder_of(tmp_path / "old", **change))
 
 
 def test_a_baseline_of_another_model_is_refused_by_what_differs(tmp_path):
@@ -188,14 +183,14 @@ def test_a_baseline_of_another_model_is_refused_by_what_differs(tmp_path):
     (tmp_path / "old" / "config.yaml").write_text(BEAM.replace("links: 2", "links: 3"), encoding="utf-8")
     run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
     with pytest.raises(ConfigError, match=r"model\.object differs"):
-        baseline_estimates(run)
+        run_history.baseline_estimates(run)
 
 
 def test_recordings_of_the_baseline_are_those_without_what_is_looked_for(tmp_path):
     folder = folder_of(tmp_path / "old")
     (folder / "config.yaml").write_text(BEAM.replace("[beam.h5]", "[../beam.h5]"), encoding="utf-8")
     run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
-    [found], message = load_reference_recordings(run)
+    [found], message = run_history.load_reference_recordings(run)
     assert (found.name, message) == ("beam (without)", "")
     assert found.sha256 == read_recordings(run, "estimate")[0].sha256
 
@@ -219,7 +214,7 @@ def test_report_says_what_drifted_and_writes_the_history(tmp_path, cli):
 def test_a_program_with_node_states_has_the_same_joint_prior(tmp_path):
     """`python -m pytest -m slow tests/workflow/test_clamps.py`: some seconds in IPOPT."""
     run = settings(tmp_path, None, ("problem.initial_state=equilibrium",))
-    known = read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
+    known = run_history.read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
     problem = with_baseline_prior(build_problem(run), known)
     rolled, program = (solve(problem, method) for method in (GaussNewton(), MultipleShooting()))
     assert program.cost == pytest.approx(rolled.cost, rel=1e-6)

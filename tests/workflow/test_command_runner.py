@@ -14,14 +14,6 @@ from yid_ocp.progress import NULL_PROGRESS
 from yid_ocp.report.terminal import SummaryStatement
 from yid_ocp.solvers import Iterate
 from yid_ocp.workflow import command_runner
-from yid_ocp.workflow.command_runner import (
-    EXIT_DONE,
-    EXIT_FAILED,
-    CommandResult,
-    StderrLineProgress,
-    run_command_and_print,
-    stderr_progress_display,
-)
 
 ENTRY = Iterate(3, 12.5, np.zeros(1), 0.1, 4, 1.25, "first 2 s")
 
@@ -39,7 +31,7 @@ def clock(monkeypatch):
 
 
 def test_lines_for_stages_iterates_and_tenths(capsys, clock):
-    progress = StderrLineProgress()
+    progress = command_runner.StderrLineProgress()
     progress.begin_stage("solving")
     progress.report_iterate(ENTRY)
     for _ in range(2):  # the tenths begin again with every stage
@@ -56,7 +48,7 @@ def test_lines_for_stages_iterates_and_tenths(capsys, clock):
                        (3000.0, ["about 6.7 h", "about 50 min"])]
 )  # fmt: skip
 def test_the_time_left_counts_what_this_run_did(capsys, clock, pace, left):
-    progress = StderrLineProgress()
+    progress = command_runner.StderrLineProgress()
     progress.begin_stage("diagnosing")
     for done in (10, 12, 19, 20):  # ten were done before and took nothing
         clock[0] = 100.0 + pace * (done - 10)
@@ -67,7 +59,7 @@ def test_the_time_left_counts_what_this_run_did(capsys, clock, pace, left):
 
 
 def test_slow_parts_have_a_line_each_and_quick_ones_one_in_ten(capsys, clock):
-    progress = StderrLineProgress()
+    progress = command_runner.StderrLineProgress()
     progress.begin_stage("diagnosing")
     for done in range(4):
         clock[0] += 30.0
@@ -89,7 +81,7 @@ def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(monkeypat
     monkeypatch.setenv("COLUMNS", "200")
     update = Bars.update
     monkeypatch.setattr(Bars, "update", lambda self, task, **what: update(self, task, refresh=True, **what))
-    with stderr_progress_display(asked(program=True)) as progress:
+    with command_runner.stderr_progress_display(asked(program=True)) as progress:
         progress.report_parts_done(1, 2, "before any stage")
         progress.begin_stage("solving")
         progress.report_iterate(ENTRY)
@@ -102,8 +94,12 @@ def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(monkeypat
 
 
 def test_who_does_not_look_is_shown_nothing_or_lines():
-    for arguments, kind in ((asked(quiet=True), None), (asked(program=True), None), (asked(), StderrLineProgress)):
-        with stderr_progress_display(arguments) as progress:
+    for arguments, kind in (
+        (asked(quiet=True), None),
+        (asked(program=True), None),
+        (asked(), command_runner.StderrLineProgress),
+    ):
+        with command_runner.stderr_progress_display(arguments) as progress:
             assert progress is NULL_PROGRESS if kind is None else isinstance(progress, kind)
 
 
@@ -115,12 +111,12 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 
     def work(progress):
         progress.begin_stage("working")
-        return CommandResult(folder, {"format": "made", "a": 1}, None, reached)
+        return command_runner.CommandResult(folder, {"format": "made", "a": 1}, None, reached)
 
     folder = tmp_path / "runs" / "x"
-    code = run_command_and_print(asked(quiet=quiet), work)
+    code = command_runner.run_command_and_print(asked(quiet=quiet), work)
     captured = capsys.readouterr()
-    assert code == (EXIT_DONE if reached else EXIT_FAILED)
+    assert code == (command_runner.EXIT_DONE if reached else command_runner.EXIT_FAILED)
     expected = (f"{folder}\n", "") if quiet else ("a = 1\ndone\nrun folder: runs/x\n", "working ...\n")
     assert (captured.out, captured.err) == expected
 
@@ -129,5 +125,7 @@ def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setattr(command_runner, "SUMMARY_BY_FORMAT", {"made": lambda result: []})
-    run_command_and_print(asked(), lambda progress: CommandResult(tmp_path / "there", {"format": "made"}, None))
+    command_runner.run_command_and_print(
+        asked(), lambda progress: command_runner.CommandResult(tmp_path / "there", {"format": "made"}, None)
+    )
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")

@@ -22,19 +22,15 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
 from yid_ocp.report.terminal import torque_offset_table_rows
+from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.check import _input_noise
-from yid_ocp.workflow.prediction_outputs import (
-    estimated_torque_offsets,
-    prediction_error_entry,
-    worse_than_baseline_issues,
-    write_diagnosis_trajectories,
-    write_solve_trajectories,
-)
 
 
 def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
     problem, solution, held_out = solved_pendulum
-    write_solve_trajectories(tmp_path / "t.h5", problem, solution, [(held_out[0][0], "step 3 did not converge")])
+    prediction_outputs.write_solve_trajectories(
+        tmp_path / "t.h5", problem, solution, [(held_out[0][0], "step 3 did not converge")]
+    )
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-trajectories/1"
         assert list(file["unknowns"].attrs["names"]) == list(solution.unknown_names)
@@ -64,7 +60,7 @@ def test_a_diagnosis_without_a_gap_has_predictions_alone(solved_pendulum, tmp_pa
     ((episode, outcome),) = solved_pendulum[2]
     other = SimpleNamespace(predicted_outputs=[2 * array for array in outcome.predicted_outputs])
     finding = SimpleNamespace(smoother_result=None, events=NO_EVENTS)
-    write_diagnosis_trajectories(tmp_path / "t.h5", finding, [(episode, outcome, other)])
+    prediction_outputs.write_diagnosis_trajectories(tmp_path / "t.h5", finding, [(episode, outcome, other)])
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-diagnosis-trajectories/1"
         assert list(file) == ["held_out"]
@@ -76,19 +72,19 @@ def test_a_diagnosis_without_a_gap_has_predictions_alone(solved_pendulum, tmp_pa
 
 def test_a_file_that_cannot_be_written(solved_pendulum, tmp_path):
     with pytest.raises(OutputError, match="does not exist"):
-        write_solve_trajectories(tmp_path / "no" / "t.h5", *solved_pendulum)
+        prediction_outputs.write_solve_trajectories(tmp_path / "no" / "t.h5", *solved_pendulum)
 
 
 def test_a_held_out_recording_beside_a_guess_without_a_model(solved_pendulum):
     problem, _, held_out = solved_pendulum
-    entry = prediction_error_entry(problem, *held_out[0])
+    entry = prediction_outputs.prediction_error_entry(problem, *held_out[0])
     assert entry["recording"] == "held_out"
     samples = held_out[0][0].measurements[0]
     for i, channel in enumerate(samples.sensor.channel_names):
         error = held_out[0][1].predicted_outputs[0][:, i] - samples.value[:, i]
         assert entry["rmse"][channel] == pytest.approx(np.sqrt(np.nanmean(error**2)))
         assert entry["baselines"]["zero"][channel] == pytest.approx(np.sqrt(np.nanmean(samples.value[:, i] ** 2)))
-    failed = prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
+    failed = prediction_outputs.prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
     assert failed["message"] == "step 3 did not converge"
     assert failed["rmse"] == {}
     assert failed["baselines"] == entry["baselines"]
@@ -124,9 +120,9 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
 
 def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
     problem = problem_of(step)
-    assert estimated_torque_offsets(problem, problem.initial_unknowns) == {}
+    assert prediction_outputs.estimated_torque_offsets(problem, problem.initial_unknowns) == {}
     weighted = problem_whitened_at(problem, problem.initial_unknowns, rounds=2)
-    found = estimated_torque_offsets(weighted, problem.initial_unknowns)
+    found = prediction_outputs.estimated_torque_offsets(weighted, problem.initial_unknowns)
     assert list(found) == ["first", "second"]
     for entry in found.values():
         own = entry["shoulder"]
@@ -134,9 +130,9 @@ def test_offsets_of_all_recordings_are_told_with_what_was_expected(step):
         assert own["std"] < 0.1 * OFFSET
         assert own["value"] == pytest.approx(0.3, abs=4 * own["std"])
     alone = problem_whitened_at(problem_of(step, held_out=False), problem.initial_unknowns)
-    assert list(estimated_torque_offsets(alone, problem.initial_unknowns)) == ["first"]
+    assert list(prediction_outputs.estimated_torque_offsets(alone, problem.initial_unknowns)) == ["first"]
     unbiased = problem_whitened_at(problem_of(step, bias=0.0), problem.initial_unknowns)
-    assert estimated_torque_offsets(unbiased, problem.initial_unknowns) == {}
+    assert prediction_outputs.estimated_torque_offsets(unbiased, problem.initial_unknowns) == {}
 
 
 def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
@@ -213,7 +209,7 @@ EFFORT, POINTS = [("joints", "effort")], [("points", "")]
     ],
 )
 def test_a_sensor_counts_as_a_whole(rmse, guess, places):
-    found = worse_than_baseline_issues([entry(rmse, guess)], UNITS)
+    found = prediction_outputs.worse_than_baseline_issues([entry(rmse, guess)], UNITS)
     assert [(doubt.group, doubt.channel) for doubt in found] == places
     assert all((d.cause, d.weight, d.recording) == ("worse_than_guess", "not_trusted", "run") for d in found)
 
@@ -221,7 +217,7 @@ def test_a_sensor_counts_as_a_whole(rmse, guess, places):
 def test_the_best_guess_counts():
     said = entry({"points.p": 0.2}, {"points.p": 0.3})
     said["baselines"]["stays"] = {"points.p": 0.1}
-    (doubt,) = worse_than_baseline_issues([said], UNITS)
+    (doubt,) = prediction_outputs.worse_than_baseline_issues([said], UNITS)
     assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
     assert doubt.evidence == pytest.approx(0.2 / 0.105)
 

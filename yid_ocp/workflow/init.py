@@ -21,14 +21,10 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.progress import Progress
 from yid_ocp.version import package_version
+from yid_ocp.workflow import import_recording
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
 from yid_ocp.workflow.config_proposal import ConfigProposal, held_out_split_time, propose_config
-from yid_ocp.workflow.import_recording import (
-    has_native_recording_suffix,
-    read_third_party_recording,
-    reader_options_from_arguments,
-)
 
 _SCHEMA_FILE = "yid-ocp.schema.json"
 
@@ -56,7 +52,9 @@ def run(arguments: argparse.Namespace) -> int:
         return Path(os.path.relpath(Path(path).resolve(), out.parent.resolve())).as_posix()
 
     files, where = list(map(near, made)), robot if robot.startswith(("package:", "default:")) else near(robot)
-    lines = _config_lines(where, arguments.object, item, proposal, files, reader_options_from_arguments(arguments))
+    lines = _config_lines(
+        where, arguments.object, item, proposal, files, import_recording.reader_options_from_arguments(arguments)
+    )
     _write(out, "\n".join(lines) + "\n", written)
     result = {"format": "yid-init/1", "configuration": str(out), "recordings": files, "proposal": proposal.to_dict()}
     print_result(arguments, result, lambda: _summary_lines(proposal, out), f"configuration: {out}", str(out))
@@ -107,11 +105,11 @@ def _grasps(given: Sequence[str]) -> dict[str, str]:
 
 
 def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) -> dict[Path, Recording | None]:
-    options = reader_options_from_arguments(arguments)
+    options = import_recording.reader_options_from_arguments(arguments)
     made: dict[Path, Recording | None] = {}
     for file in map(Path, arguments.files):
-        if not has_native_recording_suffix(file):
-            recording = read_third_party_recording(file, options, progress)
+        if not import_recording.has_native_recording_suffix(file):
+            recording = import_recording.read_third_party_recording(file, options, progress)
             made[out.parent / f"{recording.name}.h5"] = recording
         elif options:
             what, flags = f"{file.name} is a recording already", ", ".join(options)

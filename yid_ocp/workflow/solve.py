@@ -23,7 +23,6 @@ from yid_ocp.inference.uncertainty import covariance_to_dict, estimates_marked_n
 from yid_ocp.integrator.step import step_with_time_step
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.predictions import rmse_by_channel
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -32,12 +31,12 @@ from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, divided_link_parameter_scale
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
+from yid_ocp.workflow.prediction_outputs import Prediction
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
 _Refinement = Literal["links", "time_step"]
 
 _MIN_STEPS_TO_COMPILE = 2000  # steps of one evaluation from which on compiling a finer model saves time
-_Prediction = tuple[Episode, EpisodePrediction | str]
 _RESULT_FORMAT = "yid-solve/1"
 
 
@@ -107,7 +106,10 @@ def solve_and_log(
 
 
 def solution_and_fit_issues(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[_Prediction], cable: CableTopology | None = None
+    problem: EstimationProblem,
+    solution: Solution,
+    held_out: Sequence[Prediction],
+    cable: CableTopology | None = None,
 ) -> tuple[Solution, tuple[Issue, ...]]:
     """The solution, its verdicts set to untrusted where the fit is poor, and all issues of data and fit.
 
@@ -134,7 +136,10 @@ def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dic
 
 
 def solve_result(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[_Prediction], cable: CableTopology | None = None
+    problem: EstimationProblem,
+    solution: Solution,
+    held_out: Sequence[Prediction],
+    cable: CableTopology | None = None,
 ) -> dict[str, Any]:
     """Contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = _prediction_errors(problem, solution, held_out, cable)
@@ -155,7 +160,7 @@ def solve_result(
 
 
 def _prediction_errors(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[_Prediction], cable: CableTopology | None
+    problem: EstimationProblem, solution: Solution, held_out: Sequence[Prediction], cable: CableTopology | None
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
     """Errors beside baselines of recordings held out and then of those fitted, units, and errors of channels fitted."""
     residuals: Mapping[str, Any] = {}

@@ -34,7 +34,7 @@ from yid_ocp.parallel import InlineExecutor, Task, TaskResult, WorkerConfig, req
 from yid_ocp.progress import Progress
 from yid_ocp.report.animation import ModelTrajectory, make_animation
 from yid_ocp.vision import camera_registration as registration
-from yid_ocp.vision import track_result
+from yid_ocp.vision import surface_meshes, track_result
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
@@ -42,14 +42,7 @@ from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
 from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionCheck
 from yid_ocp.vision.shape_evidence import FrameShapeFit
-from yid_ocp.vision.surface_meshes import (
-    CameraScene,
-    DepthCamera,
-    FrameTiming,
-    VirtualCamera,
-    VirtualFrames,
-    render_virtual_frames,
-)
+from yid_ocp.vision.surface_meshes import CameraScene, VirtualFrames
 from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
@@ -253,10 +246,12 @@ def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tu
         experiment = VirtualExperiment(simulation=simulation, camera=None, seed=seed, **named)
         truth = simulate_in_mujoco(system, None, motion, simulation, initial_joint_angles=posture)
         recording = record_simulation(system, None, experiment, truth)
-        timing = FrameTiming(settings.frame_rate, settings.dropped_fraction, *(settings.latency, settings.latency_std))
+        rate, latency = settings.frame_rate, (settings.latency, settings.latency_std)
+        timing = surface_meshes.FrameTiming(rate, settings.dropped_fraction, *latency)
+        depth = surface_meshes.DepthCamera(outlier_probability=settings.outlier_fraction)
         pose = look_at_pose(settings.camera_position, settings.camera_target)
-        camera = VirtualCamera(pose, DepthCamera(outlier_probability=settings.outlier_fraction), timing, seed=seed)
-        made = render_virtual_frames(camera_scene(run, system), truth.t, truth.q, camera)
+        camera = surface_meshes.VirtualCamera(pose, depth, timing, seed=seed)
+        made = surface_meshes.render_virtual_frames(camera_scene(run, system), truth.t, truth.q, camera)
     return recording, made
 
 
