@@ -136,12 +136,10 @@ def test_a_diagnosis_says_what_it_could_not_explain(tmp_path, cli):
         file.attrs["format"] = "yid-diagnosis-trajectories/1"
         where = file.create_group("where/a")
         where.attrs.update({"unknowns": names, "kinds": kinds, "start": 10.0})
-        for key, values in {"edges": 0.5 * np.arange(5), "mean": mean, "prior": prior}.items():
-            where[key] = values
+        where["edges"], where["mean"], where["prior"] = 0.5 * np.arange(5), mean, prior
         points = file.create_group("b/points_camera")
         points.attrs["channels"] = ["points_camera.w_T1"]
-        for key, values in {"t": np.arange(6.0), "measured": seen, "before": before, "after": after}.items():
-            points[key] = values
+        points["t"], points["measured"], points["before"], points["after"] = np.arange(6.0), seen, before, after
         event = file.create_group("events/b/elbow")
         event["t"], event["value"] = np.arange(3.0), np.array([0.0, 2.0, 0.0])
     done = cli("export", run, "--format", "mcap", "--out", tmp_path / "out", "--json")

@@ -85,9 +85,6 @@ def written(findings: ReportData, folder: Path) -> str:
     return (folder / "r.html").read_text(encoding="utf-8")
 
 
-# -- of a solve -------------------------------------------------------------------------------------------------------
-
-
 def findings(solved, **changes) -> ReportData:
     problem, solution, *_ = solved
     made = {"command": "yid-ocp solve p.yaml", "date": "2026-01-02 03:04:05+00:00"}
@@ -168,8 +165,6 @@ def test_a_report_that_cannot_be_written(solved_pendulum, tmp_path):
     with pytest.raises(OutputError, match="does not exist"):
         write_report(tmp_path / "no" / "r.html", findings(solved_pendulum))
 
-
-# -- of a diagnosis ---------------------------------------------------------------------------------------------------
 
 KNOWN = {"command": "yid-ocp diagnose 'a b.yaml'", "next_plan": None, "versions": {"python": "3"}, "date": "today"}
 CHAPTERS = ("gap", "where", "which", "alike", "curves", "absorbed")
@@ -252,9 +247,6 @@ def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     assert f"{pulse.impulse:.3g} ± {0.0125:.2g}" in text
     assert "From 1.5 s on nothing is judged in run" in text
     assert 'id="events"' not in page_of(found["no_gap"], tmp_path)
-
-
-# -- of every command -------------------------------------------------------------------------------------------------
 
 
 def check_in_browser(page: Path, width: int, scheme: str, folder: Path) -> None:

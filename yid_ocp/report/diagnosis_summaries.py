@@ -31,9 +31,6 @@ _FOUND_VERDICTS = ("identifiable", "weak", None)
 """Verdicts of parameters whose values count; a diagnosis gives its parameters none."""
 
 
-# -- one diagnosis ----------------------------------------------------------------------------------------------------
-
-
 @register_summary("yid-diagnosis/2")
 def diagnose_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of a diagnosis."""
@@ -106,9 +103,6 @@ def _planning_command(section: Mapping[str, Any]) -> str:
         text = f"[{', '.join(value)}]" if isinstance(value, list) else str(value)
         words += ["--set", f"plan.{key}={text}"]
     return shlex.join(words)
-
-
-# -- blind validation -------------------------------------------------------------------------------------------------
 
 
 @register_summary("yid-blind/1")
@@ -202,9 +196,6 @@ def _rate(own: Mapping[str, Any]) -> str:
     if not own["of"]:
         return "-"
     return f"{_share(own['rate'])} ({own['count']} of {own['of']}, {_share(own['low'])} to {_share(own['high'])})"
-
-
-# -- several runs -----------------------------------------------------------------------------------------------------
 
 
 @register_summary("yid-batch/1")

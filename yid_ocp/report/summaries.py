@@ -41,9 +41,6 @@ _MAX_DIRECTIONS = 8
 _MAX_INSPECTED_PARAMETERS = 12  # free parameters of which `inspect` speaks; result.json has all
 
 
-# -- solve and compare ------------------------------------------------------------------------------------------------
-
-
 @register_summary("yid-solve/1")
 def solve_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of a fit."""
@@ -214,9 +211,6 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
         yield words, *(f"{entry[key]:{form}}" for entry in entries)
 
 
-# -- identifiability and plan -----------------------------------------------------------------------------------------
-
-
 @register_summary("yid-identifiability/1")
 def identifiability_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of what recordings tell of each parameter."""
@@ -347,9 +341,6 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryParts:
     yield from (f"left open by this motion: {words}" for words in result["open"] if not words.startswith(unseen))
     if result["from"]["run"] is None:
         yield "the parameters are those of the configuration; where the true ones differ, so does what is told"
-
-
-# -- models, recordings and frames ------------------------------------------------------------------------------------
 
 
 @register_summary("yid-check/1")

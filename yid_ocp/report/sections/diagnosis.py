@@ -51,9 +51,6 @@ def _diagnosis(findings: ReportData) -> Mapping[str, Any] | None:
     return {"chapters": {name: chapter for name, chapter in chapters.items() if chapter is not None}}
 
 
-# -- the gap ----------------------------------------------------------------------------------------------------------
-
-
 def _gap(finding: DiagnosisResult) -> _Chapter:
     before, after = finding.nominal_model.held_out_loss.channel_rmse, finding.final_model.held_out_loss.channel_rmse
     changed = bool(finding.accepted_effects)
@@ -95,9 +92,6 @@ def _before_after_figures(
     rows: Sequence[tuple[str, str, ValueBeforeAfter]], axis: str, words: tuple[str, str, str]
 ) -> _TitledFigures:
     return figures_by_unit(rows, lambda own, unit: figures.values_before_after_figure(own, f"{axis} [{unit}]", words))
-
-
-# -- where ------------------------------------------------------------------------------------------------------------
 
 
 def _where(finding: DiagnosisResult) -> _Chapter | None:
@@ -189,9 +183,6 @@ def _side(smoothed: SmootherResult) -> str:
     )
 
 
-# -- events -----------------------------------------------------------------------------------------------------------
-
-
 def _events(finding: DiagnosisResult) -> _Chapter | None:
     events = finding.events
     if not events:
@@ -222,9 +213,6 @@ def _recording_figures(
     plots: Mapping[str, Sequence[TimePlotData]], words: str, dots: str, lines: Mapping[str, str]
 ) -> _TitledFigures:
     return [(f"Recording {name}{words}", figures.time_plots_figure(own, dots, lines)) for name, own in plots.items()]
-
-
-# -- which ------------------------------------------------------------------------------------------------------------
 
 
 def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
@@ -280,9 +268,6 @@ def _alike(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | No
     ]
     figure = figures.explained_fraction_matrix_figure(names, values)
     return "What could be mistaken for what", sentences, [("", figure)]
-
-
-# -- curves and parameters --------------------------------------------------------------------------------------------
 
 
 def _curves(

@@ -38,9 +38,6 @@ _JOINT_CHANNEL_UNITS = {
 """Units of a revolute and of a prismatic joint."""
 
 
-# -- in words and tables -----------------------------------------------------------------------------------------------
-
-
 @register_report_section("verdict", 0, "What was found")
 def _verdict(findings: ReportData) -> Mapping[str, Any] | None:
     """Conclusions, verdicts and the blocks up to the key table."""
@@ -220,9 +217,6 @@ def _joint_channel_unit(system: System | None, names: Sequence[str], channel: st
     kinds = {} if system is None else {joint.name: joint.kind for joint in system.mechanism.joints}
     is_prismatic = {kinds.get(name) == "prismatic" for name in names} or {False}
     return ", ".join(_JOINT_CHANNEL_UNITS[channel][kind] for kind in sorted(is_prismatic))
-
-
-# -- what moved and what was measured ----------------------------------------------------------------------------------
 
 
 class _PredictedEpisode(NamedTuple):
