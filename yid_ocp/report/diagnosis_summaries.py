@@ -270,7 +270,6 @@ def history_summary(result: Mapping[str, Any]) -> SummaryParts:
 
 
 def _consistency_rows(history: Mapping[str, Any]) -> Iterator[Sequence[str]]:
-    """Each run of a `yid-history/1` tested against all others."""
     yield "run", "differs from the others", "p", "most in", "model explains it", ""
     for entry in history["runs"]:
         apart = (f"chi2 {entry['chi2']:.3g} of {entry['degrees']}", p_value_text(entry["p_value"]), entry["worst"])

@@ -289,9 +289,6 @@ def _thinned(t: Array, values: Array) -> dict[str, NDArray[np.floating]]:
     return {"x": np.asarray(t[keep], float if is_late else np.float32), "y": np.asarray(values[keep], np.float32)}
 
 
-# -- one row per name -------------------------------------------------------------------------------------------------
-
-
 def _rows_figure(height: int, names: Sequence[str], title: str) -> Figure:
     """An empty figure with one named row for each name, the first on top."""
     order = {"categoryorder": "array", "categoryarray": list(names)}
@@ -307,11 +304,9 @@ def estimates_figure(values: Mapping[str, tuple[float, float | None, float, bool
     labels = {True: "estimate", False: "estimate that cannot be trusted"}
     for (found, label), color in zip(labels.items(), LINE_COLORS, strict=False):
         chosen = [name for name in names if values[name][3] == found]
-        figure.add_scatter(
-            x=[values[name][0] for name in chosen], y=chosen, mode="markers", name=label, showlegend=bool(chosen),
-            marker={"color": color, "size": 10},
-            error_x={"type": "data", "array": [2 * (values[name][1] or 0.0) for name in chosen], "color": color},
-        )  # fmt: skip
+        bars = {"type": "data", "array": [2 * (values[name][1] or 0.0) for name in chosen], "color": color}
+        points = {"x": [values[name][0] for name in chosen], "y": chosen, "error_x": bars, "name": label}
+        figure.add_scatter(**points, mode="markers", showlegend=bool(chosen), marker={"color": color, "size": 10})
     largest = max([abs(number) for value, _, initial, _ in values.values() for number in (value, initial)] or [1.0])
     lowest = min(0.0, *(value for value, *_ in values.values()))
     figure.update_xaxes(range=[lowest - 0.05 * largest, 1.6 * largest])
@@ -329,11 +324,10 @@ def parameter_values_by_source_figure(
     for i, source in enumerate(sources):
         own = [(k, *rows[name][source]) for k, name in enumerate(names) if source in rows[name]]
         color, symbol = _line_color(i), _SYMBOLS[i // len(LINE_COLORS) % len(_SYMBOLS)]
-        figure.add_scatter(
-            x=[value for _, value, _ in own], y=[k + spread * (i - (len(sources) - 1) / 2) for k, *_ in own],
-            mode="markers", name=source, marker={"color": color, "size": 8, "symbol": symbol},
-            error_x={"type": "data", "array": [2 * (std or 0.0) for *_, std in own], "color": color, "thickness": 1.2},
-        )  # fmt: skip
+        bars = {"type": "data", "array": [2 * (std or 0.0) for *_, std in own], "color": color, "thickness": 1.2}
+        places = [k + spread * (i - (len(sources) - 1) / 2) for k, *_ in own]
+        points = {"x": [value for _, value, _ in own], "y": places, "error_x": bars, "name": source}
+        figure.add_scatter(**points, mode="markers", marker={"color": color, "size": 8, "symbol": symbol})
     numbers = [0.0, *(value for row in rows.values() for value, _ in row.values())]
     low, high = min(numbers), max(numbers)
     # bars of what cannot be told would squeeze all others
@@ -448,10 +442,8 @@ def time_heat_map_figure(edges: Array, rows: Sequence[TimeHeatMapRow], axis: str
     figure.update_layout(plot_bgcolor=_GRID_COLOR, margin={"r": 150, "t": 40})
     figure.add_annotation(**_axis_title(f"color: {axis}", 1))
     figure.update_xaxes(showgrid=False, range=[float(edges[0]), float(edges[-1])])
-    figure.update_yaxes(
-        showgrid=False, range=[len(rows) - 0.5, -0.5], tickvals=list(range(len(rows))),
-        ticktext=[row.name for row in rows], automargin=True, tickfont={"size": 11},
-    )  # fmt: skip
+    ticks = {"tickvals": list(range(len(rows))), "ticktext": [row.name for row in rows], "tickfont": {"size": 11}}
+    figure.update_yaxes(showgrid=False, range=[len(rows) - 0.5, -0.5], automargin=True, **ticks)
     groups = [row.group for row in rows]
     for group in dict.fromkeys(groups):
         own = [i for i, entry in enumerate(groups) if entry == group]
@@ -479,17 +471,14 @@ def candidate_ranking_figure(
     last = 2 if done else 1
     figure = make_subplots(rows=1, cols=last, shared_yaxes=True, horizontal_spacing=0.08)
     figure = _styled_figure(100 + 28 * len(entries), "", "", base=figure)
-    figure.add_bar(
-        x=[decrease for _, decrease in entries.values()], y=list(entries), orientation="h",
-        width=0.55, marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last,
-    )  # fmt: skip
+    bars = {"x": [decrease for _, decrease in entries.values()], "y": list(entries), "orientation": "h", "width": 0.55}
+    figure.add_bar(**bars, marker={"color": LINE_COLORS[1]}, showlegend=False, row=1, col=last)
     figure.update_xaxes(title_text=promised, rangemode="tozero", row=1, col=last)
     if done:
         values, lows, highs = zip(*done.values(), strict=True)
-        figure.add_scatter(
-            x=values, y=list(done), mode="markers", showlegend=False, row=1, col=1,
-            marker={"color": LINE_COLORS[0], "size": 11}, error_x=asymmetric_error_bars(values, lows, highs),
-        )  # fmt: skip
+        points = {"x": values, "y": list(done), "error_x": asymmetric_error_bars(values, lows, highs)}
+        marker = {"color": LINE_COLORS[0], "size": 11}
+        figure.add_scatter(**points, mode="markers", marker=marker, showlegend=False, row=1, col=1)
         # what makes a prediction worse can do so without end
         left = min([0.0, *(max(low, _MIN_CLOSURE_PERCENT) for low in lows)]) - 6
         figure.update_xaxes(title_text=closed, range=[left, 108], row=1, col=1)

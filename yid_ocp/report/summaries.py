@@ -48,8 +48,7 @@ def solve_summary(result: Mapping[str, Any]) -> SummaryParts:
     failed = result["status"] == "failed"
     yield from () if failed else misfit_summary_blocks(result["fit"])
     yield from issue_summary_blocks(result)
-    head = ("parameter", "value", "± std", "95 % interval", "unit", "verdict", "start", "bounds")
-    rows: TableRows = [head]
+    rows: TableRows = [("parameter", "value", "± std", "95 % interval", "unit", "verdict", "start", "bounds")]
     for name, entry in free.items():
         std = "" if failed or entry["std"] is None or entry["verdict"] == "at_bound" else f"{entry['std']:.2g}"
         interval = "" if failed or entry["interval"] is None else interval_text(*entry["interval"])
@@ -66,9 +65,8 @@ def solve_summary(result: Mapping[str, Any]) -> SummaryParts:
     yield from discretisation_shift_sentences(result)
     yield from result.get("discretisation_notes", ())
     if failed:
-        yield SummaryStatement(
-            "the values are the best point that was reached; nothing can be said about how sure they are", "verdict"
-        )
+        said = "the values are the best point that was reached; nothing can be said about how sure they are"
+        yield SummaryStatement(said, "verdict")
     else:
         yield from (SummaryStatement(text, "verdict") for text in _found_and_lost(free))
         if result["fit"]["explains"]:
@@ -216,8 +214,8 @@ def identifiability_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of what recordings tell of each parameter."""
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
-        text = f"{result['status']}: {result['message']}; there is no point at which to judge"
-        yield SummaryStatement(text, "verdict")
+        said = f"{result['status']}: {result['message']}; there is no point at which to judge"
+        yield SummaryStatement(said, "verdict")
         return
     unsure = ("±", "± if start and grasps were unknown", "± if all else were known")
     rows: TableRows = [("parameter", "value", *unsure, "95 % interval", "unit", "verdict")]

@@ -81,9 +81,6 @@ def register_summary(result_format: str) -> Callable[[Callable[[Mapping[str, Any
     return enter
 
 
-# -- shared by several summaries ---------------------------------------------------------------------------------------
-
-
 def display_scale_and_unit(unit: str) -> tuple[float, str]:
     """Scale factor and unit for display: metres become millimetres, other units stay."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
@@ -172,9 +169,6 @@ def parameter_bounds_text(entry: Mapping[str, Any], digits: int) -> str:
     """Bounds of a parameter, `-inf` and `inf` where it has none."""
     ends = ((entry["lower"], "-inf"), (entry["upper"], "inf"))
     return " to ".join(free if end is None else f"{end:.{digits}g}" for end, free in ends)
-
-
-# -- on a terminal -----------------------------------------------------------------------------------------------------
 
 
 def summary_terminal_lines(blocks: Sequence[SummaryBlock]) -> list[str]:

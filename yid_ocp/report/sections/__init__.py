@@ -45,8 +45,6 @@ _PrepareContext = Callable[[ReportData], Mapping[str, Any] | Iterable[tuple[str,
 
 @dataclass(frozen=True)
 class _ReportSection:
-    """One registered section: order, title and the function that prepares its template context."""
-
     order: int
     title: str
     prepare_context: _PrepareContext

@@ -102,11 +102,25 @@ def _where(finding: DiagnosisResult) -> _Chapter | None:
         ", ".join(place.location for place in finding.gap_locations if place.is_observable == seen)
         for seen in (True, False)
     )
+    verdicts = {
+        "plant": "the mechanics, not what sensors read",
+        "sensor": "what sensors read, not the mechanics",
+        "both": "both the mechanics and what sensors read",
+        "either": "the mechanics or what the effort sensors read, which efforts alone do not tell apart",
+        "none": "neither the mechanics nor the sensors' biases, as far as these unknowns can tell",
+    }
+    evidence = smoothed.log_evidence
+    side = (
+        f"By evidence the gap lies in {verdicts[smoothed.gap_origin]}: the log evidence rises by "
+        f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
+        f"alone, by {evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain "
+        f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap where it was fitted."
+    )
     left = [f"{p.location} ({100 * p.gap_share:.0f} %)" for p in finding.remaining_gap_locations if p.gap_share > 0.1]
     sentences = [
         "Every coordinate was given an unknown force, every grasp an unknown offset and every measured point an "
         "unknown bias, free to change in time; the fewest groups of them that explain the residual were kept.",
-        _side(smoothed),
+        side,
         f"A gap would have shown at {noticed}." if noticed else "",
         f"It would not have shown at {silent}: these motions and sensors cannot tell." if silent else "",
         f"What the effects leave lies in {', '.join(left)}." if finding.accepted_effects and left else "",
@@ -163,24 +177,6 @@ def _time_map(finding: DiagnosisResult, smoothed: SmootherResult, i: int, kept: 
             TimeHeatMapRow(names[k], f"{groups[k].location} {groups[k].kind} [{units[k]}]", values[:, k], texts)
         )
     return figures.time_heat_map_figure(edges, rows, axis), sentence
-
-
-def _side(smoothed: SmootherResult) -> str:
-    """Plant or sensor, with what speaks for it."""
-    verdicts = {
-        "plant": "the mechanics, not what sensors read",
-        "sensor": "what sensors read, not the mechanics",
-        "both": "both the mechanics and what sensors read",
-        "either": "the mechanics or what the effort sensors read, which efforts alone do not tell apart",
-        "none": "neither the mechanics nor the sensors' biases, as far as these unknowns can tell",
-    }
-    evidence = smoothed.log_evidence
-    return (
-        f"By evidence the gap lies in {verdicts[smoothed.gap_origin]}: the log evidence rises by "
-        f"{evidence['plant']:.4g} with unknown forces and offsets alone, by {evidence['sensor']:.4g} with biases "
-        f"alone, by {evidence['both']:.4g} with both (5 is odds of 150 to 1). They explain "
-        f"{100 * smoothed.explainable_gap_fraction:.0f} % of the gap where it was fitted."
-    )
 
 
 def _events(finding: DiagnosisResult) -> _Chapter | None:

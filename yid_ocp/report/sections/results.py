@@ -86,7 +86,6 @@ def _solver_history(findings: ReportData) -> Mapping[str, Any] | None:
 
 @register_report_section("inputs", 90, "What it was made from")
 def _provenance(findings: ReportData) -> Mapping[str, Any] | None:
-    """Date, command line, input hashes, versions and notes on non-finite values."""
     result = findings.result
     if "versions" not in result:
         return None
@@ -115,7 +114,6 @@ def _parameter_history(findings: ReportData) -> list[tuple[str, Any]]:
 
 @register_report_section("methods", 10, "Methods")
 def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
-    """Estimates of every method and its cost over time."""
     comparison: MethodComparison | None = findings.section_data.get("comparison")
     if comparison is None:
         return
@@ -135,7 +133,6 @@ def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
 
 @register_report_section("proof", 10, "What was seen and named")
 def _blind_validation(findings: ReportData) -> Iterator[tuple[str, Any]]:
-    """Detection rate by effect size, confusion matrix and calibration."""
     result = findings.result
     if result.get("format") != "yid-blind/1":
         return
@@ -157,7 +154,6 @@ def _blind_validation(findings: ReportData) -> Iterator[tuple[str, Any]]:
 
 @register_report_section("identifiability", 10, "What can be told")
 def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
-    """Profile likelihoods, and predicted parameter stds for every changed experiment."""
     result = findings.result
     if result.get("format") != "yid-identifiability/1":
         return None
@@ -174,7 +170,6 @@ def _identifiability(findings: ReportData) -> Mapping[str, Any] | None:
 
 @register_report_section("friction", 10, "Friction torque of the data and of the law")
 def _friction_torque(findings: ReportData) -> Iterator[tuple[str, Any]]:
-    """Friction torque over speed and over the load, from the measured motion and from the fitted law."""
     for cloud in findings.section_data.get("friction_clouds", ()):
         for words, along in (("speed [rad/s]", cloud.speed), ("torque through the gear [N m]", cloud.load)):
             points = {"data": (along, cloud.measured), "law": (along, cloud.predicted)}
@@ -261,7 +256,6 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
 
 @register_report_section("fit", 20, "How well it fits")
 def _fit_quality(findings: ReportData) -> Mapping[str, Any] | None:
-    """Measured and predicted values with residuals over time, and a residual histogram."""
     found = []
     whitened: dict[str, list[Array]] = {}
     for own in _predicted_episodes(findings):
@@ -305,7 +299,6 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
 
 @register_report_section("recorded", 30, "What was recorded")
 def _recorded_signals(findings: ReportData) -> Iterator[tuple[str, Any]]:
-    """Recorded joint channels and points over time."""
     system: System | None = findings.section_data.get("system")
     recordings: Sequence[Recording] = findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]
     for recording, group in ((own, group) for own in recordings for group in own.groups):
