@@ -211,8 +211,8 @@ def batch_summary(result: Mapping[str, Any]) -> SummaryParts:
     units = {name: found[name][-1]["unit"] for name in names}
     heads = [(name, f"{name} [{units[name]}]" if units[name] else name) for name in names]
     links = {entry["name"]: f"{entry['folder']}/report.html" for entry in runs if entry["folder"]}
-    few = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
-    yield SummaryTable(few, "Runs", is_key_table=True, links=links)
+    rows = [*_batch_rows(runs, dict(heads[:_MAX_TERMINAL_PARAMETERS]))]
+    yield SummaryTable(rows, "Runs", is_key_table=True, links=links)
     spread: TableRows = [("parameter", "runs", "smallest", "median", "largest", "unit")]
     for name in names:
         values = [own["value"] for own in found[name] if own["verdict"] in _FOUND_VERDICTS]
@@ -221,8 +221,8 @@ def batch_summary(result: Mapping[str, Any]) -> SummaryParts:
             spread.append((name, str(len(values)), *(f"{x:.4g}" for x in numbers), found[name][0]["unit"]))
     yield SummaryTable(spread, "Parameters over all runs")
     if len(names) > _MAX_TERMINAL_PARAMETERS:
-        every = [*_batch_rows(runs, dict(heads))]
-        yield SummaryTable(every, "Runs with all parameters", is_page_only=True, links=links)
+        rows = [*_batch_rows(runs, dict(heads))]
+        yield SummaryTable(rows, "Runs with all parameters", is_page_only=True, links=links)
     ended = ", ".join(f"{count} {status}" for status, count in Counter(entry["status"] for entry in runs).items())
     said = [f"{len(runs)} {'run' if len(runs) == 1 else 'runs'}: {ended}."]
     said += [f"{entry['name']}: {entry['message'].splitlines()[0]}." for entry in runs if not entry["ok"]]
@@ -257,11 +257,9 @@ def history_summary(result: Mapping[str, Any]) -> SummaryParts:
     runs = [entry["name"] for entry in result["runs"]]
     rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
     for name, entry in result["parameters"].items():
-        known = entry["values"]
-        cells = (
-            value_and_uncertainty_text(known[r]["value"], known[r]["std"], None) if r in known else "" for r in runs
-        )
-        p = "" if len(known) < 2 else p_value_text(entry["p_value"])
+        own = entry["values"]
+        cells = (value_and_uncertainty_text(own[r]["value"], own[r]["std"], None) if r in own else "" for r in runs)
+        p = "" if len(own) < 2 else p_value_text(entry["p_value"])
         together = value_and_uncertainty_text(entry["mean"], entry["mean_std"], None)
         rows.append((name, *cells, together, entry["unit"], p, "drifted" if entry["drifted"] else ""))
     yield SummaryTable(rows, "Parameters", is_key_table=True)

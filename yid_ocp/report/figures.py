@@ -43,7 +43,6 @@ _Curve = tuple[Sequence[float], Sequence[float]]
 
 
 def _line_color(i: int) -> str:
-    """Color of the i-th line of a figure; the colors repeat."""
     return LINE_COLORS[i % len(LINE_COLORS)]
 
 
@@ -121,10 +120,8 @@ def prediction_and_residual_plots(
     # with NaN in long gaps between measurements
     known, steps = t[seen], np.diff(t[seen])
     breaks = np.flatnonzero(steps > 5 * np.median(steps)) + 1 if len(steps) else np.zeros(0, int)
-    left = {
-        name: (np.insert(known, breaks, known[breaks]), np.insert(factor * (y - measured)[seen], breaks, np.nan))
-        for name, y in lines.items()
-    }
+    times = np.insert(known, breaks, known[breaks])
+    left = {n: (times, np.insert(factor * (y - measured)[seen], breaks, np.nan)) for n, y in lines.items()}
     noise = float(np.median(std[seen])) if seen.any() else 0.0
     above, band = TimePlotData(f"{title} [{unit}]", drawn, t, measured), 2 * factor * noise or None
     return above, TimePlotData(f"residual [{shown}]", left, band_half_height=band, is_low_row=True)

@@ -264,8 +264,7 @@ def friction_summary(result: Mapping[str, Any]) -> SummaryParts:
     keys = ("mean_error", "standard_error", "beyond_warranted", "beyond_warranted_standard_error")
     for law, entry in result["laws"].items():
         sizes = (f"{entry[key]:.3g}" for key in keys)
-        note = "warranted" if law == best else ""
-        note += "" if entry["converged"] else " (the fit did not converge)"
+        note = ("warranted" if law == best else "") + ("" if entry["converged"] else " (the fit did not converge)")
         rows.append((law, *sizes, unit, note))
     yield SummaryTable(rows, "Friction laws", is_key_table=True)
     fitted = result["laws"][best]["parameters"].items()

@@ -125,10 +125,8 @@ def misfit_summary_blocks(fit: Mapping[str, Any]) -> SummaryParts:
     """Conclusions on a poor fit: a model-free guess predicts better, or the model does not explain the recordings."""
     worse = fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:
-        own, other = (
-            " ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess")
-        )
-        text = f"{entry['channel']} of {entry['recording']}, {own} against {other} ({entry['baseline']})"
+        sizes = (" ".join(format_error_value_and_unit(entry[key], entry["unit"])).rstrip() for key in ("rmse", "guess"))
+        text = f"{entry['channel']} of {entry['recording']}, {' against '.join(sizes)} ({entry['baseline']})"
         yield SummaryStatement(f"worse than a guess without a model: {text}", "conclusion")
     left = len(worse) - MAX_CHANNELS_SHOWN_SINGLY
     yield SummaryStatement(f"and so for {left} more channels, in result.json" if left > 0 else "", "conclusion")

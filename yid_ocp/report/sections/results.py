@@ -148,8 +148,7 @@ def _blind_validation(findings: ReportData) -> Iterator[tuple[str, Any]]:
         yield "What was said of what", figures.confusion_matrix_figure(said["true"], said["said"], counts)
     kept = blind_calibration_rates(result)
     if any(kept.values()):
-        figure = figures.rate_intervals_figure(kept, "promised", "kept", True)
-        yield "What is promised, and what is kept", figure
+        yield "What is promised, and what is kept", figures.rate_intervals_figure(kept, "promised", "kept", True)
 
 
 @register_report_section("identifiability", 10, "What can be told")
