@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from made_recordings import chain_of_motors
 from twins import twin_recording
 
 from yid_ocp.data import Recording
@@ -87,30 +88,13 @@ def pendulum(urdf_folder):
 
 
 @pytest.fixture(scope="session")
-def held_tube():
+def held_tube(tmp_path_factory):
     """A tube of three links that stands on the ground, its tip held by a hand of three motors that move it slowly.
 
     The hand measures the tip at 100 Hz, a camera sees the middle; nothing turns the tube about its axis.
     """
-    urdf = """<robot name="hand"><link name="wall"/>
-    <joint name="x" type="prismatic"><parent link="wall"/><child link="a"/><axis xyz="1 0 0"/>
-      <limit lower="-1" upper="1" effort="100" velocity="5"/></joint>
-    <link name="a"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
-      </inertial></link>
-    <joint name="z" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
-      <limit lower="-1" upper="1" effort="100" velocity="5"/></joint>
-    <link name="b"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
-      </inertial></link>
-    <joint name="turn" type="continuous"><parent link="b"/><child link="hand"/><axis xyz="0 0 1"/></joint>
-    <link name="hand"><inertial><mass value="0.5"/>
-      <inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial></link></robot>"""
-    import tempfile
-    from pathlib import Path
-
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "hand.urdf"
-        file.write_text(urdf)
-        robot = read_urdf(file, joints=["x", "z", "turn"])
+    motors = {"x": ("prismatic", "1 0 0"), "z": ("prismatic", "0 0 1"), "turn": ("continuous", "0 0 1")}
+    robot = chain_of_motors(tmp_path_factory.mktemp("hand"), **motors)
     tube = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=3, bend=4.0, twist=3.0)])
     # a hand without a y motor meets the tip all the same: the tube bends in one plane
     grasps = [Grasp("hand", "hand", "w_T1", "point")]
@@ -120,10 +104,8 @@ def held_tube():
     t = 0.02 * np.arange(101)
     ramp = np.sin(np.pi * t / 4) ** 2
     path = np.stack([0.15 * ramp, 0.58 - 0.06 * ramp, 0.8 * np.sin(np.pi * t / 2) * ramp], axis=1)
-    camera = PointGroup(
-        "points_camera", ["T1_0_tip"], t[::5], np.zeros((21, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4)
-    )
-    joints = JointGroup(names, t, path, position_std=0.0)
-    recording = Recording(joints, (camera,), name="tube")
+    how = {"sensor": "camera", "pose": np.eye(4)}
+    camera = PointGroup("points_camera", ["T1_0_tip"], t[::5], np.zeros((21, 1, 3)), 2e-3, **how)
+    recording = Recording(JointGroup(names, t, path, position_std=0.0), (camera,), name="tube")
     options = ProblemOptions(path_cutoff=math.inf, initial_state="equilibrium")
     return EstimationProblem(step, [recording], ("T1.bend", "T1.twist"), options)

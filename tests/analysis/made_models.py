@@ -15,19 +15,14 @@ from yid_ocp.problem.evaluation import Evaluation, ResidualVectorLayout
 from yid_ocp.problem.options import MultivariateGaussianPrior
 from yid_ocp.solvers.base import Solution, Status
 
+_BY_NAME = ("prior_stds", "known_initial_states", "parameters_by_recording")  # options that nobody set
+
 
 class Formula:
     """A problem whose residual is a CasADi expression of its unknowns.
 
-    Parameters
-    ----------
-    rows : callable
-        From symbols by name to the residual's rows: data, then stated priors, then weak priors.
-    start : mapping of str to float
-    stated, weak : int
-        How many of the last rows are priors.
-    fails : callable, optional
-        From values by name to whether the rollout fails.
+    `rows` lead from symbols by name to the residual's rows: data, then so many `stated` priors, then `weak` ones;
+    `fails` from values by name to whether the rollout fails.
     """
 
     def __init__(
@@ -59,17 +54,10 @@ class Formula:
         )
         self.data_residual_noise_std, self._fails = noise, fails or (lambda values: False)
         self.whitening_filters, self.has_process_noise = (None,), False
-        self.options = SimpleNamespace(
-            data_issues=(),
-            has_no_serious_data_issues=True,
-            weighting="paper" if noise != 1 else "whitened",
-            initial_state="equilibrium",
-            known_initial_states={},
-            parameters_by_recording={},
-            prior_stds={},
-            multivariate_prior=MultivariateGaussianPrior(),
-            path_cutoff=np.inf,
-        )
+        weighting, empty = "paper" if noise != 1 else "whitened", {name: {} for name in _BY_NAME}
+        common = {"multivariate_prior": MultivariateGaussianPrior(), "path_cutoff": np.inf, "data_issues": ()}
+        common |= {"has_no_serious_data_issues": True, "initial_state": "equilibrium"}
+        self.options = SimpleNamespace(weighting=weighting, **common, **empty)
         everything = samples(
             ("points.tip",), np.full((data, 1), noise), used_output_mask=np.ones((data, 1), bool),
             value=np.zeros((data, 1)), node=np.arange(data), fraction=np.zeros(data), count=data,
@@ -80,12 +68,9 @@ class Formula:
         self.shared_parameters = tuple(name for name in self.free if "[" not in name)
         self.local_parameters = tuple(dict.fromkeys(name.split("[")[0] for name in self.free if "[" in name))
         kinds = dict(units or {})
-        self.system = SimpleNamespace(
-            parameters=Parameters(
-                Parameter(name, 1.0, kinds.get(name, "N m/rad"))
-                for name in dict.fromkeys(name.split("[")[0] for name in self.unknown_names)
-            )
-        )
+        names = dict.fromkeys(name.split("[")[0] for name in self.unknown_names)
+        entries = Parameters(Parameter(name, 1.0, kinds.get(name, "N m/rad")) for name in names)
+        self.system = SimpleNamespace(parameters=entries)
         self.asked: list[tuple[float, ...]] = []
 
     def split(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:

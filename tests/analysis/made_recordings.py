@@ -49,3 +49,18 @@ def holding_pendulum(folder, links=3):
     rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=links, bend=4.0, twist=3.0)])
     grasps = [Grasp("hand", "tip", "w_T1")]
     return System.build(robot, objects=[(rod, None, None)], grasps=grasps, driven=["shoulder", "elbow"])
+
+
+def chain_of_motors(folder, **joints):
+    """A robot of joints (kind, axis) one behind the other on a wall, the last link called hand."""
+    inertia = '<inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>'
+    parent, parts, limit = "wall", [], '<limit lower="-1" upper="2" effort="100" velocity="5"/>'
+    for i, (name, (kind, axis)) in enumerate(joints.items(), 1):
+        link = "hand" if i == len(joints) else f"{name}_link"
+        ends = f'<parent link="{parent}"/><child link="{link}"/><axis xyz="{axis}"/>'
+        parts.append(f'<joint name="{name}" type="{kind}">{ends}{limit if kind == "prismatic" else ""}</joint>')
+        parts.append(f'<link name="{link}"><inertial><mass value="0.5"/>{inertia}</inertial></link>')
+        parent = link
+    file = folder / "motors.urdf"
+    file.write_text(f'<robot name="motors"><link name="wall"/>{"".join(parts)}</robot>')
+    return read_urdf(file)

@@ -175,19 +175,12 @@ def found_by(status=Status.CONVERGED, cost=1.0, **parameters):
     return solution(status=status, **parameters, z_cost=estimate(cost, 9.0, "fixed", free=False))
 
 
-@pytest.mark.parametrize(
-    ("here", "best", "differs"),
-    [
-        ((10.2, 0.1), (10.0, 0.1), False),
-        ((10.21, 0.1), (10.0, 0.1), True),
-        ((9.79, 0.1), (10.0, 0.1), True),
-        ((10.3, 0.2), (10.0, 0.1), False),
-        ((10.3, 0.1), (10.0, 0.2), False),
-        ((10.04, 0.0), (10.0, 0.0), False),
-        ((10.06, 0.0), (10.0, 0.0), True),
-        ((-10.04, 0.0), (-10.0, 0.0), False),
-    ],
-)
+ALIKE = [((10.2, 0.1), (10, 0.1)), ((10.3, 0.2), (10, 0.1)), ((10.3, 0.1), (10, 0.2)), ((10.04, 0), (10, 0))]
+APART = [((10.21, 0.1), (10, 0.1)), ((9.79, 0.1), (10, 0.1)), ((10.06, 0), (10, 0))]
+PAIRS = [(*pair, False) for pair in (*ALIKE, ((-10.04, 0), (-10, 0)))] + [(*pair, True) for pair in APART]
+
+
+@pytest.mark.parametrize(("here", "best", "differs"), PAIRS)
 def test_estimates_agree_within_two_standard_deviations_or_half_a_percent(compared, here, best, differs):
     found = compared(one=found_by(a=estimate(*best)), two=found_by(a=estimate(*here)))
     assert found.is_consistent is not differs
@@ -215,32 +208,22 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
     )
 
 
-FAR = "where steepest_descent did not end within 10 % of the truth: "
-
-
 @pytest.mark.parametrize(
     ("a", "b", "status", "said"),
     [
-        (10.9, 2.19, Status.CONVERGED, "steepest_descent ended within 10 % of the truth everywhere"),
-        (
-            10.0,
-            3.0,
-            Status.STALLED,
-            f"{FAR}b (3 for 2, cannot be found); these are exactly the parameters that are not found",
-        ),
+        (10.9, 2.19, Status.CONVERGED, ["steepest_descent ended within 10 % of the truth everywhere"]),
+        (10.0, 3.0, Status.STALLED, ["b (3 for 2, cannot be found); these are exactly the parameters that are not"]),
         (
             8.9,
             3.0,
             Status.ITERATION_LIMIT,
-            f"{FAR}a (8.9 for 10, found), b (3 for 2, cannot be found); a could be found: the method stopped short "
-            "(iteration_limit)",
+            ["a (8.9 for 10, found), b (3 for 2,", "found: the method stopped short (it"],
         ),
         (
             11.1,
             2.0,
             Status.CONVERGED,
-            f"{FAR}a (11.1 for 10, found); a could be found: its cost weighs the measurements otherwise; "
-            "b (cannot be found) came out near the truth all the same",
+            ["a could be found: its cost weighs", "b (cannot be found) came out near the truth"],
         ),
     ],
 )
@@ -249,7 +232,7 @@ def test_where_the_papers_method_ended_far_from_the_truth(compared, a, b, status
     best = found_by(a=estimate(10.0), b=hidden, c=fixed, n=estimate(-1.0))
     descent = found_by(status, 5.0, a=estimate(a), b=estimate(b), c=estimate(9.0), n=estimate(-1.05))
     found = compared({"a": 10.0, "b": 2.0, "c": 1.0, "n": -1.0, "d": 5.0}, one=best, steepest_descent=descent)
-    assert found.explanations[-1] == said
+    assert all(part in found.explanations[-1] for part in said)
     assert len(compared(None, one=best, steepest_descent=descent).explanations) == 1
 
 
@@ -262,9 +245,8 @@ def test_methods_run_one_by_one_and_the_lowest_cost_is_the_reference(compared, w
     assert compared.told == [(name, "step") for name in METHODS]
     assert (found.reference_method, found.has_process_noise) == ("gauss_newton", False)
     assert [run.whitened_cost for run in found.method_results] == list(METHODS.values())
-    assert [run.held_out_predictions for run in found.method_results] == [
-        [(entry[1], cost)] for entry, cost in zip(own, METHODS.values(), strict=True)
-    ]
+    predicted = [[(entry[1], cost)] for entry, cost in zip(own, METHODS.values(), strict=True)]
+    assert [run.held_out_predictions for run in found.method_results] == predicted
     assert found.verdict_solution is found.method_results[1].solution
 
 
@@ -273,14 +255,9 @@ METHODS = {"single_shooting": 3.0, "gauss_newton": 2.0, "steepest_descent": 5.0}
 
 def test_verdicts_count_the_noise_that_drives_the_motion(compared):
     """The methods are compared without it, where nothing can be trusted; one more run, told as another, weighs it."""
-    lost = {"verdict": "not_trusted"}
-    found = compared(
-        {"a": 10.0},
-        True,
-        single_shooting=found_by(cost=7.5, a=estimate(7.5, 0.1, **lost)),
-        steepest_descent=found_by(cost=7.0, a=estimate(7.0, 0.1, **lost)),
-        all_noise=found_by(cost=10.0, a=estimate(10.0)),
-    )
+    costs = {"single_shooting": 7.5, "steepest_descent": 7.0}
+    poor = {name: found_by(cost=c, a=estimate(c, 0.1, "not_trusted")) for name, c in costs.items()}
+    found = compared({"a": 10.0}, True, **poor, all_noise=found_by(cost=10.0, a=estimate(10.0)))
     # by the sensors' noise alone every fit is poor, from wherever it starts
     assert [entry[2:] for entry in compared.asked] == [(False, False), (False, False), (True, True)]
     assert compared.asked[-1][0] == "gauss_newton"
@@ -345,32 +322,21 @@ WEAK = estimate(10.0, 2.0, "weak")
 OPEN = replace(WEAK, interval=(8.0, None))
 
 
-@pytest.mark.parametrize(
-    ("published", "entry", "truth", "stopped", "expected"),
-    [
-        (99.0, LOST, 10.0, 5.0, "not informed"),
-        (10.0, LOST, 10.0, 5.0, "not informed"),
-        (13.9, WEAK, 10.0, 5.0, "not informed"),
-        (14.1, WEAK, 10.0, 5.0, "unexplained"),
-        (13.9, FOUND, 10.0, 5.0, "torque error"),
-        (99.0, OPEN, 10.0, 5.0, "hardly informed"),
-        (7.9, OPEN, 10.0, 5.0, "torque error"),
-        (9.0, FOUND, 10.0, 5.0, "near the truth"),
-        (11.0, FOUND, 10.0, 5.0, "near the truth"),
-        (8.9, FOUND, 10.0, 5.0, "torque error"),
-        (3.0, FOUND, 10.0, 5.0, "slow"),
-        (5.5, FOUND, 10.0, 5.0, "slow"),
-        (5.6, FOUND, 10.0, 5.0, "unexplained"),
-        (2.9, FOUND, 10.0, 5.0, "unexplained"),
-        (4.0, FOUND, 10.0, 9.1, "unexplained"),
-        (6.0, FOUND, 10.0, 8.0, "slow"),
-        (2.5, FOUND, 1.0, 2.0, "slow"),
-        (10.0, FOUND, None, 5.0, "torque error"),
-        (4.0, FOUND, None, 5.0, "unexplained"),
-    ],
-)
-def test_why_a_published_value_is_what_it_is(monkeypatch, published, entry, truth, stopped, expected):
+# published value and our estimate by reason, where the truth is 10 and a descent without torque errors stops at 5
+REASONS = {
+    "not informed": [(99.0, LOST), (10.0, LOST), (13.9, WEAK)],
+    "hardly informed": [(99.0, OPEN)],
+    "near the truth": [(9.0, FOUND), (11.0, FOUND)],
+    "slow": [(3.0, FOUND), (5.5, FOUND), (6.0, FOUND, 10.0, 8.0), (2.5, FOUND, 1.0, 2.0)],
+    "torque error": [(13.9, FOUND), (7.9, OPEN), (8.9, FOUND), (10.0, FOUND, None)],
+    "unexplained": [(14.1, WEAK), (5.6, FOUND), (2.9, FOUND), (4.0, FOUND, 10.0, 9.1), (4.0, FOUND, None)],
+}
+
+
+@pytest.mark.parametrize(("expected", "case"), [(reason, case) for reason, many in REASONS.items() for case in many])
+def test_why_a_published_value_is_what_it_is(monkeypatch, expected, case):
     """Of descents that start at 3, stop where it says, and end between 6 and 14 with errors of the torques."""
+    published, entry, truth, stopped = (*case, *(10.0, 5.0)[len(case) - 2 :])
     monkeypatch.setitem(PAPER_ESTIMATES, "made up", {"T1.bend": published})
     ensemble = {"made up": {"none": {"T1.bend": [stopped]}, "offsets": {"T1.bend": [6.0, 14.0]}}}
     monkeypatch.setattr(module, "_load_torque_ensemble", lambda: ensemble)
@@ -387,9 +353,13 @@ def judged(**verdicts):
     return made | {name.replace("_", "."): entry for name, entry in verdicts.items()}
 
 
+def told(experiment, **verdicts):
+    return explain_paper_estimates(experiment, judged(**verdicts), PAPER_TRUTH)
+
+
 def test_each_published_value_has_one_sentence():
     for experiment, values in PAPER_ESTIMATES.items():
-        said = explain_paper_estimates(experiment, judged(T2_twist=LOST, T3_twist=LOST), PAPER_TRUTH)
+        said = told(experiment, T2_twist=LOST, T3_twist=LOST)
         assert [text.split(" = ")[0] for text in said] == list(_PAPER_PARAMETERS)
         for text, value in zip(said, values.values(), strict=True):
             assert f" = {value:.4g} of the paper: " in text
@@ -399,38 +369,20 @@ def test_each_published_value_has_one_sentence():
 def test_the_truth_was_chosen_from_one_answer_and_this_is_said():
     assert all(0 not in values.values() for name, values in PAPER_ESTIMATES.items() if name == _TRUTH_EXPERIMENT)
     assert all(0 in values.values() for name, values in PAPER_ESTIMATES.items() if name != _TRUTH_EXPERIMENT)
-    assert all(
-        "which was chosen from it" in text for text in explain_paper_estimates(_TRUTH_EXPERIMENT, judged(), PAPER_TRUTH)
-    )
-    other = explain_paper_estimates("single_arm_no_vision", judged(), PAPER_TRUTH)
+    assert all("which was chosen from it" in text for text in told(_TRUTH_EXPERIMENT))
+    other = told("single_arm_no_vision")
     assert other[0] == "T1.bend = 23.78 of the paper: near the truth of these recordings, 22"
-    elsewhere = explain_paper_estimates(
-        _TRUTH_EXPERIMENT, judged(), {name: 1.05 * value for name, value in PAPER_TRUTH.items()}
-    )
-    assert not any("chosen" in text for text in elsewhere)
+    elsewhere = {name: 1.05 * value for name, value in PAPER_TRUTH.items()}
+    assert not any("chosen" in text for text in explain_paper_estimates(_TRUTH_EXPERIMENT, judged(), elsewhere))
 
 
-def test_weak_parameters_are_said_with_their_interval():
-    said = explain_paper_estimates(
-        "single_arm_no_vision", judged(T3_bend=replace(OPEN, interval=(0.84, None))), PAPER_TRUTH
-    )
-    assert said[4].endswith(
-        "hardly informed; in such an experiment it is weakly determined, above 0.84, where the value lies"
-    )
-    said = explain_paper_estimates(
-        "single_arm_no_vision", judged(T1_twist=replace(OPEN, interval=(8.65, 109.7))), PAPER_TRUTH
-    )
-    assert said[1].startswith(
-        "T1.twist = 0 of the paper: unexplained; such recordings leave 8.65 to 109.7 open and not this, it is not slow"
-    )
-
-
-def test_nothing_is_said_where_the_recordings_are_not_explained_or_a_parameter_is_not_free():
-    assert (
-        explain_paper_estimates(_TRUTH_EXPERIMENT, judged(T1_bend=estimate(1.0, 1.0, "not_trusted")), PAPER_TRUTH) == ()
-    )
-    fixed = estimate(10.7, 0.0, "fixed", free=False)
-    assert len(explain_paper_estimates(_TRUTH_EXPERIMENT, judged(T2_bend=fixed), PAPER_TRUTH)) == 5
+def test_weak_parameters_are_said_with_their_interval_and_what_is_not_explained_not_at_all():
+    said = told("single_arm_no_vision", T3_bend=replace(OPEN, interval=(0.84, None)))
+    assert said[4].endswith("in such an experiment it is weakly determined, above 0.84, where the value lies")
+    said = told("single_arm_no_vision", T1_twist=replace(OPEN, interval=(8.65, 109.7)))
+    assert "unexplained; such recordings leave 8.65 to 109.7 open and not this, it is not slow" in said[1]
+    assert told(_TRUTH_EXPERIMENT, T1_bend=estimate(1.0, 1.0, "not_trusted")) == ()
+    assert len(told(_TRUTH_EXPERIMENT, T2_bend=estimate(10.7, 0.0, "fixed", free=False))) == 5
     assert len(explain_paper_estimates(_TRUTH_EXPERIMENT, {"T1.bend": FOUND, "else": FOUND}, PAPER_TRUTH)) == 1
 
 
@@ -476,9 +428,8 @@ class Means:
 
 
 def fitted(x, names=("k", "a.memory")):
-    return SimpleNamespace(
-        unknown_names=names, x=np.array(x, float), evaluation=SimpleNamespace(equilibrium_guesses=None)
-    )
+    evaluation = SimpleNamespace(equilibrium_guesses=None)
+    return SimpleNamespace(unknown_names=names, x=np.array(x, float), evaluation=evaluation)
 
 
 @pytest.fixture
@@ -530,9 +481,8 @@ def test_memory_is_kept_where_recordings_left_out_are_predicted_better_with_it(
     problem, found = Means((1.0, 2.0, 6.0), (0.5, 0.0, 0.5), off=off), fitted((at, 0.5))
     problem.bounds = tuple(np.array([bound, side]) for bound, side in zip(bounds, (0.0, 1.0), strict=True))
     safe = decide_cable_memory(problem, None, found)
-    with_it, without = (
-        np.sqrt(((predicted[0] + more - 1.0) ** 2 + (predicted[1] + more - 6.0) ** 2) / 2) for more in (0.0, off)
-    )
+    missed = np.array(predicted) - [1.0, 6.0]
+    with_it, without = (np.sqrt(np.mean((missed + more) ** 2)) for more in (0.0, off))
     assert (safe.problem is problem) is kept
     assert f"memory is {'' if kept else 'not '}kept" in safe.message
     assert f"{with_it:.3g} with it and {without:.3g} without" in safe.message

@@ -51,9 +51,8 @@ def interleaved(system: System) -> System:
 def test_a_built_model_is_pinocchios(urdf_folder, mixed):
     system = interleaved(branched(urdf_folder)) if mixed else branched(urdf_folder)
     rng = np.random.default_rng(2)
-    found = compare_system_with_pinocchio(
-        system, system.parameters.vector({"T2.mass": 0.4}), rng.uniform(-1, 1, system.n_coordinates)
-    )
+    theta, posture = system.parameters.vector({"T2.mass": 0.4}), rng.uniform(-1, 1, system.n_coordinates)
+    found = compare_system_with_pinocchio(system, theta, posture)
     assert found.agrees_within_rounding
     assert max(found.mass, found.weight, found.motion) < 1e-12
     assert found.words.startswith("the built model: mass matrix, weight and inverse dynamics are Pinocchio's within ")
@@ -73,12 +72,13 @@ def test_effects_are_compared_as_well(urdf_folder, kind, location, value):
     assert found.agrees_within_rounding, found.words
 
 
-def test_differences_are_said():
-    assert (
-        _PinocchioComparison("it", 0.0, 0.02, 0.0).words
-        == "it differs from Pinocchio's: weight by 2 % of the largest entry"
-    )
+def test_differences_and_files_that_pinocchio_does_not_read_are_said(tmp_path, urdf_folder):
+    said = "it differs from Pinocchio's: weight by 2 % of the largest entry"
+    assert _PinocchioComparison("it", 0.0, 0.02, 0.0).words == said
     assert _PinocchioComparison("it", 0.0, float("nan"), 0.0).agrees_within_rounding is False
+    (tmp_path / "odd.urdf").write_text("<robot name='odd'><link name='a'/><link name='b'/></robot>")
+    with pytest.raises(ValueError, match="valid URDF"):
+        compare_urdf_with_pinocchio(tmp_path / "odd.urdf", read_urdf(urdf_folder / "double_pendulum.urdf"), GRAVITY)
 
 
 @pytest.mark.parametrize(
@@ -131,12 +131,5 @@ def test_what_is_left_out_of_a_file_is_left_out_of_both(urdf_folder, file, left_
     found = compare_urdf_with_pinocchio(path, robot, GRAVITY, joints, None, left_out)
     assert found.agrees_within_rounding, found.words
     whole = read_urdf(path, joints=robot.joint_names)
-    assert not compare_urdf_with_pinocchio(
-        path, whole, GRAVITY, robot.joint_names, None, left_out
-    ).agrees_within_rounding
-
-
-def test_a_file_that_pinocchio_does_not_read_is_said(tmp_path, urdf_folder):
-    (tmp_path / "odd.urdf").write_text("<robot name='odd'><link name='a'/><link name='b'/></robot>")
-    with pytest.raises(ValueError, match="valid URDF"):
-        compare_urdf_with_pinocchio(tmp_path / "odd.urdf", read_urdf(urdf_folder / "double_pendulum.urdf"), GRAVITY)
+    found = compare_urdf_with_pinocchio(path, whole, GRAVITY, robot.joint_names, None, left_out)
+    assert not found.agrees_within_rounding

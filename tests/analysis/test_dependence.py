@@ -41,9 +41,8 @@ def judged(problem):
     """By parameter: its dependence about the rest at the first posture; the rest besides."""
     step, episode = problem.step, problem.episodes[0]
     system = step.system
-    rest = EquilibriumSolver(step).solve(
-        episode.initial_known_coordinates, problem.theta, episode.torque[0] if system.driven else None
-    )
+    torque = episode.torque[0] if system.driven else None
+    rest = EquilibriumSolver(step).solve(episode.initial_known_coordinates, problem.theta, torque)
     assert rest.is_converged
     path = episode.initial_known_coordinates[len(system.driven) :]
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, problem.theta, path)
@@ -59,9 +58,8 @@ def hanging():
     t = 0.01 * np.arange(STEPS + 1)
 
     def build(gravity=(0.0, 0.0, -9.81), turned=(math.pi, 0.0, 0.0)):
-        system = System.build(
-            objects=[(rod, None, homogeneous_transform(rotation_from_rpy(*turned), np.zeros(3)))], gravity=gravity
-        )
+        place = homogeneous_transform(rotation_from_rpy(*turned), np.zeros(3))
+        system = System.build(objects=[(rod, None, place)], gravity=gravity)
         step = compile_step(system, 0.01, use_compiler=False)
         recording = Recording(None, (camera(t, ["w_T1"]),), name="hanging")
         return EstimationProblem(step, [recording], ("T1.bend", "T1.twist"), ProblemOptions())
@@ -79,9 +77,8 @@ def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
     assert twist.rows == rows
     assert twist.seen == ()
     assert twist.best == ""
-    assert twist.words.startswith(
-        f"T1.twist enters 6 rows ({', '.join(rows)}), none of which a sensor sees to first order."
-    )
+    said = f"T1.twist enters 6 rows ({', '.join(rows)}), none of which a sensor sees to first order."
+    assert twist.words.startswith(said)
     assert "moves no reading by a millionth of its standard deviation within 0.6 s" in twist.words
     assert bend.seen == bend.rows
     assert "all of which sensors see to first order, points_camera best" in bend.words
@@ -118,21 +115,15 @@ MODES = pytest.mark.parametrize("swinging", ["driven", "prescribed"], indirect=T
 def swinging(request, urdf_folder):
     """A pendulum on a springy elbow, its tip seen; the shoulder follows its torque under the filter, or its path."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(
-        robot,
-        **{request.param: ["shoulder"]},
-        springs={"elbow": RobotJointSpring(3.0, 0.4)},
-        damping=0.1,
-        point_frames=["tip"],
-    )
+    how = {request.param: ["shoulder"], "damping": 0.1, "point_frames": ["tip"]}
+    system = System.build(robot, springs={"elbow": RobotJointSpring(3.0, 0.4)}, **how)
     step = compile_step(system, 0.01, use_compiler=False)
     t = 0.01 * np.arange(STEPS + 1)
     effort = {"effort": np.zeros((len(t), 1)), "effort_kind": "command", "effort_std": 0.05}
     joints = JointGroup(("shoulder",), t, np.full((len(t), 1), 0.3), position_std=1e-3, **effort)
     options = ProblemOptions(path_cutoff=math.inf, sensors={"joints.effort": SensorOptions(std=0.05)})
-    return EstimationProblem(
-        step, [Recording(joints, (camera(t, ["tip"]),), name="swing")], ("elbow.stiffness",), options
-    )
+    recording = Recording(joints, (camera(t, ["tip"]),), name="swing")
+    return EstimationProblem(step, [recording], ("elbow.stiffness",), options)
 
 
 def rolled_out(problem, rest, theta):
@@ -143,11 +134,8 @@ def rolled_out(problem, rest, theta):
     path = np.tile(episode.initial_known_coordinates[len(system.driven) :], (STEPS + 2, 1))
     feedback = episode.tracking_feedback
     if feedback is not None:
-        feedback = replace(
-            feedback,
-            gain=np.tile(feedback.gain[:1], (STEPS + 1, 1, 1)),
-            reference=np.tile(rest.state[feedback.state_indices], (STEPS + 1, 1)),
-        )
+        reference = np.tile(rest.state[feedback.state_indices], (STEPS + 1, 1))
+        feedback = replace(feedback, gain=np.tile(feedback.gain[:1], (STEPS + 1, 1, 1)), reference=reference)
     rollout = step.kernel.rollout(RolloutInputs(theta, rest.state, torque, path, feedback))
     assert rollout.status.is_converged
     found = []
@@ -199,7 +187,10 @@ def test_without_sensors_only_rows_are_said(hanging):
 
 
 ROWS = "k enters 2 rows (del[a], p1[a])"
-SEES = "sensors see to first order"
+SEES, READ = "sensors see to first order", "the reading of tip"
+STILL = "From rest, one N more of it moves no reading by a millionth of its standard deviation"
+MOVED = "From rest, 1 more of it moves readings by at most 0.25 standard deviations"
+ALONG = "Along the recordings, one N more of it moves all readings together by 12 standard deviations"
 
 
 MANY = (*(f"del[{i}]" for i in range(5)), *(f"p1[{i}]" for i in range(4)))
@@ -214,21 +205,10 @@ MANY = (*(f"del[{i}]" for i in range(5)), *(f"p1[{i}]" for i in range(4)))
         ({"rows": ("del[a]",), "seen": ()}, "k enters 1 row (del[a]), which no sensor sees to first order."),
         ({"rows": ("del[a]",), "seen": ("del[a]",)}, f"k enters 1 row (del[a]), which {SEES}, tip best."),
         ({"seen": ("p1[a]",)}, f"{ROWS}, 1 of which {SEES} (p1[a]), tip best."),
-        (
-            {"rows": (), "seen": (), "read": ("tip",)},
-            "k enters no row of a step; the reading of tip depends on it directly.",
-        ),
-        (
-            {"seen": (), "moved": 0.0, "along": 12.345},
-            f"{ROWS}, none of which a sensor sees to first order. From rest, one N more of it moves no reading by a "
-            "millionth of its standard deviation within 0.5 s. Along the recordings, one N more of it moves all "
-            "readings together by 12 standard deviations, to first order.",
-        ),
-        (
-            {"unit": "1", "moved": 0.25},
-            f"{ROWS}, all of which {SEES}, tip best. From rest, 1 more of it moves readings by at most 0.25 standard "
-            "deviations within 0.5 s.",
-        ),
+        ({"rows": (), "seen": (), "read": ("tip",)}, f"k enters no row of a step; {READ} depends on it directly."),
+        ({"seen": (), "moved": 0.0}, f"{ROWS}, none of which a sensor sees to first order. {STILL} within 0.5 s."),
+        ({"along": 12.345}, f"{ROWS}, all of which {SEES}, tip best. {ALONG}, to first order."),
+        ({"unit": "1", "moved": 0.25}, f"{ROWS}, all of which {SEES}, tip best. {MOVED} within 0.5 s."),
     ],
 )
 def test_words(changes, words):
@@ -250,13 +230,12 @@ def held_pendulum(urdf_folder):
     """The same, its tip tied to a rod that hangs from the ceiling: constraints beside coordinates."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
-    system = System.build(
-        robot, objects=[(rod, None, None)], grasps=[Grasp("hand", "tip", "w_T1")], prescribed=["shoulder", "elbow"]
-    )
+    held = {"grasps": [Grasp("hand", "tip", "w_T1")], "prescribed": ["shoulder", "elbow"]}
+    system = System.build(robot, objects=[(rod, None, None)], **held)
     return compile_step(system, 0.01, use_compiler=False)
 
 
-def test_a_step_is_counted(swing):
+def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(swing, held_pendulum):
     found = step_size_summary(swing)
     assert found["sizes"] == swing.sizes
     assert found["sizes"] | {"n": 2, "nu": 1, "nz": 0, "m": 0, "nc": 0, "nx": 4} == found["sizes"]
@@ -265,13 +244,8 @@ def test_a_step_is_counted(swing):
         nonzeros = sum(f.sparsity_out(i).nnz() for i in range(f.n_out()))
         assert entry == {"name": f.name(), "operations": f.n_instructions(), "nonzeros": nonzeros}
     assert max(entry["operations"] for entry in found["functions"]) > 100
-
-
-def test_unknowns_are_what_is_not_prescribed(held_pendulum):
-    assert (
-        step_size_summary(held_pendulum)["unknowns"]
-        == held_pendulum.sizes["n"] - 2 + held_pendulum.sizes["nz"] + held_pendulum.sizes["m"]
-    )
+    sizes = held_pendulum.sizes
+    assert step_size_summary(held_pendulum)["unknowns"] == sizes["n"] - 2 + sizes["nz"] + sizes["m"]
 
 
 def linearised(step, wrong=None):
@@ -405,14 +379,11 @@ def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
     assert found["hand"] == pytest.approx(gap, abs=2e-3)
 
 
-def test_systems_without_grasps_have_no_gaps(reaching):
-    system = reaching(grasps=0)
-    assert min_grasp_closure_errors(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}
-
-
-def test_each_grasp_has_its_gap(reaching):
+def test_each_grasp_has_its_gap_and_no_grasp_none(reaching):
     """Tip at 0.3 m and elbow at 0.7 m above the ground, of a rod of 0.6 m whose middle link ends at 0.4 m."""
     system = reaching(grasps=2)
     found = min_grasp_closure_errors(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
     assert list(found) == ["hand", "other"]
     assert min(found.values()) > 0.05
+    system = reaching(grasps=0)
+    assert min_grasp_closure_errors(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}

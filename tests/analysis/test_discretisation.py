@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from made_models import Formula, estimate, solution
 from made_models import estimate as estimated
-from made_recordings import places
+from made_recordings import chain_of_motors, places
 
+from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.discretisation import (
     _MAX_GROWTH_DECADES,
     _N_CHECKED_NODES,
@@ -29,10 +30,8 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import Grasp, Segment, System, flexible_object
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.workflow import solve as solve_command
 from yid_ocp.workflow.solve import stability_checked_solution
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
@@ -71,12 +70,9 @@ def test_a_point_that_is_no_estimate_counts_the_difference_of_the_models_alone()
     assert shifts(coarse, finer, model_difference_only=True) == pytest.approx({"a": 0.3})
 
 
-def test_a_move_ends_at_the_bound():
+def test_a_move_ends_at_the_bound_and_what_cannot_be_compared_says_why():
     start = {"a": 1.0}
     assert shifts(problem(lambda x: [x["a"] - 1.0], start), problem(lambda x: [x["a"] + 5.0], start)) == {"a": -1.0}
-
-
-def test_what_cannot_be_compared_says_why():
     coarse = problem(lambda x: [x["a"] - 1.0], {"a": 1.0})
     assert shifts(coarse, problem(lambda x: [x["a"]], {"a": 1.0}, fails=lambda values: True)) == "it snaps"
     longer = problem(lambda x: [x["a"], x["a"]], {"a": 1.0})
@@ -91,12 +87,8 @@ def chain(links):
 def test_divided_links_share_their_angle():
     coarse, fine = chain(2), chain(4)
     divided = fine_joints_by_coarse_joint(coarse, fine)
-    assert divided == {
-        "T1_0_x": ("T1_0_x", "T1_1_x"),
-        "T1_0_y": ("T1_0_y", "T1_1_y"),
-        "T1_1_x": ("T1_2_x", "T1_3_x"),
-        "T1_1_y": ("T1_2_y", "T1_3_y"),
-    }
+    pairs = {f"T1_{i}_{axis}": (f"T1_{2 * i}_{axis}", f"T1_{2 * i + 1}_{axis}") for i in (0, 1) for axis in "xy"}
+    assert divided == pairs
     assert fine_joints_by_coarse_joint(coarse, coarse) == fine_joints_by_coarse_joint(fine, coarse) == {}
 
 
@@ -112,16 +104,10 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     fine.system = chain(2)
     inner = fine.evaluate
     fine.evaluate = lambda x, equilibrium_guesses: asked.append((x, equilibrium_guesses)) or inner(x)
-    at = replace(
-        coarse.evaluate(coarse.initial_unknowns),
-        episode_predictions=(
-            SimpleNamespace(equilibrium_guess=np.array([0.2, -0.4])),
-            SimpleNamespace(equilibrium_guess=None),
-        ),
-    )
-    refined = FinerDiscretisationProblem(
-        fine, {"a": 2.0, "c": 3.0}, fine_joints_by_coarse_joint(coarse.system, fine.system)
-    )
+    guesses = (SimpleNamespace(equilibrium_guess=guess) for guess in (np.array([0.2, -0.4]), None))
+    at = replace(coarse.evaluate(coarse.initial_unknowns), episode_predictions=tuple(guesses))
+    divided = fine_joints_by_coarse_joint(coarse.system, fine.system)
+    refined = FinerDiscretisationProblem(fine, {"a": 2.0, "c": 3.0}, divided)
     discretisation_estimate_shifts(refined, coarse, coarse.initial_unknowns, at)
     [(x, (warm, none))] = asked
     point = dict(zip(fine.unknown_names, x, strict=True))
@@ -147,26 +133,17 @@ def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_
     assert found["a"].std == pytest.approx(std)
 
 
-@pytest.mark.parametrize(
-    ("move", "before", "after"),
-    [
-        (0.01, "identifiable", "identifiable"),
-        (0.4, "identifiable", "identifiable"),
-        (0.6, "identifiable", "weak"),
-        (30.0, "identifiable", "not_identifiable"),
-        (0.6, "weak", "weak"),
-        (0.4, "weak", "weak"),
-        (0.6, "at_bound", "at_bound"),
-        (30.0, "not_identifiable", "not_identifiable"),
-        (0.6, "not_trusted", "not_trusted"),
-    ],
-)
+KEPT = [(0.01, "identifiable"), (0.4, "identifiable"), (0.6, "weak"), (0.4, "weak"), (0.6, "at_bound")]
+KEPT += [(30.0, "not_identifiable"), (0.6, "not_trusted")]
+LOWERED = [(0.6, "identifiable", "weak"), (30.0, "identifiable", "not_identifiable")]
+
+
+@pytest.mark.parametrize(("move", "before", "after"), [*((move, said, said) for move, said in KEPT), *LOWERED])
 def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
     """Of a value of 10 and a standard deviation of 0.02: ten percent are reached by a move of half of them."""
     said = {"a": estimate(10.0, 0.02, verdict=before), "b": estimate(10.0, 0.02), "c": estimate(3.0, 0.0, free=False)}
-    found = inflate_estimates_by_discretisation(
-        said, {"c": DiscretisationEstimateShift(9.0), "a": DiscretisationEstimateShift(move)}, {}
-    )
+    shifts = {"c": DiscretisationEstimateShift(9.0), "a": DiscretisationEstimateShift(move)}
+    found = inflate_estimates_by_discretisation(said, shifts, {})
     assert found["a"].verdict == after
     assert found["a"].std == (0.02 if move < 0.02 else pytest.approx(math.hypot(0.02, 2 * move)))
     assert found["b"] == said["b"]
@@ -205,9 +182,8 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     recording = twin(clean, clean.initial_unknowns, 3)
     coarse = pendulum(recording)
     step = compile_step(coarse.system, coarse.step.time_step / 2, coarse.step.force_split, use_compiler=False)
-    fine = EstimationProblem(
-        step, [recording], coarse.free, coarse.options, dict(zip(coarse.free, coarse.initial_unknowns, strict=True))
-    )
+    values = dict(zip(coarse.free, coarse.initial_unknowns, strict=True))
+    fine = EstimationProblem(step, [recording], coarse.free, coarse.options, values)
     found = solve(coarse, GaussNewton())
     finer = solve(fine, GaussNewton(), initial_unknowns=found.x)
     own = discretisation_estimate_shifts(FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
@@ -224,16 +200,13 @@ H = 0.01
 def made(matrices, *, by_torque=None, fixed=(), finite=None):
     """A step whose A is given node by node, of two coordinates, and a rollout that stays where it is."""
     count = len(matrices)
-    step = SimpleNamespace(
-        system=SimpleNamespace(n_coordinates=2, prescribed_coordinate_indices=fixed),
-        sizes={"nx": 4},
-        time_step=H,
-        jacobians=lambda q, p, u, theta, prescribed, z, names: (
-            np.array(matrices[int(u[0])], float),
-            np.zeros((4, 1)) if by_torque is None else np.array(by_torque, float)[:, None],
-            None,
-        ),
-    )
+    input_matrix = np.zeros((4, 1)) if by_torque is None else np.array(by_torque, float)[:, None]
+
+    def jacobians(q, p, u, theta, prescribed, z, names):
+        return np.array(matrices[int(u[0])], float), input_matrix, None
+
+    system = SimpleNamespace(n_coordinates=2, prescribed_coordinate_indices=fixed)
+    step = SimpleNamespace(system=system, sizes={"nx": 4}, time_step=H, jacobians=jacobians)
     state = np.zeros((count + 1, 4))
     if finite is not None:
         state[finite:] = np.nan
@@ -274,11 +247,6 @@ def test_only_what_turns_back_at_every_step_is_the_methods_own(matrix, factor):
     assert found.time_step == H
 
 
-def test_prescribed_coordinates_do_not_count():
-    step, rollout = made([diagonal(-3.0, -1.1, -5.0, 0.3)] * 4, fixed=(0,))
-    assert growth(step, rollout).max_step_factor == pytest.approx(1.1)
-
-
 def test_the_tracking_filter_is_part_of_the_loop():
     """Gains too high for the time step alternate by themselves, others calm what would."""
     matrix = diagonal(0.9, 0.5, -1.2, 0.0)
@@ -302,13 +270,15 @@ def test_growth_is_that_of_the_worst_stretch():
     assert joined.growth_decades == pytest.approx(10 * np.log10(1.1) + np.log10(0.9) + 3 * np.log10(1.5))
 
 
-def test_a_rollout_that_failed_counts_as_far_as_it_got():
+def test_a_rollout_that_failed_counts_as_far_as_it_got_without_prescribed_coordinates():
     step, rollout = made([diagonal(-1.2, 0, 0, 0)] * 20, finite=8)
     assert growth(step, rollout).growth_decades == pytest.approx(7 * np.log10(1.2))
     step, rollout = made([diagonal(-1.2, 0, 0, 0)] * 20, finite=1)
     assert growth(step, rollout) == AlternatingErrorGrowth("motion", 0.0, 0.0, 0.0, H)
     broken = [diagonal(-1.2, 0, 0, 0)] * 5 + [np.full((4, 4), np.nan)] * 5
     assert growth(*made(broken)).growth_decades == pytest.approx(5 * np.log10(1.2))
+    step, rollout = made([diagonal(-3.0, -1.1, -5.0, 0.3)] * 4, fixed=(0,))
+    assert growth(step, rollout).max_step_factor == pytest.approx(1.1)
 
 
 @pytest.mark.parametrize(
@@ -317,31 +287,15 @@ def test_a_rollout_that_failed_counts_as_far_as_it_got():
 def test_what_is_said(decades, stable):
     said = AlternatingErrorGrowth("run", decades, 1.29, 0.35, 0.005)
     assert said.is_stable is stable
-    if stable:
-        assert said.description == "run: the step of 0.005 s is stable along the motion"
-    else:
-        assert said.description == (
-            "run: the step of 0.005 s is not stable: an error that alternates from step to step grows by 29 % in a "
-            "step at 0.35 s; take a shorter problem.time_step (0.0025 s, say)"
-        )
+    told = "grows by 29 % in a step at 0.35 s; take a shorter problem.time_step (0.0025 s, say)"
+    assert said.description.startswith(f"run: the step of 0.005 s is {'' if stable else 'not '}stable")
+    assert said.description.endswith("along the motion" if stable else told)
 
 
 def test_a_recording_is_judged_by_its_name(pendulum):
     problem = pendulum()
     assert largest_alternating_error_growth(problem, problem.initial_unknowns).is_stable
     assert largest_alternating_error_growth(problem, problem.initial_unknowns).recording_name == "twin"
-
-
-HANDS = """<robot name="hands"><link name="wall"/>
-<joint name="x" type="prismatic"><parent link="wall"/><child link="a"/><axis xyz="1 0 0"/>
-  <limit lower="-1" upper="2" effort="100" velocity="5"/></joint>
-<link name="a"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
-  </inertial></link>
-<joint name="z" type="prismatic"><parent link="a"/><child link="hand"/><axis xyz="0 0 1"/>
-  <limit lower="-1" upper="2" effort="100" velocity="5"/></joint>
-<link name="hand"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
-  </inertial></link></robot>
-"""
 
 
 NODE = ("symmetric", "node")
@@ -351,9 +305,7 @@ NODE = ("symmetric", "node")
 @pytest.fixture(scope="module")
 def light(tmp_path_factory):
     """light(stiffness, time_step): the step of twenty grams on a metre; `path(time_step)` moves its hands."""
-    file = tmp_path_factory.mktemp("hands") / "hands.urdf"
-    file.write_text(HANDS)
-    robot = read_urdf(file)
+    robot = chain_of_motors(tmp_path_factory.mktemp("hands"), x=("prismatic", "1 0 0"), z=("prismatic", "0 0 1"))
 
     def build(stiffness, time_step):
         segment = Segment("cable", 1.0, 0.02, 0.003, links=8, bend=stiffness, twist=stiffness, damping=1e-4)
@@ -434,11 +386,9 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     ],
 )
 def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch, before, start, estimate, after):
-    grown = {
-        0.0: AlternatingErrorGrowth("run", start, 1.3, 0.1, H),
-        1.0: AlternatingErrorGrowth("run", estimate, 1.3, 0.1, H),
-    }
-    monkeypatch.setattr(solve_command, "largest_alternating_error_growth", lambda problem, x: grown[float(x[0])])
+    decades = {0.0: start, 1.0: estimate}
+    grown = {x: AlternatingErrorGrowth("run", size, 1.3, 0.1, H) for x, size in decades.items()}
+    monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: grown[float(x[0])])
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
     judged, said = stability_checked_solution(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert judged.status == after
@@ -446,8 +396,6 @@ def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
-    monkeypatch.setattr(solve_command, "largest_alternating_error_growth", lambda problem, x: None)
-    assert stability_checked_solution(SimpleNamespace(initial_unknowns=np.zeros(1)), found) == (
-        found,
-        {"start": None, "estimate": None},
-    )
+    monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: None)
+    unchecked = stability_checked_solution(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    assert unchecked == (found, {"start": None, "estimate": None})

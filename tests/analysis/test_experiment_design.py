@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from heard import Heard
-from made_recordings import group, holding_pendulum, places, setting
+from made_recordings import chain_of_motors, group, holding_pendulum, places, setting
 
 from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis import experiment_design as module
@@ -95,11 +95,8 @@ def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen
         replace(made, position=position), group("points_arm"), group("points_off"), sensors=sensors
     )
     found = chosen.existing_sensor_observations(episode)
-    assert [(view.point_group, view.frame) for view in found] == [
-        ("points_camera", "a"),
-        ("points_camera", "tip"),
-        ("points_arm", "b"),
-    ]
+    seen = [("points_camera", "a"), ("points_camera", "tip"), ("points_arm", "b")]
+    assert [(view.point_group, view.frame) for view in found] == seen
     np.testing.assert_allclose(found[0].times, [0.0, 0.5, 1.0])
     np.testing.assert_allclose(found[1].times, [0.0, 1.0])
     np.testing.assert_array_equal(found[1].std, np.full((2, 3), 2e-3))
@@ -118,19 +115,10 @@ def view(times, std, frame="a"):
     return FrameObservationSchedule("camera", frame, np.array(times), np.array(std, float) * np.ones((len(times), 3)))
 
 
-@pytest.mark.parametrize(
-    ("time", "weights"),
-    [
-        (0.0, {0: 1.0}),
-        (0.5, {1: 1.0}),
-        (0.75, {1: 0.5, 2: 0.5}),
-        (1.6, {3: 0.8, 4: 0.2}),
-        (2.0, {4: 1.0}),
-        (-0.1, {}),
-        (2.1, {}),
-    ],
-    ids=["start", "node", "halfway", "part of the way", "end", "before", "after"],
-)
+TIMES = [(0.0, {0: 1.0}), (0.5, {1: 1.0}), (0.75, {1: 0.5, 2: 0.5}), (1.6, {3: 0.8, 4: 0.2}), (2.0, {4: 1.0})]
+
+
+@pytest.mark.parametrize(("time", "weights"), [*TIMES, (-0.1, {}), (2.1, {})])
 def test_a_view_is_interpolated_between_nodes(sloped, time, weights):
     std = np.array([[0.1, 0.2, 0.5]])
     slopes = sloped.position_sensitivities[0, "camera", "a"]
@@ -172,49 +160,31 @@ def test_a_marker_is_off_the_axis_and_felt_at_a_held_end(holding):
     np.testing.assert_allclose(beside - tip, [MARKER_DISTANCE, 0.0, 0.0], atol=1e-12)
 
 
-URDF = """<robot name="r"><link name="wall"/>
-<joint name="turn" type="continuous"><parent link="wall"/><child link="a"/><axis xyz="{axis}"/></joint>
-<link name="a"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
-</inertial></link>
-<joint name="slide" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="1 0 0"/>
-<limit lower="-1" upper="1" effort="100" velocity="5"/></joint>
-<link name="b"><inertial><mass value="0.5"/><inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/>
-</inertial></link></robot>"""
-
-
 @pytest.mark.parametrize(
     ("axis", "beside"),
     [((1, 0, 0), (0, 1, 0)), ((0, 0, 1), (1, 0, 0)), ((0.64, 0.48, 0.6), (-0.64 * 0.48, 1 - 0.48**2, -0.48 * 0.6))],
 )
 def test_a_springy_joint_has_a_marker_across_its_axis(tmp_path, axis, beside):
-    file = tmp_path / "r.urdf"
-    file.write_text(URDF.format(axis=" ".join(map(str, axis))))
+    turn = "continuous", " ".join(map(str, axis))
+    robot = chain_of_motors(tmp_path, turn=turn, slide=("prismatic", "1 0 0"))
     springs = {"turn": RobotJointSpring(1.0), "slide": RobotJointSpring(1.0)}
-    system = System.build(read_urdf(file), springs=springs, point_frames=["b"])
+    system = System.build(robot, springs=springs, point_frames=["hand"])
     *moving, marker = observable_frames(system)
-    assert [sight.name for sight in moving] == [
-        name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0
-    ]
+    there = [name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0]
+    assert [sight.name for sight in moving] == there
     assert (marker.name, marker.description) == ("turn_marker", "a marker 3 cm off the axis of turn")
     wanted = MARKER_DISTANCE * np.array(beside) / np.linalg.norm(beside)
     np.testing.assert_allclose(places(system, [marker.added_frame], np.zeros(2))[0], wanted, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("settings", "possible"),
-    [
-        ({"joints": False}, ""),
-        ({"grasps": ("weld", "point")}, "weld"),
-        ({"grasps": ("weld",)}, ""),
-        ({"second": "arm"}, "second_arm"),
-        ({"driven": ("a",)}, "motion travel torque"),
-        ({"driven": ("a",), "measured": True}, "motion travel"),
-        ({"driven": ("a",), "joints": False}, "motion travel"),
-        ({"driven": ("a",), "servos": {"a": 1}}, "torque"),
-        ({"prescribed": ("a",)}, "torque"),
-        ({"prescribed": ("a",), "measured": True}, ""),
-    ],
-)
+DRIVEN, MOVED = {"driven": ("a",)}, {"prescribed": ("a",)}
+POSSIBLE = [({"joints": False}, ""), ({"grasps": ("weld", "point")}, "weld"), ({"grasps": ("weld",)}, "")]
+POSSIBLE += [({"second": "arm"}, "second_arm"), (DRIVEN, "motion travel torque"), (MOVED, "torque")]
+POSSIBLE += [(DRIVEN | {"measured": True}, "motion travel"), (DRIVEN | {"joints": False}, "motion travel")]
+POSSIBLE += [(DRIVEN | {"servos": {"a": 1}}, "torque"), (MOVED | {"measured": True}, "")]
+
+
+@pytest.mark.parametrize(("settings", "possible"), POSSIBLE)
 def test_changes_of_mechanics_that_make_sense(settings, possible):
     made = {"grasps": (), "driven": (), "prescribed": (), "servos": {}, "measured": False, "joints": True} | settings
     grasps = [SimpleNamespace(kind=kind) for kind in made["grasps"]]
@@ -264,18 +234,10 @@ def informed(problem, *mechanics):
     return found, found.fisher_information(views)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"huber_threshold": 0.1},
-        {"weighting": "paper"},
-        {"weak_prior_factor": 0.01},
-        {"prior_stds": {"elbow.stiffness": 1e-3}},
-        {"duration": 0.8},
-    ],
-    ids=["plain", "robust", "paper", "weak priors", "stated priors", "all of it"],
-)
+COSTS = [{}, {"huber_threshold": 0.1}, {"weighting": "paper"}, {"weak_prior_factor": 0.01}, {"duration": 0.8}]
+
+
+@pytest.mark.parametrize("options", [*COSTS, {"prior_stds": {"elbow.stiffness": 1e-3}}])
 def test_information_is_of_the_sensors_alone(swung, options):
     """Neither robust costs nor weights nor priors of the parameters themselves change what sensors would tell."""
     problem = swung()
@@ -286,11 +248,15 @@ def test_information_is_of_the_sensors_alone(swung, options):
     np.testing.assert_allclose(found, rows.T @ rows, rtol=1e-9)
 
 
-def test_shorter_recordings_tell_less(swung):
+def test_shorter_recordings_tell_less_and_what_cannot_be_evaluated_nothing(swung):
     _, whole = informed(swung())
     made, half = informed(swung(duration=0.4))
     assert made.problem.episodes[0].grid.steps == 20
     assert np.all(np.linalg.eigvalsh(whole - half) > 0)
+    problem = swung()
+    x = np.array([np.nan, 0.1])
+    found = CandidateExperimentBuilder(RecordedExperiment(problem, x)).build_experiment(frozenset())
+    assert found == "elbow.stiffness = nan is not a finite number"
 
 
 def test_torques_as_a_measurement_are_fixed_information_with_typical_noise(swung):
@@ -305,28 +271,18 @@ def test_torques_as_a_measurement_are_fixed_information_with_typical_noise(swung
     assert heard.stages == ["working out joint torques as a measurement, the arms' motion as known"]
 
 
-def test_every_frame_is_in_view_at_every_node(swung):
+def test_every_frame_is_in_view_at_every_node_without_new_equations(swung):
     [episode] = built(swung())[1].problem.episodes
     assert [points.name for points in episode.recording.points] == [CAMERA_GROUP]
     camera = episode.recording.points[0]
     assert set(camera.names) == {sight.name for sight in observable_frames(swung().system)}
     np.testing.assert_allclose(camera.t, episode.grid.node_times)
     assert np.all(camera.std == 1.0)
-
-
-def test_more_frames_need_no_new_equations(swung):
     step = swung().step
     more, seen = add_observable_frames_to_step(step)
     assert {sight.name for sight in seen} <= set(more.system.mechanism.frames)
     assert more.kernel is step.kernel
     assert built(swung())[1].problem.step.kernel is step.kernel
-
-
-def test_what_cannot_be_evaluated_is_no_variant(swung):
-    problem = swung()
-    x = np.array([np.nan, 0.1])
-    found = CandidateExperimentBuilder(RecordedExperiment(problem, x)).build_experiment(frozenset())
-    assert found == "elbow.stiffness = nan is not a finite number"
 
 
 def test_welds_keep_the_orientation_at_the_start(held_tube):
@@ -362,18 +318,15 @@ def driven(holding):
     return EstimationProblem(step, [Recording(group, (camera,), name="run")], ("T1.bend",), ProblemOptions())
 
 
+BEYOND = "beyond the range of shoulder, elbow", "beyond the torque of elbow"
+
+
 @pytest.mark.parametrize(
     ("name", "factor", "q", "effort", "note"),
     [
         ("motion", 1.0, (0.04, 0.0), (0.09, -0.04), ()),
         ("travel", 2.0, (0.06, 0.0), (0.0, 0.0), ("beyond the range of shoulder",)),
-        (
-            "motion",
-            1.0,
-            (0.06, -0.06),
-            (0, -0.06),
-            ("beyond the range of shoulder, elbow", "beyond the torque of elbow"),
-        ),
+        ("motion", 1.0, (0.06, -0.06), (0, -0.06), BEYOND),
     ],
 )
 def test_another_motion_starts_where_the_recording_does(driven, monkeypatch, name, factor, q, effort, note):
@@ -395,12 +348,9 @@ def test_another_motion_starts_where_the_recording_does(driven, monkeypatch, nam
     _, made = built(driven, name)
     assert made.feasibility_notes == note
     episode = driven.episodes[0]
-    assert asked.start == pytest.approx(
-        dict(zip(("shoulder", "elbow"), episode.measured_driven_angles[0], strict=True))
-    )
-    angles = np.zeros((len(episode.measured_driven_angles), driven.system.n_coordinates))
-    angles[:, :2] = episode.measured_driven_angles
-    way = np.array([places(driven.system, ["tip"], at)[0] for at in angles])
+    assert list(asked.start.values()) == pytest.approx(episode.measured_driven_angles[0])
+    still = np.zeros(driven.system.n_coordinates - 2)
+    way = np.array([places(driven.system, ["tip"], [*at, *still])[0] for at in episode.measured_driven_angles])
     farthest = np.linalg.norm(way - way[0], axis=1).max()
     assert asked.excitation.gripper_travel == pytest.approx(factor * farthest)
     assert (asked.seed, asked.excitation.max_joint_speed) == (11, 1.4 * factor)
@@ -414,19 +364,15 @@ STEPS, NX, NU, READINGS = 30, 4, 2, 3
 def drawn_motion(monkeypatch):
     """A made-up motion of two driven joints, torques recorded every other step: course, errors, readings' slopes."""
     rng = np.random.default_rng(3)
-    steps = [
-        SimpleNamespace(
-            state_by_state=0.9 * np.linalg.qr(rng.standard_normal((NX, NX)))[0],
-            state_by_torque=rng.standard_normal((NX, NU)),
-        )
-        for _ in range(STEPS)
-    ]
+    steps = []
+    for _ in range(STEPS):
+        turned, by_torque = np.linalg.qr(rng.standard_normal((NX, NX)))[0], rng.standard_normal((NX, NU))
+        steps.append(SimpleNamespace(state_by_state=0.9 * turned, state_by_torque=by_torque))
     monkeypatch.setattr(propagation, "linearized_steps", lambda *_: steps)
     monkeypatch.setattr(propagation, "applied_torque_error_feedthrough", lambda gain, momentum: np.eye(NU))
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
-    functions = SimpleNamespace(
-        step=None, momentum_shift=SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
-    )
+    shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
+    functions = SimpleNamespace(step=None, momentum_shift=shift)
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(
         model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,
@@ -533,15 +479,12 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
             own = replace(own, t=times, position=np.zeros(shape), std=std)
         groups.append(own)
     # what is there tells of errors of torques too: those that the real recording tells of
-    effort, errors = (
-        recording.joints.effort.copy(),
-        problem_whitened_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors,
-    )
+    errors = problem_whitened_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors
+    effort = recording.joints.effort.copy()
     effort[: len(errors.torque_noise)] -= errors.total_torque_error
     faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
-    problem = EstimationProblem(
-        noisy.step, [faster], noisy.free, noisy.options, noisy.named_values(noisy.initial_unknowns)
-    )
+    values = noisy.named_values(noisy.initial_unknowns)
+    problem = EstimationProblem(noisy.step, [faster], noisy.free, noisy.options, values)
     weighted = problem_whitened_at(problem, problem.initial_unknowns)
     jacobian = linearization_without_weak_priors(weighted, weighted.evaluate(problem.initial_unknowns))[1]
     std = np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))) / problem.initial_unknowns

@@ -60,26 +60,20 @@ def test_two_runs_together_are_their_weighted_mean_with_whole_covariances():
     assert degrees == 2
 
 
-def test_runs_that_differ_widen_the_mean_by_birges_ratio():
+def test_runs_that_differ_widen_the_mean_and_a_parameter_counts_where_it_is():
     mean, chi2, degrees = pool_estimates([run("x", [1.0, 2.0]), run("y", [1.5, 2.0])])
     assert chi2 > 50
     assert mean.std == pytest.approx(np.sqrt(np.diag(COVARIANCE) / 2 * chi2 / degrees), rel=1e-8)
-
-
-def test_a_parameter_that_one_run_lacks_still_counts_where_it_is():
     mean, _, degrees = pool_estimates([run("x", [1.0, 2.0]), run("y", [1.0], [[1e-4]], ("a",))])
     assert mean.parameter_names == ("a", "b")
     assert degrees == 1
     assert mean.std[0] < 0.01
 
 
-def test_chi2_of_runs_without_drift_is_distributed_as_it_should():
+def test_without_drift_chi2_is_distributed_as_it_should_and_alarms_stay_at_their_level():
     rng = np.random.default_rng(3)
     found = [assess_drift(drawn(rng, [1.0, 2.0], 3)).p_value for _ in range(40)]
     assert scipy.stats.kstest(found, "uniform").pvalue > 1e-3
-
-
-def test_false_alarms_of_drift_and_distrust_stay_at_their_level():
     rng = np.random.default_rng(4)
     found = [assess_drift(drawn(rng, [1.0, 2.0], 4), level=0.05) for _ in range(40)]
     assert np.mean([bool(drifted(entry)) for entry in found]) < 0.16
@@ -96,14 +90,11 @@ def test_the_run_that_stands_apart_is_the_one_to_distrust():
     assert next(entry.worst_parameter for entry in found.run_consistencies if entry.run_name == "day2") == "a"
 
 
-def test_a_steady_drift_names_the_parameter_and_no_run():
+def test_a_steady_drift_and_two_runs_that_differ_make_no_outlier():
     runs = [run(f"day{i}", [1.0, 2.0 + 0.05 * i]) for i in range(5)]
     found = assess_drift(runs)
     assert "b" in drifted(found)
     assert outliers(found) == []
-
-
-def test_of_two_runs_that_differ_neither_is_distrusted():
     found = assess_drift([run("x", [1.0, 2.0]), run("y", [2.0, 2.0])])
     assert drifted(found) == ["a"]
     assert outliers(found) == []
@@ -123,13 +114,10 @@ def fit_of(law: str, *errors: float) -> FrictionLawFit:
     return FrictionLawFit(law, {}, dict(zip(("a_1", "a_2", "b_1", "c_1"), errors, strict=True)), "rad", True)
 
 
-def test_kinds_weigh_alike_however_many_recordings_each_has() -> None:
+def test_kinds_weigh_alike_and_the_simplest_law_near_the_best_is_warranted():
     mean, error = mean_and_standard_error({"a_1": 1.0, "a_2": 3.0, "b_1": 5.0, "c_1": 8.0}, KINDS)
     assert mean == pytest.approx(5.0)
     assert error == pytest.approx(np.std([2.0, 5.0, 8.0], ddof=1) / np.sqrt(3))
-
-
-def test_the_simplest_law_within_one_standard_error_of_the_best_is_warranted() -> None:
     rough, good, best = fit_of("viscous", 9, 9, 8, 9), fit_of("coulomb", 3, 3, 2, 4), fit_of("stribeck", 2.8, 2.8, 2, 4)
     assert warranted_law([rough, good, best], KINDS) is good
     far = fit_of("stribeck", 1, 1, 1.1, 0.9)
@@ -148,9 +136,8 @@ TRUTH = {
 @pytest.fixture(scope="module")
 def dry(urdf_folder) -> EstimationProblem:
     """Three kinds of motion of an arm with dry friction, as its own model has them, and one with motors off."""
-    step = pendulum_step(
-        urdf_folder, [("joint_coulomb", "shoulder", {})], driven=PENDULUM, servos=PositionServoOptions()
-    )
+    friction = [("joint_coulomb", "shoulder", {})]
+    step = pendulum_step(urdf_folder, friction, driven=PENDULUM, servos=PositionServoOptions())
     made = []
     t = 0.01 * np.arange(81)
     for name, rate in (("slow_1", 4.0), ("slow_2", 5.0), ("fast_1", 11.0), ("turn_1", 7.0)):
@@ -165,11 +152,8 @@ def dry(urdf_folder) -> EstimationProblem:
     return EstimationProblem(step, [*found, recording(off, name="drop")], names, None, known)
 
 
-def test_kinds_go_by_name_and_motors_that_are_off_stay_in_the_fit(dry) -> None:
+def test_kinds_go_by_name_and_a_true_law_predicts_to_its_noise_and_shows_in_the_torques(dry):
     assert motion_kinds(dry) == {"slow": ("slow_1", "slow_2"), "fast": ("fast_1",), "turn": ("turn_1",)}
-
-
-def test_a_law_that_is_true_predicts_what_is_left_out_to_its_noise_and_shows_in_the_torques(dry) -> None:
     driven = dry.with_episodes(dry.episodes[:-1], ())
     solution = solve(driven, GaussNewton(), restarts=False)
     fit = fit_friction_law("coulomb", driven, solution, motion_kinds(driven))

@@ -102,13 +102,10 @@ def made_problem(urdf_folder, feedback, start):
     system = holding_pendulum(urdf_folder, links=2)
     t = 0.01 * np.arange(5)
     path = np.stack([0.02 * t, 0.03 * t], axis=1)
-    joints = JointGroup(
-        ("shoulder", "elbow"), t, path, effort=np.zeros_like(path), effort_kind="command", position_std=1e-3,
-        effort_std=0.1,
-    )  # fmt: skip
-    camera = PointGroup(
-        "points_camera", ["T1_0_tip"], t[:4] + 0.004, np.zeros((4, 1, 3)), 2e-3, sensor="camera", pose=np.eye(4)
-    )
+    effort = {"effort": np.zeros_like(path), "effort_kind": "command", "effort_std": 0.1}
+    joints = JointGroup(("shoulder", "elbow"), t, path, position_std=1e-3, **effort)
+    how = {"sensor": "camera", "pose": np.eye(4)}
+    camera = PointGroup("points_camera", ["T1_0_tip"], t[:4] + 0.004, np.zeros((4, 1, 3)), 2e-3, **how)
     step = compile_step(system, 0.01, use_compiler=False)
     options = ProblemOptions(path_cutoff=math.inf, feedback=feedback, initial_state=start)
     return EstimationProblem(step, [Recording(joints, (camera,), name="short")], ("T1.bend", "T1.length"), options)
@@ -122,9 +119,8 @@ def test_the_nlp_has_the_pattern_that_is_shown(urdf_folder, feedback, start):
     symbols = StepSymbols.from_equations(problem.step.equations)
     followed = () if episode.tracking_feedback is None else tuple(episode.tracking_feedback.state_indices)
     sensors = [samples.sensor for samples in episode.measurements]
-    stage = nlp_stage_sparsity(
-        symbols, problem.shared_parameters, sensors, followed, problem.predictor.estimated_initial_state_indices
-    )
+    loose = problem.predictor.estimated_initial_state_indices
+    stage = nlp_stage_sparsity(symbols, problem.shared_parameters, sensors, followed, loose)
     steps = episode.grid.steps
     kkt, size = kkt_sparsity_pattern(stage, steps), full_nlp_size(stage, [steps])
     width = size["variables"]

@@ -36,9 +36,7 @@ def usual(_group: str) -> SensorOptions:
 @pytest.fixture(scope="module")
 def arms() -> dict[int, RecordedJointsModel]:
     systems = {count: baxter_foam_y_system(count) for count in (1, 2)}
-    return {
-        count: RecordedJointsModel.from_system(system, system.parameters.vector()) for count, system in systems.items()
-    }
+    return {n: RecordedJointsModel.from_system(system, system.parameters.vector()) for n, system in systems.items()}
 
 
 @pytest.fixture(scope="module")
@@ -79,10 +77,8 @@ def test_slopes_of_places_are_their_derivatives(arms):
         up, down = q.copy(), q.copy()
         up[:, j] += step
         down[:, j] -= step
-        difference = (
-            arm.frame_positions_and_jacobians(frames, up)[0] - arm.frame_positions_and_jacobians(frames, down)[0]
-        ) / (2 * step)
-        assert np.max(np.abs(difference - slope[..., j])) < 1e-8
+        above, below = (arm.frame_positions_and_jacobians(frames, at)[0] for at in (up, down))
+        assert np.max(np.abs((above - below) / (2 * step) - slope[..., j])) < 1e-8
 
 
 def times(factor, *columns):
@@ -149,18 +145,15 @@ def test_a_joint_of_which_nothing_is_asked_may_swing(repository, kind, least, ex
     assert {doubt.cause for doubt in check_efforts_by_inverse_dynamics(arm, recording)} == expected
 
 
-def test_a_counterbalance_that_the_urdf_does_not_have_is_no_wrong_zero(arms, runs):
-    balanced = with_joints(runs[1], effort=lambda j: j.effort + 20.0 * (np.arange(7) == 1))
-    assert check_efforts_by_inverse_dynamics(arms[1], balanced) == []
-
-
-def test_motion_that_belongs_to_other_efforts_is_not_this_robots(arms, runs):
+def test_motion_of_another_robot_or_with_a_counterbalance(arms, runs):
     quick = with_joints(runs[1], t=lambda j: j.t / 10)
     robot = read_urdf("package:baxter", joints=arms[1].joint_names)
     system = System.build(robot, prescribed=robot.joint_names)
     free = RecordedJointsModel.from_system(system, system.parameters.vector())
     # nothing else can load an arm that holds nothing
     assert "effort_unlike" in {doubt.cause for doubt in check_efforts_by_inverse_dynamics(free, quick)}
+    balanced = with_joints(runs[1], effort=lambda j: j.effort + 20.0 * (np.arange(7) == 1))
+    assert check_efforts_by_inverse_dynamics(arms[1], balanced) == []
 
 
 def test_limits_of_joints(arms, runs):
@@ -206,11 +199,14 @@ def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, 
     assert f"with {-offset:+.3g}"[:9] in doubt.what.replace("+0.0499", "+0.05").replace("-0.0499", "-0.05")
 
 
-def test_points_on_a_late_clock(arms, runs):
+def test_clocks_that_are_far_apart(arms, runs):
     groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
     (doubt,) = check_robot_held_points(arms[2], replace(runs[2], points=tuple(groups)), usual)
     assert doubt.cause == "clock_offset"
     assert "taken +0.4 s" in doubt.what
+    (doubt,) = check_robot_held_points(arms[1], stamped(runs[1], drift=0.05), usual)
+    assert doubt.cause == "clock_drift"
+    assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
 
 
 def stamped(recording: Recording, late: float = 0.0, drift: float = 0.0) -> Recording:
@@ -240,17 +236,8 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
         size, std = (float(number) for number in re.search(r"([-+\d.]+) ± ([\d.]+)", doubt.what).groups())
         told = 1e-3 * size * (-1 if "slowly" in doubt.what else 1)
         assert told == pytest.approx(drift if drift else late, rel=0.05, abs=3e-3 * std)
-        assert (doubt.group, doubt.weight, doubt.setting) == (
-            "points_arm",
-            "not_trusted",
-            "sensors.points_arm.use: false",
-        )
-
-
-def test_clocks_that_run_far_apart(arms, runs):
-    (doubt,) = check_robot_held_points(arms[1], stamped(runs[1], drift=0.05), usual)
-    assert doubt.cause == "clock_drift"
-    assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
+        assert (doubt.group, doubt.weight) == ("points_arm", "not_trusted")
+        assert doubt.setting == "sensors.points_arm.use: false"
 
 
 def test_a_camera_that_is_late_is_answered_by_its_latency(arms, runs):
@@ -260,18 +247,15 @@ def test_a_camera_that_is_late_is_answered_by_its_latency(arms, runs):
     assert re.search(r"kind: camera_latency, location: camera, values: {delay: 0.03\d*}", doubt.setting)
 
 
-def test_a_zero_that_is_a_little_off_is_no_clock(arms, runs):
-    moved = with_joints(runs[1], position=lambda j: j.position + 0.005 * (np.arange(7) == 1))
-    assert list(check_robot_held_points(arms[1], moved, usual)) == []
-
-
-def test_at_rest_nothing_tells_of_clocks(arms, runs):
+def test_what_is_a_little_off_or_at_rest_is_no_wrong_clock(arms, runs):
     joints = runs[1].joints
     still = with_joints(runs[1], position=lambda j: np.repeat(j.position[:1], len(j.t), axis=0))
     place = arms[1].frame_positions_and_jacobians(("left_gripper",), joints.position[:1])[0]
     rng = np.random.default_rng(0)
     at_rest = with_points(still, "points_arm", lambda p: place + 1e-3 * rng.standard_normal(p.shape))
     assert list(check_robot_held_points(arms[1], stamped(at_rest, 0.5), usual)) == []
+    moved = with_joints(runs[1], position=lambda j: j.position + 0.005 * (np.arange(7) == 1))
+    assert list(check_robot_held_points(arms[1], moved, usual)) == []
 
 
 def test_what_no_change_explains_is_said_so(arms, runs):
@@ -404,8 +388,9 @@ def doubts(springs, late=0.0, drift=0.0, std=None):
     return check_fit_residuals(solution.problem or made, solution.x, solution.evaluation)
 
 
-def test_a_fit_of_a_sound_recording_raises_nothing(springs):
+def test_a_fit_of_a_sound_recording_raises_nothing_and_a_late_clock_is_left_to_a_diagnosis(springs):
     assert doubts(springs) == []
+    assert "clock_drift" not in {doubt.cause for doubt in doubts(springs, late=0.1)}
 
 
 def test_a_clock_that_runs_apart_is_told_by_what_the_fit_leaves(springs):
@@ -413,10 +398,6 @@ def test_a_clock_that_runs_apart_is_told_by_what_the_fit_leaves(springs):
     assert (doubt.cause, doubt.weight, doubt.group) == ("clock_drift", "not_trusted", "points_camera")
     told, std = map(float, re.search(r"runs ([\d.]+) ± ([\d.]+) parts per thousand too fast", doubt.what).groups())
     assert told == pytest.approx(10.0, abs=4 * std + 0.5)
-
-
-def test_a_clock_that_is_late_is_left_to_a_diagnosis(springs):
-    assert "clock_drift" not in {doubt.cause for doubt in doubts(springs, late=0.1)}
 
 
 def test_noise_that_settings_state_ten_times_too_large(springs):

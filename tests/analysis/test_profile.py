@@ -228,9 +228,8 @@ def judged(problem, entry):
 
 
 def test_a_stiffness_that_is_known_to_be_small_is_found():
-    problem = Formula(
-        lambda x: [100 * (x["a.bend"] - 20.0), 10.0 * (x["b.bend"] - 0.05)], {"a.bend": 20.0, "b.bend": 0.05}
-    )
+    start = {"a.bend": 20.0, "b.bend": 0.05}
+    problem = Formula(lambda x: [100 * (x["a.bend"] - 20.0), 10.0 * (x["b.bend"] - 0.05)], start)
     found = judged(problem, estimate(0.05, 0.1))
     assert (found.verdict, found.std) == ("identifiable", 0.1)
     assert found.interval == (None, pytest.approx(0.05 + HALF / 10, rel=0.01))
@@ -254,10 +253,8 @@ def judged_twin(config: Path, seed: int) -> dict[str, Any]:
     problem = EstimationProblem(made.step, [recording], made.free, made.options, dict.fromkeys(TRUTH, 10.0))
     info = identifiability(problem, solve(problem, GaussNewton()), intervals=list(SEEN))
     held = [holds(info.parameters[name].interval, TRUTH[name]) for name in SEEN]
-    return {
-        "held": held,
-        "identifiable": [name for name, entry in info.parameters.items() if entry.verdict == "identifiable"],
-    }
+    found = [name for name, entry in info.parameters.items() if entry.verdict == "identifiable"]
+    return {"held": held, "identifiable": found}
 
 
 def report(record_property, hits: dict[str, list[bool]]) -> float:

@@ -39,9 +39,8 @@ def test_blocks_have_the_names_of_the_project(symbols):
     joints = ["shoulder", "elbow", *(f"T1_{i}_{axis}" for i in (0, 1) for axis in "xyz")]
     assert list(symbols.row_blocks[0].full_names) == [f"del[{name}]" for name in joints]
     assert [block.name for block in symbols.row_blocks] == ["del", "internal", "constraint", "p1"]
-    assert symbols.row_blocks[2].full_names == tuple(
-        f"constraint[hand.{part}]" for part in ("x", "y", "z", "tilt_x", "tilt_y")
-    )
+    parts = "x", "y", "z", "tilt_x", "tilt_y"
+    assert symbols.row_blocks[2].full_names == tuple(f"constraint[hand.{part}]" for part in parts)
     assert list(symbols.row_blocks[1].labels) == list(symbols.equations.system.internal_coordinates)
     assert symbols.column_blocks[3].full_names == ("u[shoulder]",)
     # parameters are called as everywhere, without a block
@@ -127,13 +126,10 @@ def test_an_entry_with_a_column_is_the_slope(symbols, row, column):
     assert worked_out(symbols, entry, at) == pytest.approx((ends[0] - ends[1]) / (2 * width), rel=1e-6, abs=1e-9)
 
 
-def test_an_entry_that_vanishes_says_so(symbols):
+def test_an_entry_names_or_counts_its_variables_and_says_where_it_vanishes(symbols):
     entry = symbols.equation_entry("constraint[hand.x], T1.bend")
     assert entry.is_identically_zero
     assert entry.text_lines == ["d constraint[hand.x] / d T1.bend = 0 whatever the state"]
-
-
-def test_the_variables_of_an_entry_are_named_or_counted(symbols):
     stiffness = symbols.equation_entry("del[elbow], elbow.stiffness")
     assert stiffness.variable_names == ("q0[elbow]", "elbow.rest", "h", "q1[elbow]")
     assert "8 of q0" in symbols.equation_entry("del[T1_0_z]").variable_names
@@ -178,11 +174,6 @@ def test_all_rows_are_listed_the_short_ones_whole(symbols):
         assert name in text
 
 
-def test_latex_gets_no_letter_that_it_would_read_as_its_own():
-    assert escape_latex("kelvin_voigt@T1.tau") == r"kelvin\_voigt@T1.tau"
-    assert escape_latex("T1:40%") == r"T1:40\%"
-
-
 X = ca.SX.sym("x", 4)
 A, B, C, D = ca.vertsplit(X)
 NAMES = [_SymbolName(f"v[{i}]", f"v_{{{i}}}") for i in range(4)]
@@ -223,23 +214,22 @@ def test_formulas_have_the_value_of_their_expression(name, latex):
     assert found == pytest.approx([expected, 2 * expected], rel=1e-9)
 
 
-def test_parts_that_occur_twice_are_written_once():
+def test_parts_that_occur_twice_are_written_once_and_latex_letters_escaped():
     made = format_expressions([EXPRESSIONS["shared"]], X, NAMES)
     assert [text for _, text in made.shared_subexpressions] == ["v[0] + v[1]", "sin(c1)"]
     assert made.expression_texts == ("c2*c1 + c2^2",)
     # a sum, a sine, a product, a square, a sum
     assert made.n_operations == count_operations([EXPRESSIONS["shared"]], X) == 5
     assert made.variable_indices == (0, 1)
+    assert escape_latex("kelvin_voigt@T1.tau") == r"kelvin\_voigt@T1.tau"
+    assert escape_latex("T1:40%") == r"T1:40\%"
 
 
-def test_long_fractions_can_be_broken_into_lines():
+def test_long_fractions_can_be_broken_and_nothing_is_left_of_what_cancels():
     long = sum((ca.sin(A * i) for i in range(2, 12)), ca.SX(0)) / (B + C)
     made = format_expressions([long], X, NAMES, latex=True)
     assert r"\frac" not in made.expression_texts[0]
     assert ")/(" in made.expression_texts[0]
     assert format_expressions([A / B], X, NAMES, latex=True).expression_texts == (r"\frac{v_{0}}{v_{1}}",)
-
-
-def test_nothing_is_left_of_what_cancels():
     made = format_expressions([A - A], X, NAMES)
     assert (made.expression_texts, made.n_operations, made.variable_indices) == (("0",), 0, ())

@@ -251,13 +251,10 @@ def test_noise_that_nobody_states_is_read_from_the_recording(driven, said, caplo
     assert ("neither recorded nor configured" in caplog.text) == (said is None)
 
 
-def test_torques_beside_encoders_are_never_taken_as_exact(driven):
+def test_torques_beside_encoders_are_never_exact_and_steps_average_their_samples(driven):
     step, made = driven()
     problem = sprung(step, replace(made, joints=replace(made.joints, effort_std=0.0), points=made.points[1:]))
     assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(1e-3 * np.std(made.joints.effort))
-
-
-def test_a_step_over_several_samples_averages_their_noise(driven):
     step, made = driven(48)
     group = replace(made.joints, t=1.0 + 0.5 * (made.joints.t - 1.0))
     problem = sprung(step, replace(made, joints=group))

@@ -153,10 +153,6 @@ def smoothed(monkeypatch, models, **limits):
 NOTHING = dict.fromkeys(SOURCES, 0.0)
 
 
-def test_variances_so_large_that_rounding_shows_are_never_the_best():
-    assert smoother._run([made(1, loose=1e12)], NOTHING).log_evidence == -math.inf
-
-
 @pytest.mark.parametrize("column", [0, 1, 2])
 def test_variances_go_to_the_largest_evidence(column):
     models = [made(3, size=np.eye(3)[column] * 2.0)]
@@ -169,11 +165,12 @@ def test_variances_go_to_the_largest_evidence(column):
     assert state.log_evidence == pytest.approx(Dense(models, variance).log_evidence, rel=1e-9)
 
 
-def test_variances_stay_within_their_range():
+def test_variances_stay_within_their_range_and_rounding_is_never_the_best():
     variance, _ = smoother._refined([made(3, size=np.zeros(3))], NOTHING | {FORCE: 1e-6})
     assert variance[FORCE] >= 1e-6
     exploding, _ = smoother._refined([made(3, size=np.full(3, 1e9))], NOTHING | {FORCE: 1e6})
     assert exploding[FORCE] <= 1e7
+    assert smoother._run([made(1, loose=1e12)], NOTHING).log_evidence == -math.inf
 
 
 def test_the_best_variance_of_a_group_is_searched_over_all_sizes():
@@ -324,13 +321,9 @@ def test_a_place_that_does_as_well_is_told():
 
 def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():
     same = SmoothedUnknownGroup("here", "push")
-    seen = SimpleNamespace(
-        log_evidence_drop={HERE: 9.0, LIKE: 0.0, same: 0.0},
-        detectable_std=dict.fromkeys((HERE, LIKE, same), 0.5),
-        group_variance={HERE: 1.0, LIKE: 0.0, same: 0.0},
-        smoothed_unknowns=(),
-        alternative_groups={HERE: (LIKE, same)},
-    )
+    sizes, detectable = {HERE: 1.0, LIKE: 0.0, same: 0.0}, dict.fromkeys((HERE, LIKE, same), 0.5)
+    seen = SimpleNamespace(group_variance=sizes, detectable_std=detectable, smoothed_unknowns=())
+    seen.log_evidence_drop, seen.alternative_groups = {HERE: 9.0, LIKE: 0.0, same: 0.0}, {HERE: (LIKE, same)}
     first, *_ = localise_gap(seen)
     assert (first.location, first.indistinguishable_from) == ("here", ("there",))
 
@@ -467,7 +460,7 @@ SYSTEM = baxter_foam_y_system(1)
 THETA = np.array([parameter.value for parameter in SYSTEM.parameters])
 
 
-def test_a_push_is_what_virtual_work_says():
+def test_a_push_is_what_virtual_work_says_by_the_weight_of_its_segment():
     q = 0.3 * np.random.default_rng(3).standard_normal((2, SYSTEM.n_coordinates))
     found = _generalized_forces_per_newton(SYSTEM, THETA, q, ("T1", "T3"))
     assert found.shape == (2, SYSTEM.n_coordinates, 6)
@@ -482,8 +475,5 @@ def test_a_push_is_what_virtual_work_says():
             step[i] = 1e-6
             moved = (np.array(place(row + step, THETA)) - np.array(place(row - step, THETA))).ravel() / 2e-6
             assert found[k, i] == pytest.approx(moved, abs=1e-8)
-
-
-def test_pushes_are_measured_by_the_weight_of_their_segment():
     found = _segment_weights(SYSTEM, THETA)
     assert found == pytest.approx({"T1": 9.81 * 0.064, "T2": 9.81 * 0.015, "T3": 9.81 * 0.016})

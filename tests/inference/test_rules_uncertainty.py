@@ -84,12 +84,9 @@ def judged(problem, at=None):
 
 
 INFORMED, COLUMN = np.array([[3.0, 1.0], [0.0, 2.0], [1.0, 1.0], [2.0, -1.0]]), [[1.0], [1.0], [2.0], [9.0]]
+KNOWN = np.linalg.inv(INFORMED.T @ INFORMED)
 FITS = {
-    "noise alone": (
-        MadeUp(linear(INFORMED, [0.1, 0.2, 0.3, 0.4]), (5.0, 70.0)),
-        np.linalg.inv(INFORMED.T @ INFORMED),
-        0.15,
-    ),
+    "noise alone": (MadeUp(linear(INFORMED, [0.1, 0.2, 0.3, 0.4]), (5.0, 70.0)), KNOWN, 0.15),
     "a misfit": (MadeUp(linear(np.eye(2)[[0, 1, 0, 1]], [3.0, 4.0] * 2), (1.0, 1.0)), 12.5 * np.eye(2), 25.0),
     # a stated prior counts as an observation but its misfit says nothing of the noise; a weak one does not count
     "a stated and a weak prior": (MadeUp(linear(COLUMN, [1.0, 2.0, 5.0, 7.0]), stated=1, weak=1), 2.5 / 6, 2.5),
@@ -110,17 +107,11 @@ def test_the_covariance_is_the_inverse_of_the_information_times_the_misfit(probl
     np.testing.assert_allclose(covariance, np.atleast_2d(expected), rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("matrix", "known"),
-    [
-        ([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], (1.0, 1.0)),
-        ([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]], (0.5, None)),
-        ([[2.0, 0.0]], (0.25, None)),
-        ([[0.0, 2.0]], (None, 0.25)),
-        (np.zeros((0, 2)), (None, None)),
-    ],
-    ids=["both", "one", "fewer rows than unknowns", "fewer rows, the other one", "no rows"],
-)
+TALL = [([[1.0, 0], [0, 1], [0, 0]], (1.0, 1.0)), ([[1.0, 0], [1, 0], [0, 0]], (0.5, None))]
+WIDE = [([[2.0, 0]], (0.25, None)), ([[0, 2.0]], (None, 0.25)), (np.zeros((0, 2)), (None, None))]
+
+
+@pytest.mark.parametrize(("matrix", "known"), [*TALL, *WIDE])
 def test_what_the_data_do_not_inform_gets_a_huge_variance_in_units_of_its_size(matrix, known):
     problem = MadeUp(linear(matrix), (3.0, 50.0))
     covariance, _ = judged(problem)
@@ -138,34 +129,34 @@ def test_without_a_jacobian_nothing_is_known(ok):
     assert math.isnan(chi2)
 
 
+# value, standard deviation and, near zero, the size that the parameter might have; what is surely not zero is judged by
+# itself, however large the others are
+VERDICTS = {
+    "identifiable": [(10.0, 1.0, 0.0), (0.0, 1e-14, 0.0), (0.2, 0.39, 10.0)],
+    "weak": [(10.0, 1.01, 0.0), (-10.0, 3.0, 0.0), (0.2, 0.41, 10.0), (0.0, 4.9, 10.0), (0.5, 0.2, 1000.0)],
+    "not_identifiable": [(10.0, 40.1, 0.0), (10.0, math.nan, 0.0), (0.0, 1e-3, 0.0), (0.0, 5.1, 10.0)],
+}
+
+
+@pytest.mark.parametrize(("said", "known"), [(said, known) for said, many in VERDICTS.items() for known in many])
+def test_what_may_be_said_of_a_parameter(said, known):
+    value, std, scale = known
+    assert parameter_verdict(value, std, scale=scale) == said
+
+
 @pytest.mark.parametrize(
-    ("value", "std", "scale", "explains", "at_bound", "said"),
+    ("std", "explains", "at_bound", "said"),
     [
-        # by the relative standard deviation
-        (10.0, 1.0, 0.0, True, False, "identifiable"),
-        (10.0, 1.01, 0.0, True, False, "weak"),
-        (10.0, 40.1, 0.0, True, False, "not_identifiable"),
-        (-10.0, 3.0, 0.0, True, False, "weak"),
-        (10.0, math.nan, 0.0, True, False, "not_identifiable"),
-        (0.0, 1e-14, 0.0, True, False, "identifiable"),
-        (0.0, 1e-3, 0.0, True, False, "not_identifiable"),
-        (10.0, 0.5, 0.0, False, False, "not_trusted"),
-        (10.0, 0.5, 0.0, False, True, "not_trusted"),
-        (10.0, 0.5, 0.0, True, True, "at_bound"),
-        (10.0, 41.0, 0.0, False, True, "not_identifiable"),
-        (10.0, math.inf, 0.0, True, True, "not_identifiable"),
-        # near zero the size that the parameter might have counts
-        (0.2, 0.39, 10.0, True, False, "identifiable"),
-        (0.2, 0.41, 10.0, True, False, "weak"),
-        (0.0, 4.9, 10.0, True, False, "weak"),
-        (0.0, 5.1, 10.0, True, False, "not_identifiable"),
-        (0.0, 0.1, 10.0, True, True, "at_bound"),
-        # what is surely not zero is judged by itself, however large the others are
-        (0.5, 0.2, 1000.0, True, False, "weak"),
+        (0.5, False, False, "not_trusted"),
+        (0.5, False, True, "not_trusted"),
+        (0.5, True, True, "at_bound"),
+        (41.0, False, True, "not_identifiable"),
+        (math.inf, True, True, "not_identifiable"),
     ],
 )
-def test_what_may_be_said_of_a_parameter(value, std, scale, explains, at_bound, said):
-    assert parameter_verdict(value, std, scale=scale, explains=explains, at_bound=at_bound) == said
+def test_misfit_comes_before_a_bound_and_after_what_nothing_informs(std, explains, at_bound, said):
+    assert parameter_verdict(10.0, std, explains=explains, at_bound=at_bound) == said
+    assert parameter_verdict(0.0, 0.1, scale=10.0, at_bound=True) == "at_bound"
 
 
 def of_size(square, count=400, **more):
@@ -287,11 +278,13 @@ def test_of_what_nothing_informs_no_standard_deviation_is_said():
     assert (without.verdict, without.std) == ("not_identifiable", math.inf)
 
 
-def test_misfit_takes_the_trust_from_every_parameter_that_is_informed():
+def test_misfit_takes_the_trust_from_informed_parameters_and_no_fit_says_nothing_of_bounds():
     problem = MadeUp(linear(np.diag([2.5, 1e-9]), [-12.5, 0.0]), (4.0, 50.0))
     found = estimated(problem, [5.0, 50.0], np.diag([0.16, 1e18]), BAD)
     assert {name: entry.verdict for name, entry in found.items()} == {"k0": "not_trusted", "k1": "not_identifiable"}
     assert found["k0"].std == pytest.approx(0.4)
+    problem = MadeUp(linear([[2.0]]), (3.0,), upper=3.0)
+    assert estimated(problem, [3.0], [[0.01]], None)["k0"].verdict == "identifiable"
 
 
 def test_a_parameter_at_its_bound_has_an_interval_on_one_side():
@@ -309,11 +302,6 @@ def test_a_parameter_at_its_bound_has_an_interval_on_one_side():
 def test_a_value_near_its_bound_lies_at_it(value, at_bound):
     problem = MadeUp(linear([[20.0]], [-20.0 * value]), (5.0,), upper=10.0, scales=(1.0,), priors={"k0": 10.0})
     assert (estimated(problem, [value], [[0.0025]])["k0"].verdict == "at_bound") is at_bound
-
-
-def test_a_point_that_is_no_fit_says_nothing_of_bounds_and_misfit():
-    problem = MadeUp(linear([[2.0]]), (3.0,), upper=3.0)
-    assert estimated(problem, [3.0], [[0.01]], None)["k0"].verdict == "identifiable"
 
 
 def test_the_size_that_a_parameter_might_have():
@@ -350,17 +338,12 @@ def test_of_many_parameters_and_of_well_known_ones_none_is_asked(count, std, ask
     assert (len(problem.asked) > before) is asked
 
 
+TOLD = [(0.1234, None, "22.12 ± 0.12"), (0.1234, (20.0, None), "22.12 (above 20)"), (0.0, None, "22.12 ± 0")]
+TOLD += [(0.1234, (None, 1.23456), "22.12 (below 1.235)"), (None, (20.0, 24.0), "22.12 (20 to 24)")]
+
+
 @pytest.mark.parametrize(
-    ("std", "interval", "expected"),
-    [
-        (0.1234, None, "22.12 ± 0.12"),
-        (0.1234, (20.0, None), "22.12 (above 20)"),
-        (0.1234, (None, 1.23456), "22.12 (below 1.235)"),
-        (None, (20.0, 24.0), "22.12 (20 to 24)"),
-        (0.1234, (None, None), "22.12 ± 0.12"),
-        (None, (None, None), "22.12"),
-        (0.0, None, "22.12 ± 0"),
-    ],
+    ("std", "interval", "expected"), [*TOLD, (0.1234, (None, None), "22.12 ± 0.12"), (None, (None, None), "22.12")]
 )
 def test_a_value_is_told_with_what_is_known_of_it(std, interval, expected):
     assert uncertainty.value_and_uncertainty_text(22.1234, std, interval) == expected
@@ -413,40 +396,26 @@ def test_several_series_add_and_rows_of_no_series_do_not_count():
     assert found.channel_chi2 == {"points.tip": pytest.approx(2.5), "points.other": pytest.approx(12.5)}
 
 
-@pytest.mark.parametrize(
-    ("tests", "said"),
-    [
-        ([(1.5, 0.009)], True),
-        ([(1.5, 0.01)], False),
-        ([(1.11, 1e-9)], True),
-        ([(1.1, 1e-9)], False),
-        ([(1.5, 0.004), (1.0, 0.5)], True),
-        ([(1.5, 0.006), (1.0, 0.5)], False),
-        ([(1.0, 0.5), (1.5, 0.006)], False),
-        ([(1.0, 0.5), (1.5, 0.003), (1.0, 0.6)], True),
-        ([(1.05, 1e-9), (1.2, 0.3)], True),
-        ([(1.05, 1e-9), (1.0, 0.3)], False),
-    ],
-)
+# chi2 per degree of freedom and p-value of several tests of one model
+MORE = [[(1.5, 0.009)], [(1.11, 1e-9)], [(1.5, 0.004), (1, 0.5)], [(1, 0.5), (1.5, 0.003), (1, 0.6)]]
+NOISE = [[(1.5, 0.01)], [(1.1, 1e-9)], [(1.5, 0.006), (1, 0.5)], [(1, 0.5), (1.5, 0.006)], [(1.05, 1e-9), (1, 0.3)]]
+CASES = [(tests, True) for tests in (*MORE, [(1.05, 1e-9), (1.2, 0.3)])] + [(tests, False) for tests in NOISE]
+
+
+@pytest.mark.parametrize(("tests", "said"), CASES)
 def test_more_than_noise_is_sure_among_all_tests_and_worth_a_word(tests, said):
     made = [NullTestResult(ratio, 10.0, p, {}, ()) for ratio, p in tests]
     assert residuals_exceed_noise(made) is said
 
 
-def test_a_residual_beside_other_errors_has_unit_covariance():
+def test_what_other_errors_did_is_whitened_and_the_rest_left_as_it_is():
     rng = np.random.default_rng(0)
     spread = rng.standard_normal((7, 3)) * [0.1, 3.0, 1e6]
     root = np.array([whiten_with_extra_errors(unit, spread) for unit in np.eye(7)])
     np.testing.assert_allclose(root @ (np.eye(7) + spread @ spread.T) @ root.T, np.eye(7), atol=1e-4)
-
-
-def test_what_no_other_error_could_have_done_is_left_as_it_is():
     spread = np.array([[2.0], [0.0], [0.0]])
     found = whiten_with_extra_errors(np.array([3.0, 5.0, -7.0]), spread)
     np.testing.assert_allclose(found, [3.0 / math.sqrt(5.0), 5.0, -7.0])
-
-
-def test_a_column_that_overflowed_says_nothing():
     spread = np.array([[2.0, math.inf], [0.0, 1.0]])
     np.testing.assert_allclose(whiten_with_extra_errors(np.array([3.0, 5.0]), spread), [3.0 / math.sqrt(5.0), 5.0])
     np.testing.assert_array_equal(whiten_with_extra_errors(np.array([3.0]), np.array([[math.nan]])), [3.0])
@@ -462,18 +431,11 @@ def with_p_values(*wanted: float) -> tuple[list, np.ndarray]:
     return [series(range(len(residual)), t)], np.array(residual)
 
 
-@pytest.mark.parametrize(
-    ("p_values", "flagged"),
-    [
-        ((0.008, 0.5, 0.6, 0.7), ()),
-        ((0.002, 0.5, 0.6, 0.7), (0,)),
-        ((0.6, 0.7, 0.5, 0.002), (3,)),
-        ((0.5, 0.0049, 0.6, 0.004), (1, 3)),
-        ((0.0074, 0.0049, 0.5, 0.007), (0, 1, 3)),
-        ((0.0099, 0.009, 0.0095, 0.0098), (0, 1, 2, 3)),
-        ((0.0049, 0.5, 0.6, 0.7), ()),
-    ],
-)
+FEW = [((0.008, 0.5, 0.6, 0.7), ()), ((0.0049, 0.5, 0.6, 0.7), ()), ((0.002, 0.5, 0.6, 0.7), (0,))]
+SOME = [((0.6, 0.7, 0.5, 0.002), (3,)), ((0.5, 0.0049, 0.6, 0.004), (1, 3)), ((0.0074, 0.0049, 0.5, 0.007), (0, 1, 3))]
+
+
+@pytest.mark.parametrize(("p_values", "flagged"), [*FEW, *SOME, ((0.0099, 0.009, 0.0095, 0.0098), (0, 1, 2, 3))])
 def test_windows_are_flagged_by_their_false_discovery_rate(p_values, flagged):
     found = run_null_test(*with_p_values(*p_values), 0, level=0.01).windows
     assert len(found) == 4
@@ -490,11 +452,8 @@ def test_columns_of_a_channel_share_windows_and_recordings_do_not():
     residual = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     parts = [series([0, 1]), series([2, 3]), series([4], recording="second"), series([5], channel="points.other")]
     found = run_null_test(parts, residual, 0).windows
-    assert [(w.recording, w.channel) for w in found] == [
-        ("run", "points.tip"),
-        ("second", "points.tip"),
-        ("run", "points.other"),
-    ]
+    places = [("run", "points.tip"), ("second", "points.tip"), ("run", "points.other")]
+    assert [(w.recording, w.channel) for w in found] == places
 
 
 def test_windows_are_as_long_as_wanted_and_reach_the_last_sample():

@@ -126,9 +126,8 @@ def test_steepest_descent_lowers_the_papers_cost_and_with_a_memory_returns_the_b
     solution = solve(problem, SteepestDescent(max_iterations=60, first_trial_step="spectral"))
     assert solution.history[-1].cost < 0.05 * solution.history[0].cost
     assert solution.parameters["T1.bend"].value == pytest.approx(22.0, rel=0.05)
-    solution = solve(
-        problem, SteepestDescent(first_trial_step="spectral", nonmonotone_memory=10, gradient_tolerance=1e-4)
-    )
+    patient = SteepestDescent(first_trial_step="spectral", nonmonotone_memory=10, gradient_tolerance=1e-4)
+    solution = solve(problem, patient)
     costs = [entry.cost for entry in solution.history]
     assert solution.status == Status.CONVERGED
     assert any(after > before for before, after in itertools.pairwise(costs))

@@ -48,9 +48,8 @@ def cable():
         return Recording(JointGroup(CLAMP, t, path, position_std=0.0), (group,), name="twin")
 
     def problem(values, position):
-        return EstimationProblem(
-            step, [recording(position)], tuple(TRUTH), ProblemOptions(path_cutoff=np.inf), dict(values)
-        )
+        options = ProblemOptions(path_cutoff=np.inf)
+        return EstimationProblem(step, [recording(position)], tuple(TRUTH), options, dict(values))
 
     true = problem(TRUTH, np.zeros((STEPS + 1, 3, 3)))
     [prediction] = true.evaluate(true.initial_unknowns, derivatives=False).episode_predictions
@@ -91,12 +90,8 @@ FINE, COARSE, DURATION = 12, 5, 3.0
 
 def arm_with_cable(links: int, mode: str) -> System:
     """A UR5 that carries 1 m of cable, bending alone."""
-    how = {
-        "bend": CABLE_TRUTH["cable.bend"],
-        "damping": CABLE_TRUTH["cable.damping"],
-        "stiffness_per_curvature": True,
-        "clamped_at_base": True,
-    }
+    how = {"stiffness_per_curvature": True, "clamped_at_base": True}
+    how |= {name: CABLE_TRUTH[f"cable.{name}"] for name in ("bend", "damping")}
     cable = flexible_object([Segment("cable", 1.0, 0.1, 0.006, links=links, joint_axes="xy", **how)], name="cable")
     robot = read_urdf("package:ur5", joints=list(JOINTS))
     parts = {"objects": [(cable, "tool0", None)], "point_frames": ("w_cable",), "damping": dict.fromkeys(JOINTS, 1.0)}
@@ -117,9 +112,8 @@ def coarse_recording():
 def solved(coarse_recording, links):
     step = compile_step(arm_with_cable(links, "prescribed"), 0.01)
     options = ProblemOptions(sensors={"joints.effort": SensorOptions(use=False)})
-    problem = EstimationProblem(
-        step, [coarse_recording], tuple(CABLE_TRUTH), options, {"cable.bend": 0.1, "cable.damping": 1e-3}
-    )
+    start = {"cable.bend": 0.1, "cable.damping": 1e-3}
+    problem = EstimationProblem(step, [coarse_recording], tuple(CABLE_TRUTH), options, start)
     return solve(problem, GaussNewton())
 
 

@@ -17,26 +17,12 @@ from yid_ocp.solvers import GaussNewton, base
 from yid_ocp.solvers.base import IterationRecorder, Solution, Status, projected_gradient_norm, solve
 from yid_ocp.solvers.gradient_methods import _PATIENCE_STEPS
 
-
-def test_a_solution_has_the_deviations_of_free_parameters():
-    problem = MadeUp(linear(np.eye(2), [-1.0, -2.0]), (4.0, 50.0), fixed=(7.0,))
-    solution = solve(problem, Steps([[1.0, 2.0]]))
-    assert solution.std == {"k1": pytest.approx(1.0), "k0": pytest.approx(1.0)}
+INSIDE = [((1, 1), (3, -4), 8.0), ((1, 1), (5, -1), 5.0)]
+LOW = [((0, 1), (5, -1), 2.0), ((0, 1), (-5, -1), 5.0), ((0, 2), (5, -9), 0.0), ((-0.1, 2.1), (5, -9), 0.0)]
+HIGH = [((1, 2), (1, -9), 1.0), ((1, 2), (1, 9), 18.0)]
 
 
-@pytest.mark.parametrize(
-    ("x", "gradient", "expected"),
-    [
-        ((1.0, 1.0), (3.0, -4.0), 8.0),
-        ((1.0, 1.0), (5.0, -1.0), 5.0),
-        ((0.0, 1.0), (5.0, -1.0), 2.0),
-        ((0.0, 1.0), (-5.0, -1.0), 5.0),
-        ((1.0, 2.0), (1.0, -9.0), 1.0),
-        ((1.0, 2.0), (1.0, 9.0), 18.0),
-        ((0.0, 2.0), (5.0, -9.0), 0.0),
-        ((-0.1, 2.1), (5.0, -9.0), 0.0),
-    ],
-)
+@pytest.mark.parametrize(("x", "gradient", "expected"), [*INSIDE, *LOW, *HIGH])
 def test_a_gradient_that_pushes_against_a_bound_does_not_count(x, gradient, expected):
     found = projected_gradient_norm(np.array(x), np.array(gradient), np.zeros(2), np.full(2, 2.0), np.array([1.0, 2.0]))
     assert found == expected
@@ -99,10 +85,13 @@ def test_a_poor_fit_is_started_again_from_multiples_of_the_start(chi2_at, tried,
     assert (solution.n_evaluations, solution.n_iterations) == (len(tried), len(tried) - 1)
 
 
-def test_a_poor_fit_is_left_alone_where_that_is_asked_for():
+def test_a_fit_is_left_alone_where_that_is_asked_for_or_the_cost_says_nothing_of_noise():
     solver = Steps()
     assert solve(MadeUp(misfit(lambda x: 9.0)), solver, restarts=False).message == "run 1"
     assert starts(solver) == [[1.0]]
+    solver = Steps()
+    assert solve(MadeUp(misfit(lambda x: 99.0), weighting="paper", noise=1.0), solver).message == "run 1"
+    assert len(solver.runs) == 1
 
 
 def test_a_failed_fit_is_started_again_and_loses():
@@ -114,26 +103,15 @@ def test_a_failed_fit_is_started_again_and_loses():
     assert solution.evaluation is not None
 
 
-@pytest.mark.parametrize(
-    ("bounds", "given", "tried"),
-    [
-        ({"upper": 3.0}, None, [1.0, 3.0, 2.0, 3.0]),
-        ({"lower": -5.0}, None, [1.0] * 4),
-        ({"upper": 3.0}, [0.5], [0.5, 2.0, 1.0, 3.0]),
-        ({"upper": 3.0}, [7.0], [3.0] * 4),
-    ],
-    ids=["bounds", "not positive", "a start of one's own", "beyond the bounds"],
-)
+UPPER = {"upper": 3.0}
+BOUNDED = [(UPPER, None, [1, 3, 2, 3]), (UPPER, [0.5], [0.5, 2, 1, 3]), (UPPER, [7.0], [3] * 4)]
+
+
+@pytest.mark.parametrize(("bounds", "given", "tried"), [*BOUNDED, ({"lower": -5.0}, None, [1] * 4)])
 def test_new_starts_stay_within_bounds_and_move_positive_unknowns_only(bounds, given, tried):
     solver = Steps()
     solve(MadeUp(misfit(lambda x: 9.0), (1.0,), **bounds), solver, given)
     assert starts(solver) == [[x] for x in tried]
-
-
-def test_the_papers_cost_says_nothing_of_noise_and_is_not_started_again():
-    solver = Steps()
-    assert solve(MadeUp(misfit(lambda x: 99.0), weighting="paper", noise=1.0), solver).message == "run 1"
-    assert len(solver.runs) == 1
 
 
 def test_a_fit_that_cannot_be_evaluated_has_failed():
@@ -149,11 +127,14 @@ def test_a_fit_that_cannot_be_evaluated_has_failed():
     assert len(solver.runs) == 2, "the paper's cost is started again as well where it failed"
 
 
-def test_the_end_is_evaluated_where_the_solver_found_its_equilibria():
+def test_the_end_is_evaluated_where_the_solver_found_its_equilibria_and_has_deviations():
     problem = MadeUp(misfit(lambda x: 1.0))
     solve(problem, Steps([[2.0]]))
     x, derivatives, warm = next(asked for asked in reversed(problem.asked) if asked[1])
     assert (x.tolist(), derivatives, warm) == ([2.0], True, "warm")
+    problem = MadeUp(linear(np.eye(2), [-1.0, -2.0]), (4.0, 50.0), fixed=(7.0,))
+    solution = solve(problem, Steps([[1.0, 2.0]]))
+    assert solution.std == {"k1": pytest.approx(1.0), "k0": pytest.approx(1.0)}
 
 
 def reaching(limit):
@@ -305,22 +286,15 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
         return f"{episode} falls" if episode == "b" else {"episode": episode}
 
     def known(ok):
-        plain = SimpleNamespace(
-            episodes=("a", "b"),
-            predictor=SimpleNamespace(predict_episode=run),
-            split=lambda x, i: (f"theta {'ab'[i]}", "offset"),
-            evaluate=lambda x, derivatives, warm: SimpleNamespace(
-                ok=ok, episode_predictions=("plain a", "plain b") if ok else ()
-            ),
-        )
+        found = SimpleNamespace(ok=ok, episode_predictions=("plain a", "plain b") if ok else ())
+        how = {"split": lambda x, i: (f"theta {'ab'[i]}", "offset"), "evaluate": lambda x, derivatives, warm: found}
+        plain = SimpleNamespace(episodes=("a", "b"), predictor=SimpleNamespace(predict_episode=run), **how)
         return SimpleNamespace(has_process_noise=True, problem_whitened_by_sensor_noise=lambda: plain)
 
     fitted = solve(MadeUp(misfit(lambda x: 1.0)), Steps())
     assert replace(fitted, evaluation=smoothed, problem=known(True)).episode_predictions == ("plain a", "plain b")
-    assert replace(fitted, evaluation=smoothed, problem=known(False)).episode_predictions == (
-        {"episode": "a"},
-        "b falls",
-    )
+    lost = replace(fitted, evaluation=smoothed, problem=known(False)).episode_predictions
+    assert lost == ({"episode": "a"}, "b falls")
     calm = SimpleNamespace(has_process_noise=False)
     assert replace(fitted, evaluation=smoothed, problem=calm).episode_predictions == ("smoothed a", "smoothed b")
     assert replace(fitted, evaluation=None, problem=calm).episode_predictions == ()
@@ -399,52 +373,37 @@ def test_a_short_step_beside_a_steep_row_is_no_end():
     assert found.status != Status.CONVERGED
 
 
-@pytest.mark.parametrize(
-    ("x", "residual", "expected"),
-    [
-        ((1.0, 1.0), (0.0, 0.0), True),
-        ((1.0, 1.0), (0.1, 0.0), True),
-        ((1.0, 1.0), (0.2, 0.0), False),
-        # pushed against its bound an unknown is at its end
-        ((0.0, 1.0), (5.0, 0.0), True),
-        ((0.0, 1.0), (-5.0, 0.0), False),
-        ((9.0, 1.0), (-5.0, 0.0), True),
-        ((9.0, 1.0), (5.0, 0.0), False),
-    ],
-)
-def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(x, residual, expected):
-    problem = MadeUp(lambda at, duration: (np.array(residual), np.eye(2)), (1.0, 1.0), upper=9.0, count=2)
-    assert is_stationary_point(problem, np.array(x), problem.evaluate(x)) is expected
+# pushed against its bound an unknown is at its end
+ENDS, NO_ENDS = [(1.0, 0.0), (1.0, 0.1), (0.0, 5.0), (9.0, -5.0)], [(1.0, 0.2), (0.0, -5.0), (9.0, 5.0)]
+
+
+@pytest.mark.parametrize(("at", "expected"), [*((at, True) for at in ENDS), *((at, False) for at in NO_ENDS)])
+def test_a_point_is_an_end_where_no_step_within_the_bounds_promises_much(at, expected):
+    x, residual = np.array([at[0], 1.0]), np.array([at[1], 0.0])
+    problem = MadeUp(lambda at, duration: (residual, np.eye(2)), (1.0, 1.0), upper=9.0, count=2)
+    assert is_stationary_point(problem, x, problem.evaluate(x)) is expected
 
 
 @pytest.mark.parametrize(
     ("size", "slope", "residual", "expected"),
     [
-        (100.0, [[0.01]], [-5.0], False),
-        (1.0, [[1e-3]], [-5.0], True),
-        (1e-3, [[10.0]], [-0.5], True),
-        (1.0, [[10.0]], [-0.5], False),
-        (1.0, [[1e-9]], [50.0], True),
-        (1.0, [[1.0], [0.0]], [1.0, 100.0], True),
+        *((100.0, [[0.01]], [-5.0], False), (1.0, [[10.0]], [-0.5], False)),
+        *((1.0, [[1e-3]], [-5.0], True), (1e-3, [[10.0]], [-0.5], True), (1.0, [[1e-9]], [50.0], True)),
+        (1.0, [[1.0], [0.0]], [1.0, 100.0], True),  # a small part of the cost
     ],
-    ids=["large", "not worth a large one", "small", "worth a large one", "not informed", "a small part of the cost"],
 )
 def test_no_step_longer_than_the_unknowns_size_counts(size, slope, residual, expected):
     problem = MadeUp(linear(slope, residual), lower=-np.inf, scales=(size,))
     assert is_stationary_point(problem, np.zeros(1), problem.evaluate([0.0])) is expected
 
 
-def test_without_unknowns_a_search_is_at_its_end():
-    none = MadeUp(linear(np.zeros((2, 0)), [3.0, 3.0]), ())
-    assert is_stationary_point(none, np.zeros(0), none.evaluate(np.zeros(0)))
-
-
-def test_the_promise_of_a_step_is_the_fall_of_a_linear_models_cost():
+def test_the_promise_of_a_step_is_the_fall_of_a_linear_models_cost_and_nothing_without_unknowns():
     jacobian, residual, step = np.array([[1.0, 2.0], [0.5, -1.0]]), np.array([3.0, -1.0]), np.array([0.2, -0.4])
     after = residual + jacobian @ step
-    assert predicted_cost_reduction(jacobian, residual, step) == pytest.approx(
-        0.5 * (residual @ residual - after @ after)
-    )
+    fall = 0.5 * (residual @ residual - after @ after)
+    assert predicted_cost_reduction(jacobian, residual, step) == pytest.approx(fall)
+    none = MadeUp(linear(np.zeros((2, 0)), [3.0, 3.0]), ())
+    assert is_stationary_point(none, np.zeros(0), none.evaluate(np.zeros(0)))
 
 
 def test_a_method_that_stops_short_has_not_converged_whatever_it_says():

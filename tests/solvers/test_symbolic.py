@@ -304,19 +304,10 @@ def chain(use_compiler=False, threshold=math.inf, ridge=None):
         "shared": _VectorBlock(np.array([[0]]), ("a",), "N m"),
         "chain[one]": _VectorBlock(states, ("x or y",)),
     }
-    return NonlinearProgram(
-        variables,
-        {"s": _VectorBlock(np.array([[COUNT]]), ("s",))},
-        (stages,),
-        (ResidualTerm(seen, between, weight, target, threshold), ResidualTerm(beside)),
-        np.full(SIZE, -np.inf),
-        np.full(SIZE, np.inf),
-        0.3 * rng.standard_normal(SIZE),
-        values,
-        ridge,
-        ca.MX.sym("w", SIZE),
-        ca.MX.sym("p", len(values)),
-    )
+    blocks = variables, {"s": _VectorBlock(np.array([[COUNT]]), ("s",))}
+    terms = (stages,), (ResidualTerm(seen, between, weight, target, threshold), ResidualTerm(beside))
+    numbers = np.full(SIZE, -np.inf), np.full(SIZE, np.inf), 0.3 * rng.standard_normal(SIZE), values
+    return NonlinearProgram(*blocks, *terms, *numbers, ridge, ca.MX.sym("w", SIZE), ca.MX.sym("p", len(values)))
 
 
 def at(program, *expressions, seed=1):
@@ -386,13 +377,9 @@ def test_what_is_added_must_fit():
 QUIET = {
     "ipopt": {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-12}},
     "sqpmethod": {
-        "qpsol": "qrqp",
-        "print_header": False,
-        "print_iteration": False,
-        "print_status": False,
-        "qpsol_options": {"print_iter": False, "print_header": False, "error_on_fail": False},
-        "tol_du": 1e-10,
-        "tol_pr": 1e-10,
+        **dict.fromkeys(("print_header", "print_iteration", "print_status"), False),
+        **{"qpsol": "qrqp", "tol_du": 1e-10, "tol_pr": 1e-10},
+        "qpsol_options": dict.fromkeys(("print_iter", "print_header", "error_on_fail"), False),
     },
 }
 
@@ -415,9 +402,6 @@ def test_any_plugin_finds_the_same_optimum_with_the_derivatives_it_is_given(plug
     given = curved(arguments["x0"], program.parameter_values, 1.0, np.zeros(program.g.numel()))
     dense = np.array(ca.densify(given[-1] if isinstance(given, tuple) else given))
     symbols = [program.w, program.p, program.lam_f, program.lam_g]
-    expected = np.array(
-        ca.densify(
-            ca.Function("h", symbols, [program.hessian(hessian)])(arguments["x0"], program.parameter_values, 1.0, 0.0)
-        )
-    )
+    function = ca.Function("h", symbols, [ca.densify(program.hessian(hessian))])
+    expected = np.array(function(arguments["x0"], program.parameter_values, 1.0, 0.0))
     np.testing.assert_allclose(np.triu(dense), np.triu(expected), rtol=0, atol=1e-12)
