@@ -64,15 +64,6 @@ def test_memory_of_the_process_that_starts_an_input_does_not_count(fuzz):
     assert fuzz.hunt(iter([fuzz.Case("csv", 0)]), 60.0, 1) == (1, [])
 
 
-def test_what_is_damaged_is_sound_before(fuzz, tmp_path, capsys):
-    fuzz.originals(tmp_path)
-    fuzz.checked(tmp_path)
-    assert capsys.readouterr().err == ""
-    for name in ("recording.h5", "table.csv", "bag"):
-        assert fuzz.read_any(tmp_path / name).joints.names == ("shoulder", "elbow")
-    assert len(fuzz.read_frames(tmp_path / "frames")) == 2
-
-
 def test_a_process_that_dies_is_said_and_the_others_go_on(fuzz):
     cases = iter([fuzz.Case("csv", 1), fuzz.Case("no such kind", 1), fuzz.Case("csv", 2)])
     count, found = fuzz.hunt(cases, 60.0, 1)

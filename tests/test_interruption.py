@@ -46,21 +46,20 @@ def ended(tmp_path, body, number, last=5.0):
     return process.returncode, out.strip(), folder.exists()
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_a_signal_is_raised_by_its_name(tmp_path, name):
+SWALLOWING = f"try:\n    {READY}\n    time.sleep(20)\nexcept BaseException:\n    pass\n"
+
+
+@pytest.mark.parametrize(
+    ("body", "name"),
+    [
+        *((f"{READY}\ntime.sleep(20)", name) for name in ("SIGINT", "SIGTERM", "SIGHUP")),
+        pytest.param(f"{SWALLOWING}time.sleep(20)", "SIGINT", id="swallowed, raised again"),
+        pytest.param(f"{SWALLOWING}interruption.raise_if_requested()\nprint('LOST')", "SIGTERM", id="looked for"),
+    ],
+)
+def test_a_signal_is_raised_by_its_name_also_where_it_was_swallowed(tmp_path, body, name):
     number = getattr(signal, name)
-    assert ended(tmp_path, f"{READY}\ntime.sleep(20)", number) == (128 + number, f"ENDED {name}", True)
-
-
-def test_what_was_swallowed_is_raised_again(tmp_path):
-    swallowing = f"try:\n    {READY}\n    time.sleep(20)\nexcept BaseException:\n    pass\ntime.sleep(20)"
-    assert ended(tmp_path, swallowing, signal.SIGINT) == (130, "ENDED SIGINT", True)
-
-
-def test_what_was_swallowed_is_raised_where_it_is_looked_for(tmp_path):
-    swallowing = f"try:\n    {READY}\n    time.sleep(20)\nexcept BaseException:\n    pass\n"
-    asking = "interruption.raise_if_requested()\nprint('LOST')"
-    assert ended(tmp_path, swallowing + asking, signal.SIGTERM) == (143, "ENDED SIGTERM", True)
+    assert ended(tmp_path, body, number) == (128 + number, f"ENDED {name}", True)
 
 
 def test_a_call_that_does_not_come_back_is_ended_by_force(tmp_path):

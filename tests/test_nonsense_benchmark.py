@@ -59,20 +59,20 @@ def test_a_wrong_recording_is_named(benchmark, step_of, tmp_path, config, name):
     assert entry["named"], entry
 
 
-@pytest.mark.parametrize("config", CONFIGS)
-def test_shipped_recordings_are_not_in_doubt(repository, step_of, config):
-    run = load_config(repository / "configs" / f"{config}.yaml")
+EXACT = [pytest.param(name, True, id=f"{name}, exact torques") for name in ("single_arm_vision", "dual_arm_vision")]
+
+
+@pytest.mark.parametrize(
+    ("config", "exact"), [*(pytest.param(*c.values, False, marks=c.marks) for c in CONFIGS), *EXACT]
+)
+def test_shipped_recordings_are_not_in_doubt(repository, step_of, clean, config, exact):
+    roles = ("estimate", "held_out") if exact else ()
+    files = [f"recordings.{role}=[{clean / config}_{role}.h5]" for role in roles]
+    run = load_config(repository / "configs" / f"{config}.yaml", files)
     files = [resolve_recording_path(path) for path in (*run.recordings.estimate, *run.recordings.held_out)]
     missing = [file for file in files if not file.is_file()]
     if missing:
         pytest.skip(f"its recordings are not here: {missing[0]}")
-    assert build_problem(run, step_of(config)).options.data_issues == ()
-
-
-@pytest.mark.parametrize("config", ["single_arm_vision", "dual_arm_vision"])
-def test_exact_torques_are_not_in_doubt(repository, step_of, clean, config):
-    files = [f"recordings.{role}=[{clean / config}_{role}.h5]" for role in ("estimate", "held_out")]
-    run = load_config(repository / "configs" / f"{config}.yaml", files)
     assert build_problem(run, step_of(config)).options.data_issues == ()
 
 

@@ -28,9 +28,6 @@ def test_a_line_and_a_table():
     table = "<table><tr><th>name</th><th>value</th></tr><tr><td>x &amp; y</td><td>1</td></tr></table>"
     assert thing._repr_html_() == f"<p><b>Thing</b>: a &lt; b</p>{table}"
     assert "<table>" not in Thing("alone", [("head",)])._repr_html_()
-
-
-def test_long_tables_are_cut():
     rows = [("name", "value"), *((f"r{i}", "") for i in range(_MAX_TABLE_ROWS + 5))]
     text = Thing("long", rows)._repr_html_()
     assert text.count("<tr>") == _MAX_TABLE_ROWS + 2
