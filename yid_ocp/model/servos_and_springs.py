@@ -14,7 +14,7 @@ from yid_ocp.model.mechanism import Joint, Mechanism
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
-CommandInterpolation = Literal["held", "interpolated"]
+_CommandInterpolation = Literal["held", "interpolated"]
 TORQUE_SATURATION_EXPONENT = 16  # p of a servo's smooth torque limit, demand / (1 + |demand/limit|^p)^(1/p)
 UNLIMITED_EFFORT_THRESHOLD = 2e4  # effort limits from this value on mean that there is none [N m or N]
 _DEFAULT_FULL_TORQUE_ERROR = 0.05  # at which a servo of unknown gain reaches its torque limit [rad or m]
@@ -24,12 +24,12 @@ _MAX_COMMAND_DELAY = 0.5  # [s]
 MOTOR_OFF_COMMAND = 1e6  # input of a servo whose motor is off; from half of it on there is no torque [rad or m]
 SERVO_GAIN_FACTOR = "servo_gain_factor"  # parameter by which a recording states the proportional gain of a firmware
 
-MotorKind = Literal["ideal", "dc"]
-MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]
+_MotorKind = Literal["ideal", "dc"]
+_MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]
 
 
 @dataclass(frozen=True)
-class MotorFrictionData:
+class _MotorFrictionData:
     """Constants at the output shaft, identified with one friction law; those of another do not go with them."""
 
     torque_constant: float  # kt [N m/A]
@@ -42,7 +42,7 @@ class MotorFrictionData:
 
 
 @dataclass(frozen=True)
-class DcMotorData:
+class _DcMotorData:
     """Published figures of a geared direct-current servo, starting values of what is estimated.
 
     From Duclusaud et al. (2024), Extended friction models for the physics simulation of servo actuators,
@@ -53,10 +53,10 @@ class DcMotorData:
     duty_per_gain: float  # duty per unit of the firmware's proportional gain and per error of the angle [1/rad]
     duty_limit: float  # largest duty [-]
     armature: float  # inertia of rotor and gear at the output shaft [kg m^2]
-    plain: MotorFrictionData  # with Coulomb and viscous friction
-    load_dependent: MotorFrictionData | None = None  # with friction that grows with the load, where published
+    plain: _MotorFrictionData  # with Coulomb and viscous friction
+    load_dependent: _MotorFrictionData | None = None  # with friction that grows with the load, where published
 
-    def servo_values(self, constants: MotorFrictionData) -> dict[str, float]:
+    def servo_values(self, constants: _MotorFrictionData) -> dict[str, float]:
         """Values of a servo's parameters by name: torque = kt/R (duty V - kt speed) [N m/rad, N m s/rad, N m]."""
         stall = constants.torque_constant * self.supply_voltage / constants.resistance
         drag = constants.torque_constant**2 / constants.resistance
@@ -64,8 +64,8 @@ class DcMotorData:
         return {"servo_gain": gain, "servo_damping": drag, "servo_torque_limit": limit}
 
 
-# supply, duty per gain, duty limit and armature; the two friction laws, each in the order of `MotorFrictionData`
-_MOTOR_FIGURES: Mapping[MotorPreset, tuple[tuple[float, ...], ...]] = {
+# supply, duty per gain, duty limit and armature; the two friction laws, each in the order of `_MotorFrictionData`
+_MOTOR_FIGURES: Mapping[_MotorPreset, tuple[tuple[float, ...], ...]] = {
     "xl330": (
         (7.4, 0.00288, 1.0, 0.00181),
         (0.387, 4.02, 0.0128, 0.00366),
@@ -88,8 +88,8 @@ _MOTOR_FIGURES: Mapping[MotorPreset, tuple[tuple[float, ...], ...]] = {
     ),
     "sts3215": ((7.4, 0.166, 0.97, 0.0284), (1.21, 2.68, 0.0524, 0.0591)),
 }
-MOTOR_PRESETS: Mapping[MotorPreset, DcMotorData] = {
-    name: DcMotorData(voltage, gain, limit, armature, *(MotorFrictionData(*law) for law in laws))
+MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = {
+    name: _DcMotorData(voltage, gain, limit, armature, *(_MotorFrictionData(*law) for law in laws))
     for name, ((voltage, gain, limit, armature), *laws) in _MOTOR_FIGURES.items()
 }
 """Motors of desk arms by preset; `STS3215` at 7.4 V."""
@@ -100,7 +100,7 @@ class MotorOptions:
     """What turns a servo's command into torque."""
 
     kind: Annotated[
-        MotorKind,
+        _MotorKind,
         OptionInfo(
             "ideal: torque = clip(gain error - damping speed); dc: torque = clip(gain error) - damping speed, where "
             "the clip is that of the duty and the damping is the motor's counter-voltage; gain is per unit of the "
@@ -108,7 +108,7 @@ class MotorOptions:
         ),
     ] = "ideal"
     preset: Annotated[
-        MotorPreset | None, OptionInfo("motor whose published figures are starting values and priors; of kind dc")
+        _MotorPreset | None, OptionInfo("motor whose published figures are starting values and priors; of kind dc")
     ] = None
 
     def __post_init__(self) -> None:
@@ -131,7 +131,7 @@ class PositionServoOptions:
     """How position servos process commands; gains and limits are parameters such as JOINT.servo_gain."""
 
     command_interpolation: Annotated[
-        CommandInterpolation,
+        _CommandInterpolation,
         OptionInfo("what a servo follows between two commands: the last one held, or straight lines"),
     ] = "held"
     has_gravity_compensation: Annotated[
@@ -156,8 +156,8 @@ class PositionServo:
     damping: ca.SX  # [N m s/rad or N s/m]
     command_delay: ca.SX  # [s]
     torque_limit_tightness: ca.SX  # [(N m)^-p]
-    command_interpolation: CommandInterpolation = "held"
-    motor_kind: MotorKind = "ideal"
+    command_interpolation: _CommandInterpolation = "held"
+    motor_kind: _MotorKind = "ideal"
 
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
         """The servo's torque for a command, a coordinate and its rate [N m or N]."""

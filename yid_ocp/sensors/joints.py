@@ -41,7 +41,7 @@ NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate a noise level: th
 
 
 @dataclass(frozen=True)
-class JointSensor(Sensor):
+class _JointSensor(Sensor):
     """A sensor of named joints with one output per joint and no points."""
 
     frame_names = point_names = ()
@@ -59,7 +59,7 @@ class JointSensor(Sensor):
 
 
 @dataclass(frozen=True)
-class PositionSensor(JointSensor):
+class PositionSensor(_JointSensor):
     """Encoders of named driven joints."""
 
     channel = _POSITION
@@ -71,7 +71,7 @@ class PositionSensor(JointSensor):
 
 
 @dataclass(frozen=True)
-class EffortSensor(JointSensor):
+class EffortSensor(_JointSensor):
     """Efforts of named prescribed joints, predicted by the discrete inverse dynamics."""
 
     channel = _EFFORT
@@ -87,7 +87,7 @@ class EffortSensor(JointSensor):
 
 
 @dataclass(frozen=True)
-class _MotorCurrentSensor(JointSensor):
+class _MotorCurrentSensor(_JointSensor):
     """Motor currents of named prescribed joints, current = joint effort / torque constant."""
 
     channel = _CURRENT
@@ -156,7 +156,7 @@ def _read_joint_efforts(around: SensorReadingContext) -> list[SensorData]:
 
 def smoothed_effort_data(
     around: SensorReadingContext,
-    sensor: JointSensor,
+    sensor: _JointSensor,
     t: Array,
     values: Array,
     std: Array,
