@@ -195,8 +195,7 @@ def test_patterns_of_columns(tmp_path: Path) -> None:
 
 
 def test_bad_lines_are_refused_or_skipped_and_counted(tmp_path: Path) -> None:
-    text = "t,q_a\n0,1\n1,fast\n2,3\n3,4,5\n4\n5,6\n6,7\n7,8\n"
-    path = table(tmp_path, text)
+    path = table(tmp_path, "t,q_a\n0,1\n1,fast\n2,3\n3,4,5\n4\n5,6\n6,7\n7,8\n")
     with pytest.raises(DataError, match="'fast'") as caught:
         read_csv(path)
     assert caught.value.where.endswith("line 3")

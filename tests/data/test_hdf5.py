@@ -84,8 +84,7 @@ def recordings(draw: st.DrawFn) -> Recording:
         std = st.none() | st.floats(0, 1e9) | hnp.arrays(float, shape[1], elements=st.floats(0, 1e9))
         kinds = st.sampled_from([None, "sample", "mean", "command"])
         own: dict[str, Any] = {"effort_std": draw(std), "effort_bias_std": draw(std), "effort_kind": draw(kinds)}
-        clocks = st.sampled_from(["recorded", "nominal"])
-        joints = JointGroup(joint_names, t, **channels, **own, clock=draw(clocks))
+        joints = JointGroup(joint_names, t, **channels, **own, clock=draw(st.sampled_from(["recorded", "nominal"])))
     suffixes = draw(st.sets(st.sampled_from(["", "_camera", "_arm", "_\u00e9 2"]), min_size=0 if joints else 1))
     points = []
     for suffix in sorted(suffixes):

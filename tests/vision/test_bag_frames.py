@@ -68,8 +68,7 @@ class Film(Bag):
         nothing = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
         region = self.of("sensor_msgs/msg/RegionOfInterest", **nothing)
         more = {"height": lens.height, "width": lens.width, "binning_x": 0, "binning_y": 0, "roi": region}
-        kind = "sensor_msgs/msg/CameraInfo"
-        self.at(topic, kind, 0.0, distortion_model=model or lens.model, **names, **more)
+        self.at(topic, "sensor_msgs/msg/CameraInfo", 0.0, distortion_model=model or lens.model, **names, **more)
 
 
 @pytest.mark.parametrize("big", [False, True])

@@ -66,8 +66,7 @@ def test_a_gap_is_empty_unless_something_hides_it():
     assert before.visibly_empty_fraction[0] == 0.0
     assert before.length_weighted_coverage(np.array([1.0, 0.0])) == 1.0
     assert before.covered_fraction[0] <= 0.5
-    left_out = asked(points, removed=lambda places: places[:, 0] < 0.0)
-    assert left_out.visibly_empty_fraction[0] == 0.0
+    assert asked(points, removed=lambda places: places[:, 0] < 0.0).visibly_empty_fraction[0] == 0.0
 
 
 @pytest.mark.parametrize("high", [0.2, 0.26, 0.36, 0.45])
@@ -95,8 +94,7 @@ def test_things_are_set_apart_and_contested_only_where_they_touch():
     assert not held.is_contested[points[:, 0] > 0.0].any()
     # on a wall all of it
     around = wall((-0.3, 0.3), (-0.2, 0.2), 1.985)
-    flat = asked(np.concatenate([tube(), around[np.abs(around[:, 1]) > RADIUS]]))
-    assert flat.covered_fraction.max() == 0.0
+    assert asked(np.concatenate([tube(), around[np.abs(around[:, 1]) > RADIUS]])).covered_fraction.max() == 0.0
 
 
 def test_points_on_a_swath_are_wider_than_the_tube():

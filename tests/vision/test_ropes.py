@@ -56,8 +56,7 @@ def seen(places, pose, rng, count=3500, noise=MILLIMETRE):
     index = rng.integers(1, len(places) - 1, count)
     centre, ahead = places[index], places[index + 1] - places[index - 1]
     ahead /= np.linalg.norm(ahead, axis=1)[:, None]
-    view = pose[:3, 3] - centre
-    across = np.cross(ahead, view)
+    across = np.cross(ahead, pose[:3, 3] - centre)
     across /= np.linalg.norm(across, axis=1)[:, None]
     angle = rng.uniform(-0.5 * np.pi, 0.5 * np.pi, count)[:, None]
     points = centre + RADIUS * (np.sin(angle) * across + np.cos(angle) * np.cross(across, ahead))

@@ -248,8 +248,7 @@ def _exchanged(names: Sequence[str], by_angle: Array, by_velocity: Array, fit: A
         if min(across) > 0.9:
             what = f"the angle of {names[i]} turns as the velocity of {names[j]} says, and the other way round"
             evidence, advice = min(across) / max(abs(fit[i]), abs(fit[j]), 1e-3), "exchange the two columns"
-            channel = f"position.{names[i]}"
-            yield Issue("swapped_joints", what, "not_trusted", evidence, advice, "", "joints", channel)
+            yield Issue("swapped_joints", what, "not_trusted", evidence, advice, "", "joints", f"position.{names[i]}")
 
 
 def _standstill(recording: Recording) -> Iterator[Issue]:

@@ -178,8 +178,7 @@ def tracked_states_and_points(
     velocity = np.asarray(CubicSpline(t, position, axis=0)(t, 1)) if len(t) > 1 else np.zeros_like(position)
     # a point is where it was at some time of the exposure, which is uniform over that
     std = np.hypot(std, np.abs(velocity) * math.hypot(options.stamp_std, options.exposure_time / math.sqrt(12.0)))
-    stamps = np.repeat([frames[k].stamp for k in good], len(of))
-    flat = position.reshape(-1, 3), velocity.reshape(-1, 3), stamps
+    flat = position.reshape(-1, 3), velocity.reshape(-1, 3), np.repeat([frames[k].stamp for k in good], len(of))
     shared = calibration.point_std_from_calibration(*flat).reshape(std.shape)
     std = np.hypot(std, shared)
     unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.max_point_std

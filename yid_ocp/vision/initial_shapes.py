@@ -147,8 +147,7 @@ def _slices(points: Array, graph: csr_matrix, slices: IntArray) -> tuple[Array, 
     size = np.bincount(owner, minlength=count)
     nodes = np.stack([np.bincount(owner, points[:, axis], minlength=count) for axis in range(3)], axis=1)
     pairs = np.column_stack([owner[links.row], owner[links.col]])[~same]
-    edges = np.unique(np.sort(pairs, axis=1), axis=0)
-    return nodes / size[:, None], edges.astype(np.int64)
+    return nodes / size[:, None], np.unique(np.sort(pairs, axis=1), axis=0).astype(np.int64)
 
 
 def _tree(nodes: Array, edges: IntArray, loop: float) -> tuple[IntArray, Array]:
@@ -306,8 +305,7 @@ class InitialShapeFinder:
         aim = courses[first.tip].direction(first.begin, first.end)
         carry = Rotation.align_vectors(aim, turned[first.joints[-1]][:, 2])[0].as_matrix()
         for link in self._links[1:]:
-            aim = carry.T @ courses[link.tip].direction(link.begin, link.end)
-            self._bend(q, link.joints, aim, turned)
+            self._bend(q, link.joints, carry.T @ courses[link.tip].direction(link.begin, link.end), turned)
         place = courses[first.tip].at(0.0)
         q[self._root[:3]] = place
         q[self._root[3:]] = Rotation.from_matrix(carry).as_euler("XYZ")

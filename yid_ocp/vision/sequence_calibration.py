@@ -51,8 +51,7 @@ class BackgroundPoints:
         """Whether points, shape (N, 3), lie within `match_distance + beyond` [m] of the background, shape (N,)."""
         if not len(self.points) or not len(points):
             return np.zeros(len(points), bool)
-        reach = self.match_distance + beyond
-        return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=reach)[0]))
+        return np.asarray(np.isfinite(self._tree.query(points, distance_upper_bound=self.match_distance + beyond)[0]))
 
     def merged_with(self, other: BackgroundPoints) -> BackgroundPoints:
         """Union of this background and another one."""

@@ -532,6 +532,5 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
         rng = np.random.default_rng([camera.seed, index])
         return lens.points_from_depth(camera.depth_camera._simulate_depth_image(depth, cosine, rng))
 
-    names = tuple(f"frame {i}" for i in range(len(taken)))
-    made = FrameSequence(stamps, names, pose, cloud, lens, "virtual camera")
+    made = FrameSequence(stamps, tuple(f"frame {i}" for i in range(len(taken))), pose, cloud, lens, "virtual camera")
     return VirtualFrames(made, taken, lambda at: np.asarray(course(at)))

@@ -437,8 +437,7 @@ class FrameTracker:
             place = np.array(options.approximate_root_position)
             near = min(found, key=lambda start: float(np.linalg.norm(start.root_position - place))).root_position
             found = [start for start in found if np.array_equal(start.root_position, near)]
-        own = cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter
-        work.filtered = rest = cloud.select(own)
+        work.filtered = rest = cloud.select(cKDTree(course.nodes).query(cloud.points)[0] < 2.0 * diameter)
         seen = rest.points, rest.point_weights, course.nodes, *given
         sights = [ProcessedFrameCloud(*seen, start.end_anchors) for start in found]
         return _Look(sights, self.shape_fitter.rest_configuration, [(start.q,) for start in found])
@@ -490,5 +489,4 @@ def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
 
 def _spread(indices: Sequence[int], most: int) -> tuple[int, ...]:
     """So many of the indices at most, evenly spread."""
-    count = min(len(indices), most)
-    return tuple(indices[int(k)] for k in np.linspace(0, len(indices) - 1, count).round())
+    return tuple(indices[int(k)] for k in np.linspace(0, len(indices) - 1, min(len(indices), most)).round())

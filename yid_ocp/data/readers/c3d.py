@@ -78,8 +78,7 @@ def _preview_c3d(path: str | os.PathLike[str]) -> base.FilePreview:
         note = "" if seen.all() else f"seen in {seen.mean():.0%} of the frames"
         sources.append(base.FileDataSourceSummary(name, "marker", int(seen.sum()), rate, f"point {name}", note))
     notes = [f"the file says that its unit is {found.unit}"] if found.unit else ["the file says no unit: --units mm?"]
-    options = {"points": {name: name for name in found.names}}
-    return base.FilePreview((*sources, *found.others), options, tuple(notes))
+    return base.FilePreview((*sources, *found.others), {"points": {name: name for name in found.names}}, tuple(notes))
 
 
 def _markers(path: Path) -> _Markers:
