@@ -51,15 +51,12 @@ def test_markers_of_a_file(tmp_path: Path) -> None:
     ]
 
 
-def test_markers_are_named_and_chosen(tmp_path: Path) -> None:
+def test_markers_are_named_and_chosen_and_keep_subjects_where_names_would_be_the_same(tmp_path: Path) -> None:
     write_c3d(tmp_path / "run.c3d")
     assert read_c3d(tmp_path / "run.c3d", points={"tip": "cable:100%"}).point_names == ("cable:100%",)
     with pytest.raises(DataError, match="no point 'tp'") as caught:
         read_c3d(tmp_path / "run.c3d", points={"tp": "a"})
     assert caught.value.hint == "did you mean 'tip'?"
-
-
-def test_subjects_stay_where_names_would_be_the_same(tmp_path: Path) -> None:
     write_c3d(tmp_path / "run.c3d", ("A:tip", "B:tip"), "m", 3)
     with pytest.raises(DataError, match="reaches 202 m"):
         read_c3d(tmp_path / "run.c3d")  # 200 m are millimetres whose unit the file says wrongly

@@ -317,9 +317,7 @@ def test_lengths_are_means_over_frames_and_medians_over_recordings() -> None:
     recordings = [stretched([1.0, 2.0, np.nan]), stretched([5.0]), stretched([3.0, 3.0])]
     assert median_point_pair_distances([("a", "b")], recordings) == {("a", "b"): 3.0}
     assert median_point_pair_distances([("a", "b")], recordings[:1], frames=1) == {("a", "b"): 1.0}
-
-
-def test_a_recording_that_never_shows_an_edge_does_not_count() -> None:
+    # one that never shows an edge does not count
     hidden, seen = stretched([np.nan]), stretched([2.0])
     assert median_point_pair_distances([("a", "b")], [hidden, seen]) == {("a", "b"): 2.0}
     with pytest.raises(DataError, match="edge a to b is never seen"):

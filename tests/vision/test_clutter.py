@@ -34,13 +34,9 @@ def test_things_in_reach_neither_drop_frames_nor_mislead(alone, things, junction
     assert np.mean(relative < 2) > 0.9
 
 
-@pytest.fixture(scope="module")
-def table():
-    """The Y behind a table."""
-    return filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])
-
-
-def test_messages_name_the_thing_and_what_helps(alone, table):
+def test_messages_name_the_thing_and_every_remedy_takes_it_away(alone):
+    """A background of frames or of an empty scene, and its mesh."""
+    table = filmed(SmoothY(), FRAMES, lambda k: [box(*TABLE)])
     found, _ = measured(alone, *table, filters=COARSE)
     thing = found.foreign_objects[0]
     assert thing.centre == pytest.approx([0.7, 0.5, -0.18], abs=0.15)
@@ -49,10 +45,6 @@ def test_messages_name_the_thing_and_what_helps(alone, table):
     assert thing.frames == FRAMES
     assert "track.options.background_estimation: frames" in thing.text
     assert thing.text in found.notes
-
-
-def test_every_remedy_takes_the_table_away(alone, table):
-    """A background of frames or of an empty scene, and its mesh."""
     clouds = [seen([*floor_and_wall(), box(*TABLE)], [9, k]) for k in range(2)]
     empty = FrameSequence.from_clouds([0.0, 1.0], clouds, look_at_pose(EYE, TARGET))
     mesh = ExtraMesh(box=TABLE[1], xyz=TABLE[0])
@@ -126,14 +118,10 @@ def test_extra_meshes_hang_on_links(system):
             extra_meshes_by_joint([wrong], tree)
 
 
-def test_colours_in_light_and_shade():
+def test_colours_in_light_and_shade_and_clouds_without_any(alone):
     red = [200, 40, 30]
     seen = np.array([[200, 40, 30], [100, 18, 13], [40, 200, 30], [120, 120, 120], [0, 0, 0]])
     assert has_wanted_colour(seen, [red], 0.2).tolist() == [True, True, False, False, False]
     assert has_wanted_colour(seen, [red, [128, 128, 128]], 0.2).tolist() == [True, True, False, True, True]
-
-
-def test_a_colour_mask_needs_colours(alone):
-    red = CloudFilterOptions(object_colours=((200.0, 40.0, 30.0),))
     with pytest.raises(DataError, match="no colours"):
-        measured(alone, *filmed(SmoothY(), 1), filters=red)
+        measured(alone, *filmed(SmoothY(), 1), filters=CloudFilterOptions(object_colours=((200.0, 40.0, 30.0),)))

@@ -97,13 +97,10 @@ def test_things_are_set_apart_and_contested_only_where_they_touch():
     assert asked(np.concatenate([tube(), around[np.abs(around[:, 1]) > RADIUS]])).covered_fraction.max() == 0.0
 
 
-def test_points_on_a_swath_are_wider_than_the_tube():
+def test_points_on_a_swath_are_wider_than_the_tube_and_tubes_are_slender():
     assert (asked(tube()).excess_variance < (0.1 * RADIUS) ** 2).all()
     blurred = asked(tube(wide=1.8))
     assert np.sqrt(blurred.excess_variance) == pytest.approx(RADIUS * np.sqrt((1.8**2 - 1) / 3), rel=0.15)
-
-
-def test_tubes_are_slender_and_walls_are_not():
     points = np.concatenate([tube(), wall((-0.3, 0.3), (0.3, 0.6), 2.0)])
     nodes = np.array([[-0.1, 0.0, 1.985], [0.1, 0.0, 1.985], [0.0, 0.45, 2.0]])
     thin, mine = tube_like_node_point_masks(ProcessedFrameCloud(points, np.ones(len(points)), nodes, CAMERA), RADIUS)

@@ -39,10 +39,8 @@ def test_noise_grows_with_the_square_of_distance(distance):
 
 
 def test_the_figures_at_two_metres():
-    fine, stepped = (
-        inner(camera._simulate_depth_image(*wall(2.0), np.random.default_rng(0)))
-        for camera in (replace(vision.DepthCamera(), disparity_step=0.0), vision.DepthCamera())
-    )
+    cameras = replace(vision.DepthCamera(), disparity_step=0.0), vision.DepthCamera()
+    fine, stepped = (inner(own._simulate_depth_image(*wall(2.0), np.random.default_rng(0))) for own in cameras)
     assert np.nanstd(fine) == pytest.approx(0.0058, rel=0.05)
     steps = np.unique(stepped)
     assert np.diff(steps[np.isfinite(steps)]).mean() == pytest.approx(0.0115, rel=0.1)

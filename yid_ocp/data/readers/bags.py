@@ -213,13 +213,10 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
         notes.append(f"{', '.join(sorted(shared))} have joints in common: choose one of them")
     elif len(states) > 1:
         options["joint_topics"] = states
-    if names:
-        options["points"] = names
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
         notes.append("poses have orientations: --pose-axes 0.1 keeps them as points 0.1 m along the axes")
     units, why = base.guess_units(_for_guess(bag))
-    if units:
-        options["units"] = units
+    options |= {key: found for key, found in (("points", names), ("units", units)) if found}
     return base.FilePreview(tuple(sources), options, (*notes, *why))
 
 
