@@ -184,8 +184,7 @@ def test_what_a_sensor_smooths_is_computed_or_weighed_by_settings_is_not_oversta
     assert causes(recording, joints_effort=SensorOptions(std=1.0)) == set()
     assert causes(recording, joints_effort=SensorOptions(use=False)) == set()
     assert causes(changed(recording, effort_kind="command")) == set()
-    exact = 5 * np.sin(recording.joints.t)[:, None] * np.ones(3)
-    assert causes(changed(recording, effort=exact)) == set()
+    assert causes(changed(recording, effort=5 * np.sin(recording.joints.t)[:, None] * np.ones(3))) == set()
 
 
 def test_a_camera_that_runs_longer_than_the_joints_at_both_ends_is_not_late():

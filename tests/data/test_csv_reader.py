@@ -163,11 +163,10 @@ def test_too_many_columns_and_a_line_without_end_are_refused_before_the_work(tmp
     [b"t,q_a\n", b"t\n1\n2\n", b"<!DOCTYPE html>\n<html>\n", b'{"t": [1], "q": 3}', b"PK\x03\x04\xff", b"sep=,\n"],
 )
 def test_a_preview_of_what_is_no_table_is_refused_as_reading_it_is(content: bytes, tmp_path: Path) -> None:
-    path = tmp_path / "run.csv"
-    path.write_bytes(content)
+    (tmp_path / "run.csv").write_bytes(content)
     for read in (read_csv, preview_file):
         with pytest.raises(DataError):
-            read(path)
+            read(tmp_path / "run.csv")
 
 
 # ------------------------------------------------------------------------------- no header, patterns, bad lines

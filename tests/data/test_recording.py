@@ -171,17 +171,11 @@ def test_invalid_recordings_are_refused(case: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=message) as caught:
         validate_recording(make())
     assert "recording '" in caught.value.where
+    assert case not in ("degrees", "millimetres") or case in caught.value.hint
     if case != "NaN effort":
         with pytest.raises(DataError, match=message):
             write_recording(make(), tmp_path / "run.h5")
         assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(("case", "word"), [("degrees", "degrees"), ("millimetres", "millimetres")])
-def test_wrong_units_are_guessed(case: str, word: str) -> None:
-    with pytest.raises(DataError) as caught:
-        validate_recording(INVALID[case][0]())
-    assert word in caught.value.hint
 
 
 def test_nan_effort_on_request() -> None:

@@ -61,8 +61,12 @@ class Film(Bag):
 
     def info(self, lens=LENS, topic="/camera/depth/camera_info", model=None):
         matrix = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1])
-        own = np.array([2 * lens.fx, 0, lens.cx, 0, 0, 2 * lens.fy, lens.cy, 0, 0, 0, 1, 0])
-        names = {"k": matrix, "d": np.array(lens.coefficients), "r": np.eye(3).ravel(), "p": own}
+        names = {
+            "k": matrix,
+            "d": np.array(lens.coefficients),
+            "r": np.eye(3).ravel(),
+            "p": np.array([2 * lens.fx, 0, lens.cx, 0, 0, 2 * lens.fy, lens.cy, 0, 0, 0, 1, 0]),
+        }
         if self.ros1:
             names = {key.upper(): value for key, value in names.items()}
         nothing = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}

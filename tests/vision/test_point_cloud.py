@@ -152,8 +152,7 @@ def test_too_little_gives_nothing_and_points_at_one_place_do_not_hang_it():
     assert len(extract_skeleton(few, np.random.default_rng(0)).nodes) == 0
     empty = extract_skeleton(WeightedCloud(np.empty((0, 3)), np.empty(0)), np.random.default_rng(0))
     assert len(empty.nodes) == len(empty.edges) == len(empty.node_of_point) == 0
-    cloud = WeightedCloud(np.zeros((500, 3)), np.ones(500))
-    found = extract_skeleton(cloud, np.random.default_rng(0))
+    found = extract_skeleton(WeightedCloud(np.zeros((500, 3)), np.ones(500)), np.random.default_rng(0))
     assert len(found.nodes) == 10
     assert found.has_skeleton_node.all()
     ring = WeightedCloud(

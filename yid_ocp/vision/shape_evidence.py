@@ -148,7 +148,7 @@ class ProcessedFrameCloud:
             return math.inf
         return max(float(np.median(self._point_tree.query(self.points, k=2)[0][:, 1])), 1e-4)
 
-    def is_hidden_or_filtered(self, places: Array, radius: Array, margin: float) -> BoolArray:
+    def _is_hidden_or_filtered(self, places: Array, radius: Array, margin: float) -> BoolArray:
         """Whether places are hidden from the camera or removed by filters, shape (S,)."""
         hidden = np.zeros(len(places), bool)
         if self.occlusion_map is not None:
@@ -268,7 +268,7 @@ def _coverage(
     share = (bare - first[on] + 0.5) / count[on]
     places = tubes.link_ends[on, 0] + share[:, None] * (tubes.link_ends[on, 1] - tubes.link_ends[on, 0])
     empty = np.zeros(len(filled), bool)
-    empty[bare] = ~seen.is_hidden_or_filtered(places, tubes.radius[on], gate)
+    empty[bare] = ~seen._is_hidden_or_filtered(places, tubes.radius[on], gate)
     return np.bincount(owner, filled) / count, np.bincount(owner, empty) / count
 
 
@@ -298,7 +298,7 @@ def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: fl
         return nothing
     filled = count > _FILLED * float(np.median(count[count > 0]))
     middles = tip + 0.5 * (edges[1:] + edges[:-1])[:, None] * axis
-    hidden = seen.is_hidden_or_filtered(middles, np.full(len(middles), radius), gate) & ~filled
+    hidden = seen._is_hidden_or_filtered(middles, np.full(len(middles), radius), gate) & ~filled
     score = np.concatenate([[0.0], np.cumsum(np.where(hidden, 0.0, np.where(filled, 0.5, -0.5)))])
     last = int(np.argmax(score))
     if last == 0 or last == len(count) or hidden[last]:
