@@ -167,10 +167,8 @@ class CompiledKernel:
             return [self._rolled_out(self._library, [member])[0] for member in members]
         found = self._rolled_out(known[0], members)
         # a batch knows simplified Newton only; what needs more, and what fails, is told by the kernel of one member
-        return [
-            rollout if rollout.status.is_converged else self._rolled_out(self._library, [member])[0]
-            for rollout, member in zip(found, members, strict=True)
-        ]
+        pairs = zip(found, members, strict=True)
+        return [out if out.status.is_converged else self._rolled_out(self._library, [one])[0] for out, one in pairs]
 
     def _rolled_out(self, library: ctypes.CDLL, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Rollouts by one call of the kernel of one member, or of a batch."""

@@ -74,9 +74,8 @@ def _optimization_flag() -> str:
     level = os.environ.get("YID_OCP_OPTIMIZE", "")
     if level not in ("", "0", "1", "2", "3"):
         what, where = f"there is no optimisation '{level}'", "the environment's variable YID_OCP_OPTIMIZE"
-        raise ConfigError(
-            what, where=where, allowed="0, 1, 2, 3", hint="unset it; 0 is for many short runs, as tests are"
-        )
+        hint = "unset it; 0 is for many short runs, as tests are"
+        raise ConfigError(what, where=where, allowed="0, 1, 2, 3", hint=hint)
     return f"-O{level}" if level else _OPTIMIZATION_FLAG
 
 
@@ -115,9 +114,8 @@ def _temporary_cache_folder(instead_of: Path) -> Path:
 
 def _is_mine_alone(info: os.stat_result) -> bool:
     """Whether a file or folder belongs to this user and nobody else can write to it."""
-    return not hasattr(os, "getuid") or (
-        info.st_uid == os.getuid() and not info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    )
+    is_shared = info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return not hasattr(os, "getuid") or (info.st_uid == os.getuid() and not is_shared)
 
 
 @functools.cache
@@ -232,9 +230,8 @@ def _said(command: list[str], patience: float) -> tuple[bool, str]:
     timer.daemon = True
     try:
         timer.start()
-        options: dict[str, Any] = {"capture_output": True, "text": True, "errors": "replace"}
-        options["stdin"] = subprocess.DEVNULL
-        run = subprocess.run(command, check=False, timeout=patience, **options)
+        options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "text": True, "errors": "replace"}
+        run = subprocess.run(command, check=False, timeout=patience, capture_output=True, **options)
     except subprocess.TimeoutExpired:
         _HUNG_COMPILERS.add(command[0])
         return False, f"it did not end within {patience:g} s"

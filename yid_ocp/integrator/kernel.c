@@ -766,13 +766,6 @@ static void scatter(const real *from, size_t rows, size_t own, size_t d, int ent
         for (size_t c = 0; c < own; c++) to[i * own + c] = SIMD_ENTRY(from[i * d + c], entry);
 }
 
-/* What a batch is given and carries from step to step; states are those of this node and of the two before. */
-typedef struct {
-    real *x[3], *theta, *gain, *reference, *nominal, *prescribed;
-    real time_step, tolerance, error;
-    mask running;
-} March;
-
 /* Rollouts of so many members at once, with forward sensitivities where there are directions. Members have their own
  * number of steps and their own directions, if any has some; what their feedback reads is the same. A batch leaves members
  * that do not get through by simplified Newton alone to whoever asked. */
@@ -789,7 +782,11 @@ int yid_rollout(int members, const Motion *motions, const Trajectory *outs, cons
                            apart * (2 * NX + M + 2 * NC) + BLOCK,
                        outcomes);
     if (!k) return OUT_OF_MEMORY;
-    March m;
+    struct {
+        real *x[3], *theta, *gain, *reference, *nominal, *prescribed; /* states of this node and of the two before */
+        real time_step, tolerance, error;
+        mask running;
+    } m;
     real *room = k->room;
     for (int i = 0; i < 3; i++, room += NX) m.x[i] = room;
     m.theta = room;

@@ -268,10 +268,9 @@ def _arrays(what: str, shapes: Mapping[str, tuple[int, ...]], value: float) -> d
 def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
     """The `InsufficientMemoryError` to raise when `size` bytes for `what` cannot be allocated."""
     amount = f"{size / 1e9:.3g} GB" if size >= 1e9 else f"{size / 1e6:.3g} MB"
-    return InsufficientMemoryError(
-        f"{_STATUS_MESSAGES[NewtonStatus.OUT_OF_MEMORY]} for {what}: it takes {amount}",
-        hint="estimate fewer parameters at once, use a shorter part of the recording, or close other programs",
-    )
+    said = f"{_STATUS_MESSAGES[NewtonStatus.OUT_OF_MEMORY]} for {what}: it takes {amount}"
+    hint = "estimate fewer parameters at once, use a shorter part of the recording, or close other programs"
+    return InsufficientMemoryError(said, hint=hint)
 
 
 def rollout_with_status(

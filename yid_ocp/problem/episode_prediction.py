@@ -146,11 +146,8 @@ class EpisodePredictor:
         """Whether no effect corrects the episode's inputs, times or tracked reference: none is free or non-neutral."""
         wanted = self.unknowns.free_parameters
         inputs = self.corrected_inputs(episode, theta, wanted)
-        pairs = (
-            (inputs.torque, episode.torque),
-            (inputs.prescribed_path, episode.prescribed_path),
-            (inputs.driven_angles, episode.measured_driven_angles),
-        )
+        true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
+        recorded = (episode.torque, episode.prescribed_path, episode.measured_driven_angles)
         slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
         if self._follows_momenta and self.model_functions.momentum_shift.is_active(theta, wanted):
             return False
@@ -158,7 +155,7 @@ class EpisodePredictor:
         for samples in episode.measurements:
             slopes += self._delay_in_steps(samples, theta, wanted) or ()
         moved = any(x is not None and np.any(x) for x in slopes)
-        return not moved and all(np.array_equal(a, b) for a, b in pairs)
+        return not moved and all(map(np.array_equal, true, recorded))
 
     @property
     def _follows_momenta(self) -> bool:

@@ -15,7 +15,6 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
-from yid_ocp.model.system import System
 from yid_ocp.problem.episode_prediction import EpisodePredictor, with_observed_equilibrium_and_loads
 from yid_ocp.problem.episodes import (
     Episode,
@@ -76,6 +75,9 @@ class EstimationProblem(ReprMixin):
 
     Attributes
     ----------
+    unknown_names, shared_parameters, local_parameters : tuple of str
+        All unknowns, local ones and initial states with their recording's name; free parameters with one value for all
+        recordings, and with one in each.
     theta : ndarray, shape (ntheta,)
         Initial values of free parameters and values of fixed ones.
     unknowns, residual_rows : UnknownVectorLayout, ResidualVectorLayout
@@ -109,10 +111,8 @@ class EstimationProblem(ReprMixin):
         names = (*free, *(name for name in may_free if name not in free))
         functions = ModelFunctions(step, names, options.start_fit_parameters)
         check_parameter_bounds(step.system, free, theta)
-        episodes, others = (
-            tuple(prepare_episode(functions, recording, options, theta) for recording in group)
-            for group in (recordings, held_out)
-        )
+        prepare = partial(prepare_episode, functions, options=options, theta=theta)
+        episodes, others = (tuple(map(prepare, group)) for group in (recordings, held_out))
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.with_fitted_initial_state(episode, theta) for episode in episodes)
         ready, other = (
@@ -137,12 +137,12 @@ class EstimationProblem(ReprMixin):
         self.held_out_whitening_filters = held_out_whitening_filters or (None,) * len(held_out)
         self.model_functions, self.options, self.free, self.theta = model_functions, options, free, theta
         self.episodes, self.held_out = episodes, held_out
-        self.unknowns = UnknownVectorLayout(
-            tuple(name for name in free if name not in options.local_parameters),
-            tuple(name for name in free if name in options.local_parameters),
-            estimated_initial_state_names(model_functions.step.system, options, free, theta),
-            tuple(episode.name for episode in episodes),
-        )
+        self.step, self.system = model_functions.step, model_functions.step.system
+        self.shared_parameters = tuple(name for name in free if name not in options.local_parameters)
+        self.local_parameters = tuple(name for name in free if name in options.local_parameters)
+        starts, names = estimated_initial_state_names(self.system, options, free, theta), (e.name for e in episodes)
+        self.unknowns = UnknownVectorLayout(self.shared_parameters, self.local_parameters, starts, tuple(names))
+        self.unknown_names = self.unknowns.unknown_names
         self.predictor = EpisodePredictor(model_functions, options, self.unknowns)
         inertia = partial(mass_matrix_diagonal_at_zero, model_functions.step, theta)
         self._prior_std = stated_prior_std(self.unknowns, options, model_functions.step.system, inertia)
@@ -170,31 +170,6 @@ class EstimationProblem(ReprMixin):
         return ReprSummary(f"{self.system.mechanism.name}, {free}, {seen} values of {used}, {held} held out", rows)
 
     # -- what it is made of -------------------------------------------------------------------------------------------
-
-    @property
-    def step(self) -> Step:
-        """The compiled step."""
-        return self.model_functions.step
-
-    @property
-    def system(self) -> System:
-        """The step's system."""
-        return self.model_functions.step.system
-
-    @property
-    def unknown_names(self) -> tuple[str, ...]:
-        """Names of all unknowns; local ones and initial states carry their recording's name."""
-        return self.unknowns.unknown_names
-
-    @property
-    def shared_parameters(self) -> tuple[str, ...]:
-        """Free parameters with one value for all recordings."""
-        return self.unknowns.shared_parameters
-
-    @property
-    def local_parameters(self) -> tuple[str, ...]:
-        """Free parameters with a value of their own in every recording."""
-        return self.unknowns.local_parameters
 
     @property
     def initial_unknowns(self) -> Array:
@@ -358,10 +333,8 @@ class EstimationProblem(ReprMixin):
         An `estimated` initial state is found from the first moments and its prior. Derivatives are by
         (free parameters, initial state offset), the initial state held.
         """
-        return [
-            (episode, self.predictor.predict_episode(episode, theta, offset, derivatives))
-            for episode, theta, offset in self.held_out_prediction_inputs(x)
-        ]
+        predict = self.predictor.predict_episode
+        return [(asked[0], predict(*asked, derivatives)) for asked in self.held_out_prediction_inputs(x)]
 
     def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
         """For each held-out recording: episode with fitted initial state, theta, and estimated initial state offset."""

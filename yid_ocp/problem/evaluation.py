@@ -100,10 +100,8 @@ def _sensor_whitened_residual(
 ) -> ResidualBlock:
     """Residual of one recording in units of the sensors' noise, group after group."""
     slopes = result.output_sensitivities or (None,) * len(measurements)
-    parts = [
-        samples.residual_block(predicted, by_unknowns, threshold)
-        for samples, predicted, by_unknowns in zip(measurements, result.predicted_outputs, slopes, strict=True)
-    ]
+    groups = zip(measurements, result.predicted_outputs, slopes, strict=True)
+    parts = [samples.residual_block(predicted, by_unknowns, threshold) for samples, predicted, by_unknowns in groups]
     jacobians = [part.jacobian for part in parts if part.jacobian is not None]
     return ResidualBlock(
         sum(part.cost for part in parts),
@@ -128,20 +126,13 @@ def whitened_episode_residual(
     if plain.jacobian is not None:
         columns = np.hstack([columns, plain.jacobian])
     if whitening is not None:
-        columns, by_constants = _innovations(whitening, columns, by_constants, result.torque_correction_and_sensitivity)
+        kept, push = columns.shape[1], result.torque_correction_and_sensitivity
+        # constant errors of sensors drive nothing
+        push = None if push is None else np.pad(push, ((0, 0), (0, 0), (0, by_constants.shape[1])))
+        innovations, _ = whitening.whiten(np.hstack([columns, by_constants]), push)
+        columns, by_constants = innovations[:, :kept], innovations[:, kept:]
     if by_constants.shape[1]:
         columns = whitened_by_constant_errors(by_constants, columns)
     cost, factor = huber_loss_and_residual_factors(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualBlock(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
-
-
-def _innovations(
-    whitening: ResidualWhitener, columns: Array, by_constants: Array, push: Array | None
-) -> tuple[Array, Array]:
-    """Columns and slopes by constant errors of sensors, which drive nothing, turned into innovations."""
-    kept, more = columns.shape[1], by_constants.shape[1]
-    if push is not None:
-        push = np.pad(push, ((0, 0), (0, 0), (0, more)))
-    made = whitening.whiten(np.hstack([columns, by_constants]), push)[0]
-    return made[:, :kept], made[:, kept:]

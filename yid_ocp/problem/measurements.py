@@ -17,11 +17,9 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError
 from yid_ocp.sensors import Sensor, SensorData
 
+# half an hour in steps of 10 ms; a clock in milliseconds or one that jumps asks for more
 _MAX_STEPS = 200_000
-"""Steps of a rollout: half an hour in steps of 10 ms; a clock in milliseconds or one that jumps asks for more."""
-
-_MAX_STEPS_PER_SAMPLE = 500
-"""Steps from one sample to the next, on average; a clock in milliseconds read as seconds asks for a thousand."""
+_MAX_STEPS_PER_SAMPLE = 500  # on average; a clock in milliseconds read as seconds asks for a thousand
 
 
 @dataclass(frozen=True)

@@ -43,10 +43,8 @@ class CorrectedInputs:
 
     def initial_known_coordinates_sensitivity(self, width: int) -> Array:
         """Derivative of `initial_known_coordinates` by the parameters, shape (nk, d)."""
-        parts = (
-            (self.driven_angles_sensitivity, self.driven_angles),
-            (self.prescribed_path_sensitivity, self.prescribed_path),
-        )
+        by_angles, by_path = self.driven_angles_sensitivity, self.prescribed_path_sensitivity
+        parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
 
     def corrected_feedback(

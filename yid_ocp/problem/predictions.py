@@ -191,11 +191,8 @@ def rmse_by_channel(results: Sequence[EpisodePrediction], episodes: Sequence[Epi
             for c, channel in enumerate(samples.sensor.channel_names):
                 squares.setdefault(channel, []).extend(square[np.isfinite(square[:, c]), c].tolist())
                 units[channel] = samples.sensor.unit
-    return {
-        channel: {"rmse": float(np.sqrt(np.mean(values))), "unit": units[channel], "n": len(values)}
-        for channel, values in squares.items()
-        if values
-    }
+    seen = ((channel, values) for channel, values in squares.items() if values)
+    return {name: {"rmse": float(np.sqrt(np.mean(x))), "unit": units[name], "n": len(x)} for name, x in seen}
 
 
 # -- synthetic recordings: a rollout at given parameters as sensors would record it ------------------------------------
