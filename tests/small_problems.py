@@ -81,6 +81,15 @@ def pendulum_step(folder, effects=(), **how):
     return compile_step(system.with_effects(made), H, use_compiler=False)
 
 
+def elbow(q):
+    """Where the elbow is: rods of 0.5 and 0.4 m hang at a height of 1.2 m and turn about x."""
+    return np.array([0.0, 0.5 * np.sin(q[0]), 1.2 - 0.5 * np.cos(q[0])])
+
+
+def tip(q):
+    return elbow(q) + 0.4 * np.array([0.0, np.sin(q[0] + q[1]), -np.cos(q[0] + q[1])])
+
+
 def taken(step, seed, *, efforts=True, camera=True, name=None, steps=STEPS):
     """A recording of something like a motion of the pendulum: smooth angles and efforts, points somewhere near."""
     rng = np.random.default_rng(seed)

@@ -128,8 +128,6 @@ def test_without_vectors_members_are_done_one_by_one(parts, urdf_folder, monkeyp
         assert_same(one, alone(case, member))
 
 
-# -- arithmetic --------------------------------------------------------------------------------------------------------
-
 DRIVER = """
 void yid_try(const double *in, double *out, int count) {
     for (int first = 0; first < count; first += SIMD_WIDTH) {

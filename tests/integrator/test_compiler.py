@@ -280,9 +280,6 @@ def test_a_function_that_cannot_be_compiled_is_as_it_was(cache, choose, monkeypa
     assert compiler.compiled_casadi_function(polynomial(3.0)).is_a("SXFunction")
 
 
-# -- functions at many points at once ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("use_compiler", [True, False], ids=["compiled", "interpreted"])
 def test_values_at_every_point(use_compiler):
     x, y = ca.SX.sym("x", 3), ca.SX.sym("y", 2)

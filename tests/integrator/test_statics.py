@@ -14,7 +14,7 @@ from yid_ocp.integrator.statics import (
     relaxed_internal_coordinates,
 )
 from yid_ocp.integrator.step import compile_step, compile_step_like, simulate
-from yid_ocp.model import Grasp, Segment, System, flexible_object, forward_kinematics
+from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.system import floating_clamp
@@ -31,21 +31,16 @@ def hung_cable(span: float):
     return EquilibriumSolver(compile_step(system, 0.01, use_compiler=False)), np.array([0.6 * span, 0, 0, 0, 0, 0])
 
 
-def height(system, frame, q) -> float:
-    kinematics = forward_kinematics(system.mechanism.with_numeric_values(), ca.SX(ca.DM(q)))
-    return float(kinematics.frame_position(frame)[2])
-
-
-def test_of_several_equilibria_the_one_of_least_energy():
+def test_of_several_equilibria_the_one_of_least_energy(parts):
     """The cable could also stand as an arch, and the search comes across that with the smaller imbalance."""
     statics, posture = hung_cable(0.95)
     system, theta = statics.step.system, statics.step.system.parameters.vector()
     rest = statics.solve(posture, theta)
     assert rest.is_converged, rest.message
-    assert height(system, "C_1_tip", rest.state[: system.n_coordinates]) < -0.05
+    assert parts.tip(system.mechanism, "C_1_tip", rest.state[: system.n_coordinates])[2, 3] < -0.05
 
 
-def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest():
+def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest(parts):
     statics, _ = hung_cable(0.95)
     system, theta = statics.step.system, statics.step.system.parameters.vector()
     # on the other side of where it begins, where Newton's iteration from the undeformed shape leads nowhere
@@ -53,7 +48,7 @@ def test_a_cable_held_far_from_its_undeformed_shape_hangs_at_rest():
     assert rest.is_converged, rest.message
     held = simulate(statics.step, theta, rest.state, 50).state[-1]
     np.testing.assert_allclose(held, rest.state, atol=1e-8)
-    assert height(system, "w_C", rest.state[: system.n_coordinates]) == pytest.approx(0.2)
+    assert parts.tip(system.mechanism, "w_C", rest.state[: system.n_coordinates])[2, 3] == pytest.approx(0.2)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import pytest
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import NewtonStatus
-from yid_ocp.model import Grasp, Parameters, Segment, StepTerms, System, flexible_object, forward_kinematics
+from yid_ocp.model import Grasp, Parameters, Segment, StepTerms, System, flexible_object
 from yid_ocp.model.mechanism import Inertia
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
@@ -23,11 +23,6 @@ BENT = np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1, 0.2, 0.3, 0.15])
 
 def numbers(expression) -> np.ndarray:
     return np.array(ca.DM(ca.densify(expression)))
-
-
-def pose(system, frame, q) -> np.ndarray:
-    mechanism = system.mechanism.with_numeric_values()
-    return numbers(forward_kinematics(mechanism, ca.SX(ca.DM(q))).frame_pose(frame).homogeneous_matrix())
 
 
 def smooth(time):
@@ -188,9 +183,9 @@ def test_grasps_hold_what_they_should(parts, roll, violation, kind):
     end = rollout.state[-1, : system.n_coordinates]
     assert np.max(np.abs(violation(step, end, theta))) < 1e-10
     grasp = system.grasps[0]
-    holder = pose(system, "clamp", end)
+    holder = parts.tip(system.mechanism, "clamp", end)
     wanted = holder[:3, :3] @ numbers(grasp.held_orientation)
-    held = pose(system, "w_C", end)
+    held = parts.tip(system.mechanism, "w_C", end)
     np.testing.assert_allclose(held[:3, 3], holder[:3, 3], atol=1e-9)
     aligned = np.allclose(held[:3, 2], wanted[:, 2], atol=1e-9)
     same = np.allclose(held[:3, :3], wanted, atol=1e-9)
@@ -203,7 +198,7 @@ def test_a_creeping_grasp_slides_along_the_object(parts, roll, violation):
     rollout = roll(step, theta, q, np.zeros(system.n_coordinates), 100)
     assert rollout.status.is_converged, rollout.status.message
     slip, end = rollout.state[-1, -1], rollout.state[-1, : system.n_coordinates]
-    held, holder = pose(system, "w_C", end), pose(system, "clamp", end)
+    held, holder = parts.tip(system.mechanism, "w_C", end), parts.tip(system.mechanism, "clamp", end)
     assert abs(slip) > 1e-4
     np.testing.assert_allclose(held[:3, 3] - slip * held[:3, 2], holder[:3, 3], atol=1e-9)
     assert system.parameters.vector()[-1] == 0.05

@@ -52,11 +52,13 @@ def test_rows_are_independent_whatever_of_a_sample_was_seen():
     np.testing.assert_allclose(back, pull[seen] @ made.residual_block(predicted, slopes).jacobian, rtol=1e-12)
 
 
-def arm(step, path, effort, angle=ANGLE, std=EFFORT, free=("shoulder.damping",), cutoff=CUTOFF):
+def arm(step, path, effort, angle=ANGLE, std=EFFORT, free=("shoulder.damping",), cutoff=CUTOFF, values=None, **joint):
     t = 0.01 * np.arange(len(path))
-    group = JointGroup(JOINTS, t, path, effort=effort, position_std=angle, effort_std=std, effort_kind="sample")
+    group = JointGroup(
+        JOINTS, t, path, effort=effort, position_std=angle, effort_std=std, **{"effort_kind": "sample"} | joint
+    )
     options = ProblemOptions(path_cutoff=cutoff, weak_prior_factor=0.0)
-    return EstimationProblem(step, [Recording(group, name="arm")], free, options)
+    return EstimationProblem(step, [Recording(group, name="arm")], free, options, values)
 
 
 def motion():
@@ -193,9 +195,8 @@ def efforts_of(urdf_folder):
     path = np.stack([0.6 * np.sin(2.9 * t), 0.5 * np.sin(3.7 * t + 1)], axis=1)
 
     def build(effort: np.ndarray, cutoff: float, kind: str | None = None, time_step: float = 0.01) -> EstimationProblem:
-        joints = JointGroup(JOINTS, t, path, effort=effort, position_std=0.0, effort_std=EFFORT_NOISE, effort_kind=kind)
-        options = ProblemOptions(path_cutoff=cutoff, weak_prior_factor=0.0)
-        return EstimationProblem(steps[time_step], [Recording(joints, name="arm")], tuple(DAMPING), options, DAMPING)
+        known = (tuple(DAMPING), cutoff, DAMPING)
+        return arm(steps[time_step], path, effort, 0.0, EFFORT_NOISE, *known, effort_kind=kind)
 
     return build
 

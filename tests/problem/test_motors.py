@@ -9,7 +9,6 @@ from small_problems import (
     PENDULUM,
     H,
     assert_slopes_are_those_of_differences,
-    assert_the_compiled_step_agrees,
     joints,
     pendulum_step,
     recording,
@@ -168,11 +167,3 @@ def test_friction_of_a_load_grows_with_what_hangs_and_pulls(urdf_folder) -> None
 def weight_at(e, system, q):
     slope = ca.gradient(e.rigid_body_terms.potential_energy, e.q0)
     return np.array(ca.Function("w", [e.q0, e.q1, e.theta], [slope])(q, q, system.parameters.vector(VALUES))).ravel()
-
-
-def test_the_compiled_step_agrees(urdf_folder) -> None:
-    effects = [(kind, "elbow", values) for kind, values in [*LADDER["load"], *LADDER["drive"]]]
-    slow, enabled = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=DC), np.ones((61, 2))
-    enabled[20:35] = 0.0
-    free = ["shoulder.servo_gain", "elbow.damping"]
-    assert_the_compiled_step_agrees(slow, lambda step: problem_of(step, swing(torque_enable=enabled), free))

@@ -183,9 +183,6 @@ def test_prediction_error_is_euclidean_and_leaves_out_given_frames_and_gaps():
 def test_what_cannot_be_predicted_is_said(recording, call, text):
     with pytest.raises(DataError, match=text):
         call(recording)
-
-
-def test_a_point_hidden_in_the_given_frame_is_said(recording):
     seen = recording.points[0].position.copy()
     seen[1, 2] = np.nan
     hidden = Recording(points=(PointGroup("points", NAMES, recording.points[0].t, seen),), name="hidden")

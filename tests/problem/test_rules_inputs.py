@@ -20,7 +20,6 @@ from yid_ocp.problem.recorded_inputs import (
     mean_step_inputs,
     prescribed_path,
     recorded_sensor_kinds,
-    smoothed_joint_angles,
     smoothed_joint_efforts,
 )
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
@@ -137,14 +136,6 @@ def test_nothing_driven_needs_no_torque_and_a_driven_joint_does():
         mean_step_inputs(driven([1.0, 2.0]), ("b",), TimeGrid(0.0, 0.1, 3), "run")
 
 
-def test_measured_angles_have_no_kinks_between_samples():
-    t = 0.1 * np.arange(8)
-    made = joints(["b", "a"], t, np.stack([np.zeros(8), cubic(t)], axis=1))
-    grid = TimeGrid(0.0, 0.025, 28)
-    found = smoothed_joint_angles(made, ("a",), grid, "run", LowPassFilter(math.inf))
-    np.testing.assert_allclose(found[:, 0], cubic(grid.node_times), rtol=1e-12)
-
-
 def test_loads_are_smoothed_and_interpolated():
     t = 0.01 * np.arange(200)
     effort = np.stack([np.ones(200), 3 * t + np.sin(2 * np.pi * 40 * t)], axis=1)
@@ -156,9 +147,6 @@ def test_loads_are_smoothed_and_interpolated():
     for without in (recording(joints(["a"], t, np.zeros((200, 1)))), pointed()):
         with pytest.raises(DataError, match="gears give way"):
             smoothed_joint_efforts(without, ("a",), grid, PLAIN)
-
-
-# -- what is there ----------------------------------------------------------------------------------------------------
 
 
 RECORDED = {
@@ -300,11 +288,9 @@ def test_an_uneven_clock_is_resampled_in_between():
     np.testing.assert_allclose(LowPassFilter(5.0)(t, line), line, atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    ("cutoff", "step", "stride"), [(5.0, 0.01, 10), (5.0, 0.02, 5), (10.0, 0.01, 5), (30.0, 0.05, 1), (7.0, 0.01, 7)]
-)
-def test_smoothed_values_tell_something_new_twice_a_period(cutoff, step, stride):
-    assert LowPassFilter(cutoff).decorrelation_stride(step) == stride
+def test_smoothed_values_tell_something_new_twice_a_period():
+    for cutoff, step, stride in ((5.0, 0.01, 10), (5.0, 0.02, 5), (10.0, 0.01, 5), (30.0, 0.05, 1), (7.0, 0.01, 7)):
+        assert LowPassFilter(cutoff).decorrelation_stride(step) == stride
 
 
 @pytest.mark.parametrize("cutoff", [2.0, 5.0])

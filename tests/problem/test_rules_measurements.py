@@ -21,9 +21,6 @@ from yid_ocp.sensors.base import SensorData
 NAN = math.nan
 
 
-# -- nodes in time ----------------------------------------------------------------------------------------------------
-
-
 def test_a_time_lies_between_two_nodes():
     times = [5.0, 5.05, 5.1, 5.1 + 5e-8, 5.1 - 5e-8, 5.1 + 5e-7, 5.275, 5.3, 5.4, 4.9]
     node, fraction = TimeGrid(5.0, 0.1, 3).node_and_fraction(times)
@@ -50,27 +47,14 @@ def test_without_joints_points_drive_the_clock_and_too_little_is_refused():
         make_time_grid(made, 0.3)
 
 
-# -- losses -----------------------------------------------------------------------------------------------------------
+def test_hubers_loss_is_square_first_and_then_straight():
+    residual = np.array([-1.0, 2.0, 3.0, -8.0, 0.0])
+    cost, factor = huber_loss_and_residual_factors(residual, 2.0)
+    assert cost == pytest.approx(0.5 + 2.0 + 2.0 * (3.0 - 1.0) + 2.0 * (8.0 - 1.0))
+    assert factor == pytest.approx([1.0, 1.0, math.sqrt(2 / 3), 0.5, 1.0])
+    for scale, cost, factor in ((math.inf, 0.5e12, 1.0), (0.0, 0.0, 0.0)):
+        assert huber_loss_and_residual_factors(np.array([1e6]), scale) == (pytest.approx(cost), pytest.approx([factor]))
 
-
-@pytest.mark.parametrize(
-    ("residual", "scale", "cost", "factor"),
-    [
-        (-1.0, 2.0, 0.5, 1.0),
-        (2.0, 2.0, 2.0, 1.0),
-        (3.0, 2.0, 2.0 * (3.0 - 1.0), math.sqrt(2 / 3)),
-        (-8.0, 2.0, 2.0 * (8.0 - 1.0), 0.5),
-        (1e6, math.inf, 0.5e12, 1.0),
-        (0.5, 0.0, 0.0, 0.0),
-    ],
-)
-def test_hubers_loss_is_square_first_and_then_straight(residual, scale, cost, factor):
-    found, weight = huber_loss_and_residual_factors(np.array([residual]), scale)
-    assert found == pytest.approx(cost)
-    assert weight == pytest.approx([factor])
-
-
-# -- rows of a residual -----------------------------------------------------------------------------------------------
 
 TWO = measured(efforts("a", "b"), [0, 1], [0.0, 0.0], [[1.0, NAN], [3.0, 4.0]], [[2.0, 0.0], [0.5, 10.0]])
 
@@ -102,9 +86,6 @@ def test_every_output_has_its_channel():
     assert TWO.output_channel_names == ("joints.effort.a", "joints.effort.b")
 
 
-# -- from a sensor ----------------------------------------------------------------------------------------------------
-
-
 def located(t, value, std, *span):
     data = SensorData(efforts("a"), np.array(t), np.array(value)[:, None], np.array(std)[:, None], *span)
     return locate_measurements_on_grid(data, TimeGrid(5.0, 0.1, 3), "run")
@@ -126,26 +107,13 @@ def test_a_noise_level_that_is_not_positive_is_refused_where_something_was_measu
     assert located([5.0, 5.1], [1.0, NAN], [0.5, std]).weight.tolist() == [[2.0], [0.0]]
 
 
-@pytest.mark.parametrize(
-    ("node", "fraction", "nearest", "weight"),
-    [
-        (0, 0.0, 0, 0.0),
-        (0, 0.49, 0, 0.0),
-        (0, 0.5, 1, 1.0),
-        (1, 0.49, 1, 1.0),
-        (1, 0.5, 2, 1.0),
-        (2, 0.9, 3, math.sqrt(2)),
-        (3, 0.0, 3, math.sqrt(2)),
-    ],
-)
-def test_the_papers_cost_counts_the_end_twice_and_the_start_not_at_all(node, fraction, nearest, weight):
-    made = measured(points("p"), [node], [fraction], [[1.0, NAN, 3.0]], weight=[[1e3, 0.0, 1e3]])
+def test_the_papers_cost_counts_the_end_twice_and_the_start_not_at_all():
+    node, fraction = [0, 0, 0, 1, 1, 2, 3], [0.0, 0.49, 0.5, 0.49, 0.5, 0.9, 0.0]
+    made = measured(points("p"), node, fraction, [[1.0, NAN, 3.0]] * 7, weight=[[1e3, 0.0, 1e3]] * 7)
     found = with_paper_weights(made, TimeGrid(0.0, 0.1, 3))
-    assert (found.node.tolist(), found.fraction.tolist()) == ([nearest], [0.0])
-    np.testing.assert_allclose(found.weight, [[weight, 0.0, weight]])
-
-
-# -- between nodes ----------------------------------------------------------------------------------------------------
+    assert (found.node.tolist(), found.fraction.tolist()) == ([0, 0, 1, 1, 2, 3, 3], [0.0] * 7)
+    weight = np.array([0.0, 0.0, 1.0, 1.0, 1.0, math.sqrt(2), math.sqrt(2)])
+    np.testing.assert_allclose(found.weight, np.stack([weight, 0 * weight, weight], axis=1))
 
 
 def test_predictions_are_interpolated_between_the_nodes_that_are_needed():
@@ -161,24 +129,6 @@ def test_a_sample_on_its_node_does_not_look_at_the_next_one():
     made = measured(efforts("a"), [2, 3], [0.0, 0.0], np.zeros((2, 1)))
     assert made.evaluation_nodes.tolist() == [2, 3]
     np.testing.assert_array_equal(made.interpolate_to_samples(np.array([[1.0], [NAN]])), [[1.0], [NAN]])
-
-
-@pytest.mark.parametrize("late", [None, (0.0, 1.3), (0.4, 2.0)])
-def test_distributing_is_the_transpose_of_interpolating(late):
-    made = measured(efforts("a", "b"), [4, 4, 6, 9], [0.0, 0.25, 0.5, 1.0], np.zeros((4, 2)), span=(0, 10))
-    made = made if late is None else made.shifted_earlier_by(np.array(late))
-    rng = np.random.default_rng(1)
-    count = len(made.evaluation_nodes)
-    at_nodes, at_samples = rng.standard_normal((count, 2)), rng.standard_normal((4, 2))
-    there, back = made.interpolate_to_samples(at_nodes), made.interpolation_adjoint(at_samples)
-    assert back.shape == (count, 2)
-    assert np.sum(there * at_samples) == pytest.approx(np.sum(at_nodes * back), rel=1e-12)
-    deep = rng.standard_normal((4, 2, 3))
-    whole, part = made.interpolation_adjoint(deep), made.interpolation_adjoint(deep[:, :, 1])
-    np.testing.assert_allclose(whole[:, :, 1], part, atol=1e-12)
-
-
-# -- late samples -----------------------------------------------------------------------------------------------------
 
 
 LATE = {

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from small_problems import PENDULUM, STEPS, H, pendulum_step, taken
 
-from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import truncate_episode
-from yid_ocp.problem.model_functions import CorrectedInputs
 
 MISREAD = (("encoder_offset", "shoulder", {"offset": 0.03}), ("effort_gain", "shoulder", {"scale": 0.9}))
 LATE = (("camera_latency", "camera", {"delay": 0.0137}), ("clock_scale", "clock", {"scale": 0.97}))
@@ -112,9 +110,6 @@ def test_what_is_freed_later_has_the_same_derivatives(urdf_folder):
     alone = none.evaluate(np.zeros(0))
     np.testing.assert_allclose(alone.residual, two.residual[data], atol=1e-9)
     assert alone.jacobian.shape == (len(alone.residual), 0)
-
-
-# -- values -----------------------------------------------------------------------------------------------------------
 
 
 def predicted(problem, values, group=0):
@@ -300,9 +295,6 @@ def test_a_filtered_arm_is_smooth_enough_to_be_differenced(urdf_folder):
     np.testing.assert_array_equal(smooth.measured_driven_angles, plain.measured_driven_angles)
 
 
-# -- the first part of an episode -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("case", ["driven, filtered", "prescribed gears", "estimated start"])
 def test_the_beginning_of_an_episode_is_predicted_as_in_the_whole(urdf_folder, case):
     problem = problem_of(urdf_folder, case, seeds=(1,))
@@ -320,26 +312,6 @@ def test_the_beginning_of_an_episode_is_predicted_as_in_the_whole(urdf_folder, c
         np.testing.assert_array_equal(samples.value, before.value[early])
         np.testing.assert_allclose(two.predicted_outputs[k], one.predicted_outputs[k][early], atol=1e-9)
     assert truncate_episode(whole, 99).grid.steps == STEPS
-
-
-# -- filters and efforts ----------------------------------------------------------------------------------------------
-
-
-def test_filters_follow_the_true_angles_and_momenta():
-    feedback = TrackingFeedback(np.array([0, 1, 4, 5]), np.ones((3, 2, 4)), np.zeros((3, 4)))
-    arm, measured = np.full((4, 2), [1.0, 2.0]), np.zeros((4, 2))
-    momentum = np.full((3, 2), [10.0, 20.0])
-    inputs = CorrectedInputs(np.zeros((3, 2)), np.zeros(2), np.zeros((4, 0)), arm)
-    assert inputs.corrected_feedback(feedback, (0, 1), measured) is feedback
-    assert inputs.corrected_feedback(None, (0, 1), measured) is None
-    turned = replace(inputs, driven_angles_sensitivity=np.zeros((4, 2, 1)))
-    angles = turned.corrected_feedback(feedback, (0, 1), measured)
-    np.testing.assert_array_equal(angles.reference, np.full((3, 4), [1.0, 2.0, 0.0, 0.0]))
-    momenta = replace(inputs, momentum_shift=momentum).corrected_feedback(feedback, (0, 1), measured)
-    np.testing.assert_array_equal(momenta.reference, np.full((3, 4), [0.0, 0.0, 10.0, 20.0]))
-    assert not feedback.reference.any()
-    swapped = turned.corrected_feedback(feedback, (1, 0), measured)
-    np.testing.assert_array_equal(swapped.reference[:, :2], np.full((3, 2), [2.0, 1.0]))
 
 
 @pytest.mark.parametrize(

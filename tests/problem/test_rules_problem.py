@@ -9,13 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.optimize
-from small_problems import PENDULUM, H, pendulum_step, recording, seen, taken
+from small_problems import PENDULUM, H, pendulum_step, recording, seen, taken, tip
 
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
-from yid_ocp.problem.episodes import _joint_mass_matrices, mass_matrix_diagonal_at_zero, truncate_episode
+from yid_ocp.problem.episodes import mass_matrix_diagonal_at_zero, truncate_episode
 from yid_ocp.problem.evaluation import ResidualVectorLayout
 from yid_ocp.problem.unknown_vector import (
     UnknownVectorLayout,
@@ -41,12 +41,6 @@ def make(free_step):
         return EstimationProblem(free_step, recordings, free, ProblemOptions(**options), values, held_out, may_free)
 
     return build
-
-
-def tip(q):
-    """Where the tip is: rods of 0.5 and 0.4 m hang at a height of 1.2 m and turn about x."""
-    one, both = q[0], q[0] + q[1]
-    return np.array([0.0, 0.5 * np.sin(one) + 0.4 * np.sin(both), 1.2 - 0.5 * np.cos(one) - 0.4 * np.cos(both)])
 
 
 # -- the unknown vector -----------------------------------------------------------------------------------------------
@@ -93,16 +87,6 @@ def test_start_bounds_and_values_by_name(make):
     found = problem.vector({"elbow.stiffness": 9.0, "shoulder.stiffness": -1.0, "start.q.elbow[run_1]": 0.5})
     changed = {"elbow.stiffness": 9.0, "shoulder.stiffness": 0.0, "start.q.elbow[run_1]": 0.5}
     assert problem.named_values(found) == {**START, **dict.fromkeys(problem.unknown_names[3:], 0.0), **changed}
-
-
-def test_joints_are_coupled_by_the_inertia_of_every_configuration(momentum, free_step):
-    theta = free_step.system.parameters.vector()
-    angles = np.array([[0.4, 0.2], [-1.1, 0.7], [2.0, -0.3]])
-    turned = np.eye(2)[::-1]
-    matrices = [np.column_stack([momentum(free_step, q[::-1], v, theta)[::-1] for v in turned]) for q in angles]
-    found = _joint_mass_matrices(free_step, theta, ("elbow", "shoulder"), angles)
-    np.testing.assert_allclose(found, matrices, rtol=1e-9)
-    assert found[0, 0, 1] == pytest.approx(found[0, 1, 0]) != found[1, 0, 1]
 
 
 # -- priors and scales ------------------------------------------------------------------------------------------------
@@ -347,9 +331,6 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
     assert make(held_out=held).held_out_prediction_inputs(np.array([6.0, 3.0, 0.1]))[0][2].shape == (0,)
 
 
-# -- other problems like it -------------------------------------------------------------------------------------------
-
-
 def test_problems_that_free_other_parameters_share_all_else(make):
     problem = make(may_free=("elbow.damping",), local_parameters=("elbow.rest",))
     other = problem.with_free_subset(("elbow.damping", "shoulder.stiffness"))
@@ -388,9 +369,6 @@ def test_problems_prepared_anew_keep_what_is_not_changed(make, held):
 def test_a_problem_cannot_be_changed_through_its_parameters(make):
     with pytest.raises(ValueError, match="read-only"):
         make().theta[0] = 1.0
-
-
-# -- what is refused --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

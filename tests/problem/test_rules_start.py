@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from scipy.spatial.transform import Rotation
-from small_problems import H, efforts, joints, measured, pendulum_step, points, recording, seen, taken
+from small_problems import H, efforts, elbow, joints, measured, pendulum_step, points, recording, seen, taken, tip
 
 from yid_ocp.errors import DataError, ModelError
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -25,15 +25,6 @@ from yid_ocp.sensors import sensor_reading_function
 from yid_ocp.sensors.points import PointSensor
 
 NAN = math.nan
-
-
-def tip(q):
-    one, both = q[0], q[0] + q[1]
-    return np.array([0.0, 0.5 * np.sin(one) + 0.4 * np.sin(both), 1.2 - 0.5 * np.cos(one) - 0.4 * np.cos(both)])
-
-
-def elbow(q):
-    return np.array([0.0, 0.5 * np.sin(q[0]), 1.2 - 0.5 * np.cos(q[0])])
 
 
 @pytest.fixture(scope="module")
@@ -57,9 +48,6 @@ def solved(step, samples, window=0.02, posture=(), path=None, **values):
 
 def momentum_at(step, momentum, q, v):
     return momentum(step, np.asarray(q), np.asarray(v), step.system.parameters.vector())
-
-
-# -- the configuration ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("std", "soft"), [(0.2, 1.0), (1.0, 1.0), (1.0, 0.1)])
@@ -93,9 +81,6 @@ def test_a_joint_without_a_spring_is_held_a_little(urdf_folder):
     hidden = measured(points("lower"), [0], [0.0], [elbow([0.3, 0.0])], np.full((1, 3), 1e3))
     found = solved(loose, [hidden], posture=[0.7])
     np.testing.assert_allclose(found.state[:2], [0.3, 0.7], atol=1e-4)
-
-
-# -- the velocity -----------------------------------------------------------------------------------------------------
 
 
 def test_two_frames_give_a_velocity_and_the_start_before_the_first(step, momentum):
@@ -154,9 +139,6 @@ def test_other_sensors_say_nothing_of_a_start_and_some_point_must(step):
         solved(step, [effort, at(3, q)])
 
 
-# -- parameters that are fitted along ---------------------------------------------------------------------------------
-
-
 TURN = "camera_rotation@camera.rx"
 
 
@@ -176,9 +158,6 @@ def test_parameters_are_fitted_along_with_the_start(urdf_folder):
         found = fitter.fit_to_points(np.zeros(0), [here, camera], theta, 0.02, np.zeros((30, 0)))
         assert found.fitted_parameters[TURN] == pytest.approx(turn, abs=1e-4)
         np.testing.assert_allclose(found.state[:2], q, atol=1e-4)
-
-
-# -- in a problem -----------------------------------------------------------------------------------------------------
 
 
 def swung(step, seed=4, std=0.02):
@@ -260,9 +239,6 @@ def test_a_start_at_rest_that_does_not_exist_is_said(step):
     assert not start.equilibrium.is_converged
 
 
-# -- how fast it starts -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("value", "span", "speed"),
     [
@@ -278,9 +254,6 @@ def test_the_speed_of_a_start_is_that_of_points_seen_in_both_frames(value, span,
     other = measured(points("a", "b"), [0, 1], [0.0, 0.0], np.full((2, 6), 9.0))
     assert _speed([(made, 0)], [(made, 1), (other, 1)], span) == pytest.approx(speed)
     assert _speed([(made, 0)], [(other, 1)], span) == 0.0
-
-
-# -- errors of predictions --------------------------------------------------------------------------------------------
 
 
 def test_errors_are_euclidean_for_points_and_plain_for_efforts():

@@ -79,11 +79,6 @@ def test_the_torque_is_that_of_a_spring_and_a_damper_within_a_limit(step, demand
     assert found[1] == 0.0
 
 
-def test_a_clip_is_what_the_limit_is_away_from_its_corner() -> None:
-    for ratio, most in ((0.5, 1e-3), (0.9, 0.012), (1.0, 0.045), (1.1, 0.013)):
-        assert abs(saturated(ratio, 1.0) - min(ratio, 1.0)) < most
-
-
 def test_it_rests_where_its_servos_balance_the_weight(step) -> None:
     theta, command = step.system.parameters.vector(VALUES), np.array([0.4, -0.3])
     rest = EquilibriumSolver(step).solve(command, theta, command)

@@ -150,20 +150,3 @@ def test_mass_matrix_gravity_and_inverse_dynamics(twin):
         close(kinetic, energy, abs(energy))
         height = pin.computePotentialEnergy(twin.model, data, at)
         close(potential, height, abs(height))
-
-
-@pytest.mark.parametrize("file", ["mixed_joints.urdf", "turntable.urdf"])
-def test_second_derivatives_against_automatic_differentiation(urdf_folder, file):
-    mechanism = read_urdf(urdf_folder / file).with_numeric_values()
-    n = len(mechanism.joints)
-    q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
-    rigid = rigid_body_lagrangian_derivatives(forward_kinematics(mechanism, q), v, ca.SX(ca.DM(GRAVITY)))
-    lagrangian = rigid.kinetic_energy - rigid.potential_energy
-    by_q, by_v = ca.gradient(lagrangian, q), ca.gradient(lagrangian, v)
-    expected = [by_q, by_v, ca.jacobian(by_q, q), ca.jacobian(by_q, v), ca.jacobian(by_v, v)]
-    actual = [rigid.lagrangian_by_q, rigid.lagrangian_by_v, *lagrangian_second_derivatives(rigid, mechanism)]
-    difference = ca.Function("difference", [q, v], [ca.densify(a - e) for a, e in zip(actual, expected, strict=True)])
-    rng = np.random.default_rng(3)
-    for _ in range(5):
-        for entry in difference.call([rng.uniform(-1, 1, n), rng.normal(size=n)]):
-            close(np.array(entry), 0.0)
