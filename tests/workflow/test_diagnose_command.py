@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
+from small_problems import pendulum_step
 
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -18,10 +19,6 @@ from yid_ocp.diagnosis import StoredFit
 from yid_ocp.diagnosis.refit import REFIT_SOLVER
 from yid_ocp.errors import ConfigError
 from yid_ocp.inference.whitening import estimate_recording_torque_biases, problem_whitened_at
-from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import System
-from yid_ocp.model.servos_and_springs import RobotJointSpring
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.progress import Progress
 from yid_ocp.workflow.diagnose import JsonRefitStore, _with_noise_only_stds, run_diagnose
@@ -179,10 +176,7 @@ PRESCRIBED = {
 @pytest.fixture(scope="module")
 def problem_of(urdf_folder):
     """problem_of(role, sensors, ...): a pendulum whose shoulder is driven or prescribed, seen by its tip."""
-    robot, springs = read_urdf(urdf_folder / "double_pendulum.urdf"), {"elbow": RobotJointSpring(3.0, 0.1)}
-    more = {"springs": springs, "damping": 0.1, "point_frames": ["tip"]}
-    systems = {role: System.build(robot, **{role: ["shoulder"]}, **more) for role in ("driven", "prescribed")}
-    steps = {role: compile_step(system, 0.01, use_compiler=False) for role, system in systems.items()}
+    steps = {role: pendulum_step(urdf_folder, **{role: ("shoulder",)}) for role in ("driven", "prescribed")}
 
     def build(role, sensors=STATED, position_std=1e-3, **changed):
         t = 0.01 * np.arange(41)

@@ -8,16 +8,13 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
+from small_problems import pendulum_step
 
 from yid_ocp.data import read_recording, write_recording
 from yid_ocp.data.recording import JointGroup, Recording
 from yid_ocp.diagnosis.events import NO_EVENTS
 from yid_ocp.errors import OutputError
 from yid_ocp.inference.whitening import problem_whitened_at, problem_without_input_errors
-from yid_ocp.integrator.step import compile_step
-from yid_ocp.model import System
-from yid_ocp.model.servos_and_springs import RobotJointSpring
-from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.report.summaries import _noise_words
@@ -95,9 +92,7 @@ STEPS, OFFSET, WHITE, ANGLE = 200, 0.2, 0.05, 1e-4
 
 @pytest.fixture(scope="module")
 def step(urdf_folder):
-    tree = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(tree, driven=("shoulder",), springs={"elbow": RobotJointSpring(3.0)}, damping=0.2)
-    return compile_step(system, 0.01, use_compiler=False)
+    return pendulum_step(urdf_folder, driven=("shoulder",))
 
 
 def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
