@@ -34,10 +34,7 @@ _EXTRAPOLATION_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class DiscretisationEstimateShift:
-    """Shift of one estimate with every link divided in two, and with half the time step, in its own unit.
-
-    None where not tried or where the finer model could not be rolled out.
-    """
+    """Shift of one estimate with links divided in two, and half the time step, in its unit; None where not tried."""
 
     links: float | None = None
     time_step: float | None = None
@@ -336,10 +333,7 @@ def _alternating_mode_magnitude(
 
 
 def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
-    """The largest error growth among a problem's recordings, at unknowns x (nx,); None where none has an initial state.
-
-    Of a failed rollout it is that along the part before the failure.
-    """
+    """Largest error growth of all recordings at unknowns x (nx,), up to a failed step; None where none has a start."""
     predictor, system = problem.predictor, problem.system
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)

@@ -55,10 +55,7 @@ def motion_kinds(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
 def fit_friction_law(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> FrictionLawFit:
-    """Errors of a law on every kind of motion left out in turn, each fit begun at the fit to all recordings.
-
-    The `solution` is that of `problem`, which is on all recordings, with the law in its model.
-    """
+    """Errors of a law, with its `solution` on all recordings of `problem`, on every kind of motion left out in turn."""
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
@@ -90,8 +87,7 @@ def mean_and_standard_error(errors: Mapping[str, float], kinds: Mapping[str, Seq
 def warranted_law(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
     """The first law of the ladder whose error is within one standard error of the least one's.
 
-    Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, section 7.10,
-    doi:10.1007/978-0-387-84858-7.
+    Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, 7.10, doi:10.1007/978-0-387-84858-7.
     """
     sizes = [mean_and_standard_error(fit.left_out_errors, kinds) for fit in fits]
     least, error = min((size for size in sizes if np.isfinite(size[0])), default=(np.inf, np.inf))

@@ -275,10 +275,7 @@ def check_point_distances(
 
 
 def check_object_points_by_rollout(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
-    """Issues of object points that disagree grossly with a rollout at the parameters' initial values.
-
-    Gross errors, such as a mirror image, show even where the stiffnesses are wrong. `size` is that of the object [m].
-    """
+    """Issues of points grossly off a rollout at the parameters' initial values, beside the object's `size` [m]."""
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names
         if not names or not size > 0:

@@ -76,10 +76,7 @@ def linearise_and_check(step: Step, state: Array, torque: Array, theta: Array, p
 def linearise_step_equations(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepEquationLinearizations:
-    """Linearised equations of the step that starts at a state (nx,), with derivatives by all parameters.
-
-    The torque (nu,) is in N m; `path` (nc,) are the prescribed coordinates, before and after the step.
-    """
+    """Linearised equations of the step from a state (nx,), torque (nu,) [N m] and path (nc,), by all parameters too."""
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])

@@ -150,10 +150,7 @@ def what_if(
 def evaluate_change_sets(
     setting: RecordedExperiment, sets: Sequence[Sequence[str]], inflation: float
 ) -> list[ChangedExperimentResult]:
-    """Predicted results of an experiment with each of several sets of changes, given by name.
-
-    `inflation` is the factor by which variances are larger than stated.
-    """
+    """Predicted results with each of several sets of changes by name, variances `inflation` times what is stated."""
     outcomes = _Outcomes(setting, inflation)
     known = {change.name: change for change in outcomes.possible}
     return outcomes.of_all([[known[name] for name in names] for names in sets])

@@ -328,10 +328,7 @@ def select_and_smooth_unknowns(
     evaluation: Evaluation,
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
 ) -> SmootherResult:
-    """Choose the groups of unknowns with the largest evidence at a whitened problem's fit `x` and estimate them.
-
-    The evaluation is that at `x`, with its Jacobian.
-    """
+    """Choose the groups of unknowns with the largest evidence at a whitened problem's fit `x`, and estimate them."""
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
         models = linear_residual_models(problem, x, evaluation, limits)
