@@ -47,7 +47,7 @@ def outliers(found):
     return [entry.run_name for entry in found.run_consistencies if entry.is_outlier]
 
 
-def test_two_runs_together_are_their_weighted_mean_with_whole_covariances():
+def test_two_runs_together_are_their_weighted_mean_also_without_full_rank():
     other = np.array([[1.0, -0.3], [-0.3, 2.0]]) * 1e-4
     first, second = run("x", [1.0, 2.0]), run("y", [1.003, 2.002], other)
     mean, chi2, degrees = pool_estimates([first, second])
@@ -58,6 +58,10 @@ def test_two_runs_together_are_their_weighted_mean_with_whole_covariances():
     assert mean.covariance == pytest.approx(sum_of, rel=1e-8)
     assert chi2 == pytest.approx(apart @ np.linalg.solve(COVARIANCE + other, apart), rel=1e-8)
     assert degrees == 2
+    flat = np.array([[1.0, 1.0], [1.0, 1.0]]) * np.outer([1e-3, 1e4], [1e-3, 1e4])
+    found = nearby_positive_definite_covariance(flat)
+    assert np.sqrt(np.diag(found)) == pytest.approx([1e-3, 1e4], rel=1e-9)
+    assert np.all(np.isfinite(np.linalg.cholesky(found)))
 
 
 def test_runs_that_differ_widen_the_mean_and_a_parameter_counts_where_it_is():
@@ -98,13 +102,6 @@ def test_a_steady_drift_and_two_runs_that_differ_make_no_outlier():
     found = assess_drift([run("x", [1.0, 2.0]), run("y", [2.0, 2.0])])
     assert drifted(found) == ["a"]
     assert outliers(found) == []
-
-
-def test_a_covariance_without_full_rank_can_be_inverted_and_keeps_its_standard_deviations():
-    flat = np.array([[1.0, 1.0], [1.0, 1.0]]) * np.outer([1e-3, 1e4], [1e-3, 1e4])
-    found = nearby_positive_definite_covariance(flat)
-    assert np.sqrt(np.diag(found)) == pytest.approx([1e-3, 1e4], rel=1e-9)
-    assert np.all(np.isfinite(np.linalg.cholesky(found)))
 
 
 KINDS = {"a": ("a_1", "a_2"), "b": ("b_1",), "c": ("c_1",)}
