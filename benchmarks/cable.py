@@ -6,7 +6,7 @@ Free vertices are all but the two held at each end. A prediction knows the held 
 the first two frames; its error is the root mean square Euclidean distance over free vertices and later frames. Values
 are per unit weight: the linear density is nominal, as no force was measured. `nominal` and `undeformed rest` are the
 model with the measured undeformed shape as its rest shape, at guessed and at fitted stiffness and damping; for
-`with_fitted_initial_state` the rest shape was estimated as well.
+`episode_with_fitted_initial_state` the rest shape was estimated as well.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 import yid_ocp as yid
-from yid_ocp.data.channel_checks import median_point_pair_distances
+from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.model.objects.base import CableTopology
@@ -69,10 +69,10 @@ def branched_cable(folder: Path = FOLDER) -> CableTopology:
     )
 
 
-def estimable_parameter_names(cable: CableTopology, options: CableOptions) -> tuple[str, ...]:
+def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptions) -> tuple[str, ...]:
     """Names of the parameters that a cable's motion alone can identify: stiffness, damping and rest shape, no mass."""
     names: list[str] = []
-    for name in cable.branch_vertex_names:
+    for name in cable.vertex_names_by_branch:
         names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
         if options.branches.get(name, options.default_branch).separate_twist_damping:
             names.append(f"{name}.twist_damping")
@@ -81,7 +81,7 @@ def estimable_parameter_names(cable: CableTopology, options: CableOptions) -> tu
     if options.shape_memory is not None:
         names.append("start.speed_scale")
     if options.has_rest_angle_parameters:
-        for name, chain in cable.branch_vertex_names.items():
+        for name, chain in cable.vertex_names_by_branch.items():
             links = len(chain) - (2 if name == cable.parent_segment else 1)
             names += [f"{name}_{i}_{axis}.rest" for i in range(links) for axis in "xy"]
     return tuple(names)
@@ -90,15 +90,15 @@ def estimable_parameter_names(cable: CableTopology, options: CableOptions) -> tu
 def cable_options(cable: CableTopology, recordings: list[Recording], options: CableOptions) -> ProblemOptions:
     """Of each recording what a prediction may use: the clamps throughout, free vertices in the first two frames."""
     known = {
-        r.name: edge_length_parameter_values(cable, median_point_pair_distances(cable.edges, [r], 2))
+        r.name: edge_length_parameter_values(cable, typical_point_pair_distances(cable.edges, [r], 2))
         for r in recordings
     }
-    names = [name for name in estimable_parameter_names(cable, options) if name.endswith(".rest")]
+    names = [name for name in identifiable_cable_parameter_names(cable, options) if name.endswith(".rest")]
     return ProblemOptions(
         initial_state="fitted_to_points",
         path_cutoff=8.0,
         sensors={"points": SensorOptions(std=MODEL_ERROR, points=cable.free_vertex_names)},
-        clamp_paths=cable.clamp_paths,
+        clamp_pose_definitions=cable.clamp_pose_definitions,
         prior_stds=dict.fromkeys(names, 0.2),
         start_fit_window=TIME_STEP,
         start_point_noise_std=NOISE,
@@ -133,7 +133,7 @@ def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
         "stay": constant_position_baseline(recording, free),
         "move_with_clamps": clamp_displacement_baseline(recording, free, cable.clamped_vertex_names),
         "linear_carry": interpolated_displacement_baseline(
-            recording, free, cable.parent_vertices, cable.child_vertices, cable.clamped_vertex_names
+            recording, free, cable.parent_branch_points, cable.child_branch_points, cable.clamped_vertex_names
         ),
     }
     return {name: position_rmse(predicted, measured) for name, predicted in predictions.items()}
@@ -145,14 +145,16 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     recordings = {name: read_recording(folder / f"bdlo1_train_{name}.h5") for name in (*ESTIMATE, *HELD_OUT)}
     estimate, held_out = [recordings[n] for n in ESTIMATE], [recordings[n] for n in HELD_OUT]
     clock = time.perf_counter()
-    system = cable_system(median_point_pair_distances(cable.edges, estimate), cable, OPTIONS)
+    system = cable_system(typical_point_pair_distances(cable.edges, estimate), cable, OPTIONS)
     step = yid.compile_step(system, TIME_STEP)
     seconds = {"build_and_compile": time.perf_counter() - clock}
     options = cable_options(cable, estimate + held_out, OPTIONS)
     plain = {name: 0.0 for name in system.parameters.names if name.endswith(".memory")}
-    names = estimable_parameter_names(cable, CableOptions(default_branch=BRANCH))
+    names = identifiable_cable_parameter_names(cable, CableOptions(default_branch=BRANCH))
     undeformed = EstimationProblem(step, estimate, names, replace(options, prior_stds={}), plain, held_out)
-    problem = EstimationProblem(step, estimate, estimable_parameter_names(cable, OPTIONS), options, None, held_out)
+    problem = EstimationProblem(
+        step, estimate, identifiable_cable_parameter_names(cable, OPTIONS), options, None, held_out
+    )
     clock = time.perf_counter()
     nominal = point_rmse_by_recording(undeformed, undeformed.initial_unknowns, cable.free_vertex_names)
     point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)
@@ -210,7 +212,7 @@ def parameters(cable: CableTopology, x: Any, covariance: Any, names: tuple[str, 
     for i, name in enumerate(names):
         branch, _, quantity = name.partition(".")
         result[name] = {"value": float(x[i]), "std": float(covariance[i, i]) ** 0.5}
-        if branch in cable.branch_vertex_names and quantity in units:
+        if branch in cable.vertex_names_by_branch and quantity in units:
             weight = OPTIONS.branches.get(branch, OPTIONS.default_branch).linear_density * GRAVITY
             result[name] |= {"per_weight": float(x[i]) / weight, "per_weight_unit": units[quantity]}
     return result

@@ -23,7 +23,7 @@ from diagnosis_cases import CASES, record
 from make_recordings import ROUGH, TRUTH
 from planning import PlannedMovement
 
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
 from yid_ocp.effects import make_effect
@@ -36,7 +36,7 @@ from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_fo
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import StderrLineProgress
+from yid_ocp.workflow.command_runner import StderrLogLinesProgress
 from yid_ocp.workflow.plan import parameter_and_effect_values
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.yaml"
@@ -70,7 +70,7 @@ def parameter(starts: int, recordings: int) -> None:
     solution = solve(problem, GaussNewton(cost_tolerance=1e-5))
     values = {name: entry.value for name, entry in solution.parameters.items() if name in problem.free}
     plan = plan_informative_motion(
-        problem, replace(OPTIONS, n_random_starts=starts), values, None, StderrLineProgress()
+        problem, replace(OPTIONS, n_random_starts=starts), values, None, StderrLogLinesProgress()
     )
     rows: list[tuple[str, ...]] = [("", SOUGHT, "± std", "of it", "true value off by")]
     rows.append(_row("the configuration's recording, 5 s", solution))
@@ -108,7 +108,7 @@ def _row(words: str, solution: Solution) -> tuple[str, ...]:
 def pair(name: str, starts: int, share: float) -> None:
     case = CASES[name]
     case = replace(case, withheld=tuple(_share(effect, share) for effect in case.withheld))
-    run = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG)
+    run = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG_FILE)
     nominal = build_problem(run)
     made = [record(case, 1, 401), record(case, 7, 402)]
     before = _diagnosed(nominal, made[:1], made[1:])
@@ -122,7 +122,7 @@ def pair(name: str, starts: int, share: float) -> None:
     planned = []
     for seed in (0, 100):
         options = replace(OPTIONS, identify=None, discriminate=labels, n_random_starts=starts, seed=seed)
-        plan = plan_informative_motion(problem, options, values, sizes, StderrLineProgress())
+        plan = plan_informative_motion(problem, options, values, sizes, StderrLogLinesProgress())
         for (first, second), (then, now) in plan.effect_distances.items():
             print(f"seed {seed}: {first} beside {second}: {then:.3g} std in the recording, {now:.3g} in the plan")
         movement = PlannedMovement(plan.joint_names, plan.simulator.path, plan.spline_coefficients)
@@ -165,7 +165,7 @@ def _share(effect: InjectedEffect, share: float) -> InjectedEffect:
 
 def _diagnosed(nominal: EstimationProblem, estimate: list[Recording], held_out: list[Recording]) -> DiagnosisResult:
     problem = EstimationProblem(nominal.step, estimate, nominal.free, nominal.options)
-    return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=StderrLineProgress())
+    return diagnose(problem, "all", held_out, thresholds=Thresholds(), progress=StderrLogLinesProgress())
 
 
 def main() -> None:

@@ -22,7 +22,7 @@ from yid_ocp.model.rotations import transform_from_xyz_rpy
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.experiment import VirtualExperiment, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import (
-    BAXTER_ARM_JOINT_NAMES,
+    BAXTER_JOINT_NAMES_WITHOUT_SIDE,
     MultisineOptions,
     grasping_joint_angles,
     random_multisine_motion,
@@ -48,7 +48,7 @@ def damped(segment: str, tau: float) -> dict[str, float]:
 
 def experiment() -> System:
     """The paper's single arm, with a damping of its own for the twists of every tube."""
-    names = [f"left_{joint}" for joint in BAXTER_ARM_JOINT_NAMES]
+    names = [f"left_{joint}" for joint in BAXTER_JOINT_NAMES_WITHOUT_SIDE]
     segments = [
         replace(segment, damping=NOMINAL_DAMPING, twist_damping=NOMINAL_DAMPING) for segment in foam_y_segments()
     ]

@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
         "multiple_shooting, exact": MultipleShooting(hessian="exact"),
         "steepest_descent, as in the paper": SteepestDescent(),
         "steepest_descent, spectral": SteepestDescent(
-            first_trial_step="spectral", nonmonotone_memory=10, max_iterations=800, gradient_tolerance=1e-4
+            first_trial_step_rule="spectral", nonmonotone_memory=10, max_iterations=800, gradient_tolerance=1e-4
         ),
     }
     table = Table(title=f"{recording.name}: 500 steps, from 3 N m/rad")

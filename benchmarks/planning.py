@@ -37,7 +37,7 @@ from yid_ocp.model.system import System
 from yid_ocp.planning.joint_paths import (
     FramePositionFunction,
     SplinePath,
-    solve_end_equilibrium,
+    solve_equilibrium_at_target,
     solve_start_equilibrium,
 )
 from yid_ocp.planning.motion_plan import TargetMotionPlan, plan_motion_to_target
@@ -80,7 +80,7 @@ def goals(step: Step, count: int = 10) -> list[tuple[float, float, float]]:
         x, y, z = way / np.linalg.norm(way) * rng.uniform(0.04, 0.08)
         place = begin + np.array((x, y, z))
         with contextlib.suppress(ConfigError):
-            end = solve_end_equilibrium(step, theta, start, tip, place, 1e-3)
+            end = solve_equilibrium_at_target(step, theta, start, tip, place, 1e-3)
             rest = tip.positions_and_jacobian(end.state[None, : system.n_coordinates], theta)[0][0]
             travel = (end.state - start.state)[list(system.prescribed_coordinate_indices)]
             if np.linalg.norm(rest - place) < 1e-4 and np.abs(travel).max() < TRAVEL:

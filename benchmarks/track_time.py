@@ -99,7 +99,7 @@ def _speed(config: Path, folder: Path) -> tuple[str, ...]:
     begun = time.process_time()
     common = tracker.calibrate_sequence()
     shared, begun = time.process_time() - begun, time.process_time()
-    frames = [tracker.track_frame(i, common) for i in tracker.frame_order]
+    frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
     each = (time.process_time() - begun) / len(frames)
     fits = [frame.cpu_seconds for frame in frames if frame.shape_fit is not None]
     good = sum(frame.is_good for frame in frames)

@@ -38,7 +38,7 @@ from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.virtual.joint_motion import (
-    BAXTER_ARM_JOINT_NAMES,
+    BAXTER_JOINT_NAMES_WITHOUT_SIDE,
     MultisineOptions,
     grasping_joint_angles,
     random_multisine_motion,
@@ -135,7 +135,7 @@ ROWS: dict[str, Row] = {
 def y_system(arms: int, links: int, damping: float = 0.05) -> System:
     """Baxter with one or two arms holding the foam Y, of so many links a tube."""
     sides = ("left", "right")[:arms]
-    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_ARM_JOINT_NAMES]
+    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINT_NAMES_WITHOUT_SIDE]
     grasps = [Grasp(side, f"{side}_gripper", held) for side, held in zip(sides, ("w_T2", "w_T3"), strict=False)]
     robot = read_urdf("package:baxter", joints=names)
     return System.build(

@@ -194,7 +194,7 @@ solver: {name: multiple_shooting, hessian: exact, ipopt: {max_cpu_time: 600}}
 solver: {name: single_shooting, max_iterations: 400}
 """,
     "solver, name: steepest_descent": """\
-solver: {name: steepest_descent, first_trial_step: spectral, nonmonotone_memory: 10}
+solver: {name: steepest_descent, first_trial_step_rule: spectral, nonmonotone_memory: 10}
 """,
     "compare": """\
 compare:

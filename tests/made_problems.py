@@ -55,7 +55,7 @@ class MadeUp:
         priors: Mapping[str, float] | None = None,
     ) -> None:
         self._rows, self._stated, self._weak, self.duration = rows, stated, weak, duration
-        self.data_residual_noise_std = noise
+        self.rms_noise_of_data_residuals = noise
         self.initial_unknowns = np.array(start, float)
         size = len(self.initial_unknowns)
         self.unknown_names = tuple(f"k{i}" for i in range(size))
@@ -84,7 +84,7 @@ class MadeUp:
         data = (self._count - self._stated - self._weak) if i == 0 else 0
         node = np.linspace(0, steps, data).astype(int)
         group = samples(
-            ("points.tip",), np.full((data, 1), self.data_residual_noise_std),
+            ("points.tip",), np.full((data, 1), self.rms_noise_of_data_residuals),
             used_output_mask=np.ones((data, 1), bool), value=np.zeros((data, 1)), node=node,
             fraction=np.zeros(data), n_residuals=data,
         )  # fmt: skip
@@ -107,7 +107,7 @@ class MadeUp:
     def linearization_without_weak_priors(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
         count = len(evaluation.residual) - self._weak
         unit = np.ones(count)
-        unit[: count - self._stated] = self.data_residual_noise_std
+        unit[: count - self._stated] = self.rms_noise_of_data_residuals
         return evaluation.residual[:count] / unit, evaluation.jacobian[:count] / unit[:, None]
 
     def split(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:

@@ -52,7 +52,7 @@ class Formula:
         self.residual_rows = ResidualVectorLayout(
             ((slice(0, data),),), slice(0, data), slice(data, data + stated), slice(data + stated, data + stated + weak)
         )
-        self.data_residual_noise_std, self._fails = noise, fails or (lambda values: False)
+        self.rms_noise_of_data_residuals, self._fails = noise, fails or (lambda values: False)
         self.whitening_filters, self.has_process_noise = (None,), False
         weighting, empty = "paper" if noise != 1 else "whitened", {name: {} for name in _BY_NAME}
         common = {"multivariate_prior": MultivariateGaussianPrior(), "path_cutoff": np.inf, "data_issues": ()}

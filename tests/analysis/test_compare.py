@@ -414,7 +414,7 @@ class Means:
         jacobian[:, 0] = 1.0
         return SimpleNamespace(residual=x[0] - self.values, jacobian=jacobian, equilibrium_guesses=None)
 
-    def with_free_subset(self, names):
+    def with_compiled_parameters_free(self, names):
         made = Means(self.values, [0.0] * len(self.values), tuple(names), self.off)
         made.episodes, made.bounds = self.episodes, tuple(bound[:1] for bound in self.bounds)
         return made

@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.discretisation import min_grasp_closure_errors, step_map_natural_frequencies
+from yid_ocp.analysis.discretisation import min_closure_error_by_grasp, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
-    ParameterEquationDependence,
+    ParameterRowsAndSensorResponse,
     linearise_and_check,
     linearise_step_equations,
-    parameter_dependences,
+    parameter_rows_and_sensor_responses,
     step_size_summary,
 )
 from yid_ocp.analysis.step_symbols import StepSymbols
@@ -47,7 +47,7 @@ def judged(problem):
     path = episode.initial_known_coordinates[len(system.driven) :]
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, problem.theta, path)
     symbols = StepSymbols.from_equations(step.equations)
-    found = parameter_dependences(step, symbols, episode, rest.state, problem.theta, rows)
+    found = parameter_rows_and_sensor_responses(step, symbols, episode, rest.state, problem.theta, rows)
     return {entry.parameter: entry for entry in found}, rest, rows
 
 
@@ -180,7 +180,7 @@ def test_without_sensors_only_rows_are_said(hanging):
     theta = step.system.parameters.vector()
     rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, theta, np.zeros(0))
-    found = {e.parameter: e for e in parameter_dependences(step, symbols, None, rest.state, theta, rows)}
+    found = {e.parameter: e for e in parameter_rows_and_sensor_responses(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].seen is None
     assert found["T1.twist"].moved is None
     assert found["T1.bend"].words == "T1.bend enters 12 rows (6 of del, 6 of p1)."
@@ -212,7 +212,7 @@ MANY = (*(f"del[{i}]" for i in range(5)), *(f"p1[{i}]" for i in range(4)))
     ],
 )
 def test_words(changes, words):
-    made = ParameterEquationDependence("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
+    made = ParameterRowsAndSensorResponse("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
     assert replace(made, **changes).words == words
 
 
@@ -374,7 +374,7 @@ def reaching(urdf_folder):
 )
 def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
     system = reaching(x)
-    found = min_grasp_closure_errors(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
+    found = min_closure_error_by_grasp(system, {"shoulder": angle, "elbow": 0.0}, system.parameters.vector())
     assert set(found) == {"hand"}
     assert found["hand"] == pytest.approx(gap, abs=2e-3)
 
@@ -382,8 +382,8 @@ def test_gaps_of_grasps_are_what_bending_cannot_close(reaching, x, angle, gap):
 def test_each_grasp_has_its_gap_and_no_grasp_none(reaching):
     """Tip at 0.3 m and elbow at 0.7 m above the ground, of a rod of 0.6 m whose middle link ends at 0.4 m."""
     system = reaching(grasps=2)
-    found = min_grasp_closure_errors(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
+    found = min_closure_error_by_grasp(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector())
     assert list(found) == ["hand", "other"]
     assert min(found.values()) > 0.05
     system = reaching(grasps=0)
-    assert min_grasp_closure_errors(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}
+    assert min_closure_error_by_grasp(system, {"shoulder": 0.0, "elbow": 0.0}, system.parameters.vector()) == {}

@@ -20,10 +20,10 @@ from yid_ocp.analysis.discretisation import (
     DiscretisationEstimateShift,
     FinerDiscretisationProblem,
     _error_growth_along,
-    discretisation_estimate_shifts,
     fine_joints_by_coarse_joint,
     inflate_estimates_by_discretisation,
     largest_alternating_error_growth,
+    parameter_shifts_in_finer_model,
 )
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -32,7 +32,7 @@ from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.workflow.solve import stability_checked_solution
+from yid_ocp.workflow.solve import solution_marked_if_step_unstable
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
 
@@ -47,7 +47,7 @@ def problem(rows, start, shared=None, **more):
 def shifts(coarse, finer, factors=None, **more):
     """Of the coarse problem's parameters at its initial values."""
     x = coarse.initial_unknowns
-    return discretisation_estimate_shifts(
+    return parameter_shifts_in_finer_model(
         FinerDiscretisationProblem(finer, factors or {}), coarse, x, coarse.evaluate(x), **more
     )
 
@@ -108,7 +108,7 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     at = replace(coarse.evaluate(coarse.initial_unknowns), episode_predictions=tuple(guesses))
     divided = fine_joints_by_coarse_joint(coarse.system, fine.system)
     refined = FinerDiscretisationProblem(fine, {"a": 2.0, "c": 3.0}, divided)
-    discretisation_estimate_shifts(refined, coarse, coarse.initial_unknowns, at)
+    parameter_shifts_in_finer_model(refined, coarse, coarse.initial_unknowns, at)
     [(x, (warm, none))] = asked
     point = dict(zip(fine.unknown_names, x, strict=True))
     assert point == {"a": 3.0, "c[run]": 6.0, "b": 7.0, **dict(zip(names, (0.2, 0.2, 0.0, 0.0), strict=True))}
@@ -186,7 +186,7 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     fine = EstimationProblem(step, [recording], coarse.free, coarse.options, values)
     found = solve(coarse, GaussNewton())
     finer = solve(fine, GaussNewton(), initial_unknowns=found.x)
-    own = discretisation_estimate_shifts(FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
+    own = parameter_shifts_in_finer_model(FinerDiscretisationProblem(fine), coarse, found.x, found.evaluation)
     change = finer.x - found.x
     assert np.abs(change).max() > 1e-5
     np.testing.assert_allclose(
@@ -286,7 +286,7 @@ def test_a_rollout_that_failed_counts_as_far_as_it_got_without_prescribed_coordi
 )
 def test_what_is_said(decades, stable):
     said = AlternatingErrorGrowth("run", decades, 1.29, 0.35, 0.005)
-    assert said.is_stable is stable
+    assert said.keeps_errors_below_resolution is stable
     told = "grows by 29 % in a step at 0.35 s; take a shorter problem.time_step (0.0025 s, say)"
     assert said.description.startswith(f"run: the step of 0.005 s is {'' if stable else 'not '}stable")
     assert said.description.endswith("along the motion" if stable else told)
@@ -294,7 +294,7 @@ def test_what_is_said(decades, stable):
 
 def test_a_recording_is_judged_by_its_name(pendulum):
     problem = pendulum()
-    assert largest_alternating_error_growth(problem, problem.initial_unknowns).is_stable
+    assert largest_alternating_error_growth(problem, problem.initial_unknowns).keeps_errors_below_resolution
     assert largest_alternating_error_growth(problem, problem.initial_unknowns).recording_name == "twin"
 
 
@@ -336,7 +336,7 @@ def test_a_light_cable_between_two_hands(light, stiffness, time_step, stable):
     _, _, rollout = moved_hands(step, 0.4)
     assert rollout.status.is_converged
     found = _error_growth_along(step, step.system.parameters.vector(), rollout, None, "light", _N_CHECKED_NODES)
-    assert found.is_stable is stable
+    assert found.keeps_errors_below_resolution is stable
     assert (found.max_step_factor > 1.1) is not stable
 
 
@@ -363,7 +363,7 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     assert found.status == Status.CONVERGED
     entry = found.parameters["cable.bend"]
     assert (abs(entry.value - 0.5) > 100 * entry.std) == (status == Status.STALLED)
-    judged, said = stability_checked_solution(problem, found)
+    judged, said = solution_marked_if_step_unstable(problem, found)
     assert judged.status == status
     assert set(said) == {"start", "estimate"}
     if status == Status.STALLED:
@@ -390,12 +390,12 @@ def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch
     grown = {x: AlternatingErrorGrowth("run", size, 1.3, 0.1, H) for x, size in decades.items()}
     monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: grown[float(x[0])])
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
-    judged, said = stability_checked_solution(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    judged, said = solution_marked_if_step_unstable(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert judged.status == after
     assert (said["start"]["decades"], said["estimate"]["decades"]) == (start, estimate)
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
     monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: None)
-    unchecked = stability_checked_solution(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    unchecked = solution_marked_if_step_unstable(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert unchecked == (found, {"start": None, "estimate": None})

@@ -63,7 +63,7 @@ def test_cameras_and_arms_are_told_apart(groups, camera, arm):
     made, episode = setting(*groups)
     for (found, times, std), name, usual in (
         (made.camera_sample_times_and_std(episode), camera, (np.arange(7) / 3.0, 5e-3)),
-        (made.arm_sample_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
+        (made.arm_point_sample_times_and_std(episode), arm, (0.1 * np.arange(21), 1e-3)),
     ):
         assert (None if found is None else found.name) == name
         np.testing.assert_allclose(times, [0.0, 0.5, 1.0] if name else usual[0], atol=1e-12)
@@ -369,7 +369,7 @@ def drawn_motion(monkeypatch):
         turned, by_torque = np.linalg.qr(rng.standard_normal((NX, NX)))[0], rng.standard_normal((NX, NU))
         steps.append(SimpleNamespace(state_by_state=0.9 * turned, state_by_torque=by_torque))
     monkeypatch.setattr(propagation, "linearized_steps", lambda *_: steps)
-    monkeypatch.setattr(propagation, "applied_torque_error_feedthrough", lambda gain, momentum: np.eye(NU))
+    monkeypatch.setattr(propagation, "applied_torque_by_torque_error", lambda gain, momentum: np.eye(NU))
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
     shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
     functions = SimpleNamespace(step=None, momentum_shift=shift)

@@ -12,7 +12,7 @@ from small_problems import PENDULUM, joints, pendulum_step, recording
 
 from yid_ocp.analysis.estimate_history import (
     RunEstimates,
-    assess_drift,
+    assess_drift_and_outlier_runs,
     nearby_positive_definite_covariance,
     pool_estimates,
 )
@@ -20,8 +20,8 @@ from yid_ocp.analysis.friction_ladder import (
     FrictionLawFit,
     fit_friction_law,
     friction_torque_clouds,
-    mean_and_standard_error,
-    motion_kinds,
+    left_out_error_mean_and_std_error,
+    recordings_by_motion_kind,
     warranted_law,
 )
 from yid_ocp.model.servos_and_springs import PositionServoOptions
@@ -44,7 +44,7 @@ def drifted(found):
 
 
 def outliers(found):
-    return [entry.run_name for entry in found.run_consistencies if entry.is_outlier]
+    return [entry.run_name for entry in found.run_outlier_tests if entry.is_outlier]
 
 
 def test_two_runs_together_are_their_weighted_mean_also_without_full_rank():
@@ -76,10 +76,10 @@ def test_runs_that_differ_widen_the_mean_and_a_parameter_counts_where_it_is():
 
 def test_without_drift_chi2_is_distributed_as_it_should_and_alarms_stay_at_their_level():
     rng = np.random.default_rng(3)
-    found = [assess_drift(drawn(rng, [1.0, 2.0], 3)).p_value for _ in range(40)]
+    found = [assess_drift_and_outlier_runs(drawn(rng, [1.0, 2.0], 3)).p_value for _ in range(40)]
     assert scipy.stats.kstest(found, "uniform").pvalue > 1e-3
     rng = np.random.default_rng(4)
-    found = [assess_drift(drawn(rng, [1.0, 2.0], 4), level=0.05) for _ in range(40)]
+    found = [assess_drift_and_outlier_runs(drawn(rng, [1.0, 2.0], 4), level=0.05) for _ in range(40)]
     assert np.mean([bool(drifted(entry)) for entry in found]) < 0.16
     assert np.mean([bool(outliers(entry)) for entry in found]) < 0.16
 
@@ -88,18 +88,18 @@ def test_the_run_that_stands_apart_is_the_one_to_distrust():
     rng = np.random.default_rng(5)
     runs = drawn(rng, [1.0, 2.0], 4)
     runs[2] = run("day2", runs[2].values + np.array([0.2, 0.0]))
-    found = assess_drift(runs)
+    found = assess_drift_and_outlier_runs(runs)
     assert outliers(found) == ["day2"]
     assert drifted(found) == ["a"]
-    assert next(entry.worst_parameter for entry in found.run_consistencies if entry.run_name == "day2") == "a"
+    assert next(entry.worst_parameter for entry in found.run_outlier_tests if entry.run_name == "day2") == "a"
 
 
 def test_a_steady_drift_and_two_runs_that_differ_make_no_outlier():
     runs = [run(f"day{i}", [1.0, 2.0 + 0.05 * i]) for i in range(5)]
-    found = assess_drift(runs)
+    found = assess_drift_and_outlier_runs(runs)
     assert "b" in drifted(found)
     assert outliers(found) == []
-    found = assess_drift([run("x", [1.0, 2.0]), run("y", [2.0, 2.0])])
+    found = assess_drift_and_outlier_runs([run("x", [1.0, 2.0]), run("y", [2.0, 2.0])])
     assert drifted(found) == ["a"]
     assert outliers(found) == []
 
@@ -112,7 +112,7 @@ def fit_of(law: str, *errors: float) -> FrictionLawFit:
 
 
 def test_kinds_weigh_alike_and_the_simplest_law_near_the_best_is_warranted():
-    mean, error = mean_and_standard_error({"a_1": 1.0, "a_2": 3.0, "b_1": 5.0, "c_1": 8.0}, KINDS)
+    mean, error = left_out_error_mean_and_std_error({"a_1": 1.0, "a_2": 3.0, "b_1": 5.0, "c_1": 8.0}, KINDS)
     assert mean == pytest.approx(5.0)
     assert error == pytest.approx(np.std([2.0, 5.0, 8.0], ddof=1) / np.sqrt(3))
     rough, good, best = fit_of("viscous", 9, 9, 8, 9), fit_of("coulomb", 3, 3, 2, 4), fit_of("stribeck", 2.8, 2.8, 2, 4)
@@ -150,10 +150,10 @@ def dry(urdf_folder) -> EstimationProblem:
 
 
 def test_kinds_go_by_name_and_a_true_law_predicts_to_its_noise_and_shows_in_the_torques(dry):
-    assert motion_kinds(dry) == {"slow": ("slow_1", "slow_2"), "fast": ("fast_1",), "turn": ("turn_1",)}
+    assert recordings_by_motion_kind(dry) == {"slow": ("slow_1", "slow_2"), "fast": ("fast_1",), "turn": ("turn_1",)}
     driven = dry.with_episodes(dry.episodes[:-1], ())
     solution = solve(driven, GaussNewton(), restarts=False)
-    fit = fit_friction_law("coulomb", driven, solution, motion_kinds(driven))
+    fit = fit_friction_law("coulomb", driven, solution, recordings_by_motion_kind(driven))
     assert set(fit.left_out_errors) == {"slow_1", "slow_2", "fast_1", "turn_1"}
     assert all(error < 1.3e-3 for error in fit.left_out_errors.values())
     assert fit.parameters["joint_coulomb@shoulder.tau_c"].value == pytest.approx(1.2, abs=0.05)

@@ -14,8 +14,8 @@ from made_recordings import holding_pendulum
 from yid_ocp.analysis import identifiability as module
 from yid_ocp.analysis.identifiability import (
     identifiability,
+    system_with_grasp_offset_effects,
     unknowns_from_solution,
-    with_grasp_offset_effects,
     with_nuisance_unknowns,
 )
 from yid_ocp.effects import make_effect
@@ -165,7 +165,7 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
 
 def test_where_the_grasp_sits_is_a_nuisance(held_tube):
     base = identifiability(held_tube)
-    system = with_grasp_offset_effects(held_tube.system)
+    system = system_with_grasp_offset_effects(held_tube.system)
     step = compile_step(system, held_tube.step.time_step, use_compiler=False)
     recordings = [episode.recording for episode in held_tube.episodes]
     problem = EstimationProblem(step, recordings, held_tube.free, held_tube.options)
@@ -188,7 +188,7 @@ def test_every_grasp_without_an_offset_gets_one(urdf_folder):
     system = replace(system, grasps=(*system.grasps, Grasp("other", "lower", "T1_1_tip")))
     for there in ((), (("grasp_compliance", "hand"),), (("grasp_offset", "other"), ("grasp_compliance", "other"))):
         made = system.with_effects([make_effect(kind, place, system) for kind, place in there])
-        found = [(e.kind, e.location) for e in with_grasp_offset_effects(made).effects]
+        found = [(e.kind, e.location) for e in system_with_grasp_offset_effects(made).effects]
         missing = [place for place in ("hand", "other") if ("grasp_offset", place) not in there]
         assert found == [*there, *(("grasp_offset", place) for place in missing)]
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.analysis.clock_checks import check_fit_residuals
+from yid_ocp.analysis.clock_checks import check_fit_for_drift_and_noise
 from yid_ocp.analysis.joint_checks import (
     RecordedJointsModel,
     check_efforts_by_inverse_dynamics,
@@ -387,7 +387,7 @@ def doubts(springs, late=0.0, drift=0.0, std=None):
         options = replace(options, sensors={**options.sensors, group.name: own})
     made = EstimationProblem(problem.step, [replace(recording, points=(moved,))], problem.free, options)
     solution = solve(made, run.solver)
-    return check_fit_residuals(solution.problem or made, solution.x, solution.evaluation)
+    return check_fit_for_drift_and_noise(solution.problem or made, solution.x, solution.evaluation)
 
 
 def test_a_fit_of_a_sound_recording_raises_nothing_and_a_late_clock_is_left_to_a_diagnosis(springs):

@@ -18,7 +18,7 @@ from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.analysis.profile import (
     compute_profile_likelihood_interval,
     is_small_enough_for_profiles,
-    with_profile_intervals,
+    solution_with_profile_intervals,
 )
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
 from yid_ocp.parallel import Task, run_tasks
@@ -222,7 +222,9 @@ def judged(problem, entry):
     first = estimate(20.0, 0.01)
     fitted = solution(a_bend=first, b_bend=entry)
     there = problem.evaluate(problem.initial_unknowns)
-    found = with_profile_intervals(problem, replace(fitted, x=problem.initial_unknowns, evaluation=there)).parameters
+    found = solution_with_profile_intervals(
+        problem, replace(fitted, x=problem.initial_unknowns, evaluation=there)
+    ).parameters
     assert found["a.bend"] == first
     return found["b.bend"]
 

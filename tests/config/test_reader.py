@@ -11,7 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from yid_ocp import options
-from yid_ocp.config.reader import DEFAULT_CONFIG, load_config
+from yid_ocp.config.reader import DEFAULT_CONFIG_FILE, load_config
 from yid_ocp.config.schema import section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.errors import ConfigError
@@ -21,9 +21,9 @@ RENAMED = "names changed in this version: see the table in CHANGELOG.md"
 
 
 def test_the_embedded_default_is_the_one_in_configs(repository):
-    embedded = repository / "yid_ocp" / "data" / "defaults" / DEFAULT_CONFIG
-    assert embedded.read_bytes() == (repository / "configs" / DEFAULT_CONFIG).read_bytes()
-    assert load_config() == dataclasses.replace(load_config(repository / "configs" / DEFAULT_CONFIG))
+    embedded = repository / "yid_ocp" / "data" / "defaults" / DEFAULT_CONFIG_FILE
+    assert embedded.read_bytes() == (repository / "configs" / DEFAULT_CONFIG_FILE).read_bytes()
+    assert load_config() == dataclasses.replace(load_config(repository / "configs" / DEFAULT_CONFIG_FILE))
 
 
 def test_numbers_as_in_yaml_1_2(written):
@@ -121,7 +121,10 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         # compared methods are typed like the solver
         (METHODS.replace("VALUE", "max_iterations: abc"), [f"{METHOD}.max_iterations", "number from 1", "line 5"]),
         (METHODS.replace("VALUE", "max_iteration: 3"), [f"'max_iteration' in {METHOD}", "mean 'max_iterations'?"]),
-        (METHODS.replace("VALUE", "first_trial_step: last"), ["no key 'first_trial_step'", "node_interval", "line 5"]),
+        (
+            METHODS.replace("VALUE", "first_trial_step_rule: last"),
+            ["no key 'first_trial_step_rule'", "node_interval", "line 5"],
+        ),
         (METHODS.replace("VALUE", "name: multiple_shooting"), ["there is no key 'name'"]),
         ("compare: {methods: {newton: {}}}\n", ["no solver 'newton'", "'gauss_newton'?", "1: compare.methods.newton"]),
     ],

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from yid_ocp.data.channel_checks import median_point_pair_distances
+from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_at_gaps
 from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
@@ -314,13 +314,13 @@ def stretched(lengths: list[float], name: str = "r") -> Recording:
 
 def test_lengths_are_means_over_frames_and_medians_over_recordings() -> None:
     recordings = [stretched([1.0, 2.0, np.nan]), stretched([5.0]), stretched([3.0, 3.0])]
-    assert median_point_pair_distances([("a", "b")], recordings) == {("a", "b"): 3.0}
-    assert median_point_pair_distances([("a", "b")], recordings[:1], frames=1) == {("a", "b"): 1.0}
+    assert typical_point_pair_distances([("a", "b")], recordings) == {("a", "b"): 3.0}
+    assert typical_point_pair_distances([("a", "b")], recordings[:1], frames=1) == {("a", "b"): 1.0}
     # one that never shows an edge does not count
     hidden, seen = stretched([np.nan]), stretched([2.0])
-    assert median_point_pair_distances([("a", "b")], [hidden, seen]) == {("a", "b"): 2.0}
+    assert typical_point_pair_distances([("a", "b")], [hidden, seen]) == {("a", "b"): 2.0}
     with pytest.raises(DataError, match="edge a to b is never seen"):
-        median_point_pair_distances([("a", "b")], [hidden])
+        typical_point_pair_distances([("a", "b")], [hidden])
     with pytest.raises(DataError, match="point 'c' is not recorded") as caught:
-        median_point_pair_distances([("a", "c")], [stretched([4.0], "run")])
+        typical_point_pair_distances([("a", "c")], [stretched([4.0], "run")])
     assert caught.value.where == "run"

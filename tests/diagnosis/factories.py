@@ -28,7 +28,7 @@ from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import ParameterTransferCheck
 from yid_ocp.effects.base import EffectBase, ParameterDefinition
-from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult
+from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult
 from yid_ocp.inference.smoother import SmoothedUnknowns, SmootherResult
 from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 from yid_ocp.model.parameters import Parameter, Parameters
@@ -202,7 +202,7 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
     alone = fit([of], loss(1.0, 1.1), values={f"{of.label}.a": 0.5})
     usual = {
         "verdict": verdict,
-        "noise_floor": (ChannelNoiseLevel("points.tip", "m", 0.001, 100),),
+        "noise_floor": (AssumedChannelNoiseLevel("points.tip", "m", 0.001, 100),),
         "nominal_test": outcome(p=1e-9, chi2=2.0),
         "nominal_held_out_test": outcome(p=1e-8, chi2=2.1),
         "detectability": (visible(of),),

@@ -342,7 +342,7 @@ def predicting(monkeypatch):
         told["episodes"] = [e.name for e in episodes]
         return {"a": {"rmse": np.float64(0.25), "unit": "m", "n": 3}}
 
-    monkeypatch.setattr(module, "rmse_by_channel", channel_errors)
+    monkeypatch.setattr(module, "rmse_unit_and_count_by_channel", channel_errors)
 
     def rows(i, there, result):
         pairs = zip(there.measurements, result.predicted_outputs, strict=True)

@@ -17,8 +17,8 @@ from yid_ocp.diagnosis.screening import (
     _shape_grid,
     candidate_detectability,
     confusability_matrix,
+    make_joint_score_model,
     score_candidates,
-    score_candidates_jointly,
 )
 
 CHI2 = scipy.stats.chi2
@@ -235,7 +235,7 @@ def test_a_signature_explained_by_another():
     b = effect("b@x", amplitude(lower=-1.0, expected=(-1.0, 1.0)))
     angle = math.radians(30)
     at = point([0.0] * 2, signature(a, [2.0, 0.0]), signature(b, [math.cos(angle), math.sin(angle)]))
-    found = confusability_matrix(score_candidates_jointly(at))
+    found = confusability_matrix(make_joint_score_model(at))
     assert found.labels == ("a@x", "b@x")
     np.testing.assert_allclose(found.overlap_fractions, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
 
@@ -243,20 +243,20 @@ def test_a_signature_explained_by_another():
 def test_nothing_is_like_what_moves_nothing():
     a, b = effect("a@x", amplitude()), effect("b@x", amplitude())
     at = point([0.0] * 2, signature(a, [0.0, 0.0]), signature(b, [1.0, 0.0]))
-    found = confusability_matrix(score_candidates_jointly(at))
+    found = confusability_matrix(make_joint_score_model(at))
     np.testing.assert_array_equal(found.overlap_fractions, [[0.0, 0.0], [0.0, 1.0]])
-    assert confusability_matrix(score_candidates_jointly(point([0.0]))).labels == ()
+    assert confusability_matrix(make_joint_score_model(point([0.0]))).labels == ()
 
 
 def test_shapes_are_those_of_the_scores_or_the_middle_of_the_grid():
     one = effect("one@x", amplitude())
     axes = [signature(SHAPED, np.eye(4)[i], s=0.1 * (i + 1)) for i in range(4)]
     at = point([0.0] * 4, *axes, signature(one, [0.0, 1.0, 0.0, 0.0]))
-    assert confusability_matrix(score_candidates_jointly(at)).overlap_fractions[1, 0] == 0.0
+    assert confusability_matrix(make_joint_score_model(at)).overlap_fractions[1, 0] == 0.0
     chosen = score(SHAPED, step={"branch@T1.a": 1.0, "branch@T1.s": 0.2})
-    assert confusability_matrix(score_candidates_jointly(at, [chosen])).overlap_fractions[1, 0] == pytest.approx(1.0)
+    assert confusability_matrix(make_joint_score_model(at, [chosen])).overlap_fractions[1, 0] == pytest.approx(1.0)
     middle = point([0.0] * 4, *axes, signature(one, [0.0, 0.0, 1.0, 0.0]))
-    assert confusability_matrix(score_candidates_jointly(middle)).overlap_fractions[1, 0] == pytest.approx(1.0)
+    assert confusability_matrix(make_joint_score_model(middle)).overlap_fractions[1, 0] == pytest.approx(1.0)
 
 
 def test_candidates_alike_explain_the_signature_from_the_limit_on():
@@ -275,10 +275,10 @@ def test_two_that_hide_in_each_other_show_as_a_pair():
     at = point(
         [0.0, -1.0, 0.0], *(signature(of, x) for of, x in ((a, [1, 0.5, 0]), (b, [1, -0.5, 0]), (c, [0, 0.5, 2])))
     )
-    pairs = list(score_candidates_jointly(at).ranked_pairs([a.label, b.label, c.label]))
+    pairs = list(make_joint_score_model(at).ranked_pairs([a.label, b.label, c.label]))
     assert ["".join(of.kind for of in pair) for pair, *_ in pairs] == ["ab", "ac", "bc"]
     assert pairs[0][1:] == (pytest.approx({"a@x.a": 1.0, "b@x.a": -1.0}), pytest.approx(-1.0))
-    [(fewer, *_)] = score_candidates_jointly(at).ranked_pairs(["c@x", "b@x"])
+    [(fewer, *_)] = make_joint_score_model(at).ranked_pairs(["c@x", "b@x"])
     assert fewer == (b, c)
 
 
@@ -288,7 +288,7 @@ def test_pairs_promise_what_the_linear_model_of_both_does():
     columns = [rng.standard_normal((9, len(of.amplitude_names))) for of in effects]
     residual = rng.standard_normal(9)
     made = [signature(of, x, **({"s": 0.2} if of is SHAPED else {})) for of, x in zip(effects, columns, strict=True)]
-    for pair, values, decrease in score_candidates_jointly(point(residual, *made)).ranked_pairs(
+    for pair, values, decrease in make_joint_score_model(point(residual, *made)).ranked_pairs(
         [of.label for of in effects]
     ):
         x = np.hstack([columns[effects.index(of)] for of in pair])

@@ -13,7 +13,7 @@ from heard import Heard
 
 from yid_ocp.diagnosis import select
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefitContext
-from yid_ocp.diagnosis.screening import ScreeningResult, score_candidates_jointly
+from yid_ocp.diagnosis.screening import ScreeningResult, make_joint_score_model
 from yid_ocp.diagnosis.select import (
     _is_amplitude_outside_prior,
     _is_rmse_reduced,
@@ -222,7 +222,7 @@ def test_an_amplitude_may_leave_its_range_by_its_width():
 # -- the shortlist ----------------------------------------------------------------------------------------------------
 
 
-FEW = score_candidates_jointly(point([0.0]))
+FEW = make_joint_score_model(point([0.0]))
 
 
 def ranked(**decreases):

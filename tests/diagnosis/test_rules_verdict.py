@@ -30,11 +30,11 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
     _compare,
     check_parameter_transfer,
-    compute_explained_chi2_fraction,
     decide_verdict,
+    explained_fraction_of_smoother_chi2,
     find_unknown_verdict_reason,
+    fit_with_disagreement_in_std,
     has_significant_gap,
-    inflate_std_by_disagreement,
     is_chance_excess,
 )
 from yid_ocp.progress import NULL_PROGRESS
@@ -217,8 +217,8 @@ def test_what_effects_explain_of_what_can_be_explained(costs, chi2, degrees, par
     nominal, last = fit(cost=costs[0]), added(ONE, fitted=fit([ONE], cost=costs[1]))
     first = added(OTHER, fitted=fit([OTHER], cost=1e3))
     found = smoothed({FORCE: 1.0}, chi2=chi2, degrees=degrees)
-    assert compute_explained_chi2_fraction(nominal, (first, last), found) == pytest.approx(part)
-    assert compute_explained_chi2_fraction(nominal, (first, last), None) == 1.0
+    assert explained_fraction_of_smoother_chi2(nominal, (first, last), found) == pytest.approx(part)
+    assert explained_fraction_of_smoother_chi2(nominal, (first, last), None) == 1.0
 
 
 # -- on which side ----------------------------------------------------------------------------------------------------
@@ -321,10 +321,10 @@ def test_a_small_part_of_a_vector_may_differ_by_a_part_of_the_whole():
 )
 def test_standard_deviations_count_how_far_two_sets_of_recordings_are_apart(first, second, std):
     one, other = (of("spring@elbow", {"k": value, "s": 3.0}, {"k": size}) for value, size in (first, second))
-    counted = inflate_std_by_disagreement(one, _compare(SPRING, one, other, Thresholds()))
+    counted = fit_with_disagreement_in_std(one, _compare(SPRING, one, other, Thresholds()))
     assert counted.std == one.std | {"spring@elbow.k": pytest.approx(std)}
     assert counted.values == one.values
-    again = inflate_std_by_disagreement(other, _compare(SPRING, other, one, Thresholds()))
+    again = fit_with_disagreement_in_std(other, _compare(SPRING, other, one, Thresholds()))
     reach = 2 * (counted.std["spring@elbow.k"] + again.std["spring@elbow.k"])
     assert not abs(first[0] - second[0]) > reach  # their intervals overlap
 

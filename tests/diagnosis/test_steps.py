@@ -16,8 +16,8 @@ from yid_ocp.diagnosis.screening import (
     candidate_detectability,
     confusability_matrix,
     linearize_candidates,
+    make_joint_score_model,
     score_candidates,
-    score_candidates_jointly,
 )
 from yid_ocp.diagnosis.select import _near_best_models
 from yid_ocp.effects import make_effect
@@ -88,7 +88,7 @@ def test_what_the_fit_has_explained_is_projected_off(screened):
 
 def test_a_candidate_explains_itself_and_nothing_explains_more(screened):
     _, _, point = screened
-    table = confusability_matrix(score_candidates_jointly(point))
+    table = confusability_matrix(make_joint_score_model(point))
     assert np.diag(table.overlap_fractions) == pytest.approx(1.0)
     assert np.all((table.overlap_fractions >= 0) & (table.overlap_fractions <= 1))
     assert "joint_stribeck@elbow" in table.labels

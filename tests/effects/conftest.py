@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.data.channel_checks import median_point_pair_distances
+from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.effects import _SENSOR_KINDS, EffectBase, candidate_kinds_and_locations, make_effect
 from yid_ocp.integrator.statics import EquilibriumSolver
@@ -173,7 +173,7 @@ def prescribed(benches) -> Bench:
 @pytest.fixture(scope="session")
 def cable() -> tuple[CableTopology, Recording, System]:
     layout, recording = made_cable()
-    lengths = median_point_pair_distances(layout.edges, [recording])
+    lengths = typical_point_pair_distances(layout.edges, [recording])
     return layout, recording, cable_system(lengths, layout, CableOptions())
 
 

@@ -86,13 +86,15 @@ def test_neutral_readings_change_nothing(mode, feedback, benches) -> None:
     assert one.ok, one.message
     assert other.residual == pytest.approx(one.residual, rel=1e-9, abs=1e-9)
     assert plain.uses_inputs_as_recorded
-    assert full.with_free_subset(["T1.bend", "kelvin_voigt@T3.tau"]).uses_inputs_as_recorded
+    assert full.with_compiled_parameters_free(["T1.bend", "kelvin_voigt@T3.tau"]).uses_inputs_as_recorded
     # an arm's own damping leaves the recording as it is
     assert problem(bench, (), feedback=feedback, free=("left_a.damping",)).uses_inputs_as_recorded
     # the momentum that an LQR filter follows depends on how fast the clock runs
-    assert full.with_free_subset(["T1.bend", "clock_scale@clock.scale"]).uses_inputs_as_recorded is (feedback != "lqr")
+    assert full.with_compiled_parameters_free(["T1.bend", "clock_scale@clock.scale"]).uses_inputs_as_recorded is (
+        feedback != "lqr"
+    )
     for name in ("effort_delay@left.delay", "effort_lag@left_c.time_constant", "camera_latency@camera.delay"):
-        assert not full.with_free_subset([name]).uses_inputs_as_recorded
+        assert not full.with_compiled_parameters_free([name]).uses_inputs_as_recorded
     with pytest.raises(SolverError, match="gauss_newton"):
         MultipleShooting(condensing=True).minimize_cost(full, full.initial_unknowns, None)
 
@@ -199,7 +201,9 @@ def test_what_a_recording_holds(driven) -> None:
 
 def test_a_cable_from_a_fitted_start(cable, all_effects) -> None:
     layout, made, system = cable
-    options = ProblemOptions(**OPEN, initial_state="fitted_to_points", clamp_paths=layout.clamp_paths)
+    options = ProblemOptions(
+        **OPEN, initial_state="fitted_to_points", clamp_pose_definitions=layout.clamp_pose_definitions
+    )
     residuals = []
     for one in (system, system.with_effects(all_effects(system))):
         step = compile_step(one, H, use_compiler=False)
@@ -214,7 +218,7 @@ def test_the_filter_follows_the_momentum_of_the_effects(driven) -> None:
     """The cost is one number, whether derivatives are asked for or not, and however the effects' values are given."""
     task = problem(driven, HEAVIER, feedback="lqr")
     with_slopes, without = (task.evaluate(task.initial_unknowns, derivatives=flag).cost for flag in (True, False))
-    fixed = task.with_free_subset(["T1.bend"])
+    fixed = task.with_compiled_parameters_free(["T1.bend"])
     told = problem(driven, HEAVIER, neutral=True, feedback="lqr")
     values = dict(zip(task.unknown_names, task.initial_unknowns, strict=True))
     other = told.evaluate([values[name] for name in told.unknown_names], derivatives=False).cost

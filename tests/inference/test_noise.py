@@ -12,8 +12,8 @@ from small_problems import H, correlated, pendulum_step, taken
 from yid_ocp.errors import ConfigError
 from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
-    estimate_recording_torque_biases,
     problem_whitened_at,
+    torque_biases_and_stds_by_recording,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
@@ -169,14 +169,14 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     episode = problem.episodes[0]
     problem = problem.with_episodes([replace(episode, torque=episode.torque + 0.35)], [])
     weighted = problem_whitened_at(problem, problem.initial_unknowns)
-    ((value, std),) = estimate_recording_torque_biases(weighted, problem.initial_unknowns)
+    ((value, std),) = torque_biases_and_stds_by_recording(weighted, problem.initial_unknowns)
     assert std[0] < BIAS
     assert value[0] == pytest.approx(0.35, abs=4 * std[0])
     again = problem_whitened_at(weighted, problem.initial_unknowns)
     np.testing.assert_allclose(again.episodes[0].input_errors.torque_bias, value)
-    ((settled, _),) = estimate_recording_torque_biases(again, problem.initial_unknowns)
+    ((settled, _),) = torque_biases_and_stds_by_recording(again, problem.initial_unknowns)
     assert settled[0] == pytest.approx(value[0], abs=0.5 * std[0])
-    assert estimate_recording_torque_biases(problem, problem.initial_unknowns) == [None]
+    assert torque_biases_and_stds_by_recording(problem, problem.initial_unknowns) == [None]
 
 
 @pytest.mark.parametrize("feedback", [TRACKED, {"feedback": "lqr"}], ids=["angles", "angles_and_momenta"])

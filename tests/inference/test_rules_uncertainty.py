@@ -17,7 +17,7 @@ from yid_ocp.inference import uncertainty
 from yid_ocp.inference.null_test import (
     ExcessResidualCriteria,
     NullTestResult,
-    channel_noise_levels,
+    assumed_channel_noise_levels,
     residual_channel_samples,
     residuals_exceed_noise,
     run_null_test,
@@ -31,7 +31,7 @@ from yid_ocp.inference.uncertainty import (
     _cost_checked_std,
     _misfit_sandwich_covariance,
     assess_goodness_of_fit,
-    is_std_sufficient,
+    needs_no_profile_likelihood,
     parameter_estimates,
     parameter_verdict,
     typical_parameter_magnitudes,
@@ -75,7 +75,7 @@ def test_no_verdict_and_no_spread_contradicts_a_profile(value, std, said, interv
 
 @pytest.mark.parametrize(("value", "std", "sufficient"), [(-10.0, 1.0, True), (0.1, 0.2, False)])
 def test_small_values_do_not_stand_by_themselves(value, std, sufficient):
-    assert is_std_sufficient(stiffness(value, std, "identifiable")) is sufficient
+    assert needs_no_profile_likelihood(stiffness(value, std, "identifiable")) is sufficient
 
 
 def judged(problem, at=None):
@@ -183,7 +183,7 @@ def test_a_fit_is_judged_in_units_of_noise_by_the_limits_of_a_diagnosis():
     found = problem.evaluate([1.0])
     assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(significance_level=1e-6)).explains
     assert assess_goodness_of_fit(problem, found, ExcessResidualCriteria(min_excess_chi2=0.5)).explains
-    half = assess_goodness_of_fit(problem, found, ExcessResidualCriteria(noise_fraction=0.5))
+    half = assess_goodness_of_fit(problem, found, ExcessResidualCriteria(noise_fraction_of_std=0.5))
     assert half.chi2_per_dof == pytest.approx(4 * assess_goodness_of_fit(problem, found).chi2_per_dof)
 
 
@@ -469,7 +469,7 @@ def test_the_noise_floor_is_the_median_of_each_channel():
     first = samples(["points.a", "points.b"], [[1.0, 9.0], [2.0, nan], [6.0, nan]])
     second = samples(["points.a", "effort"], [[3.0, nan], [4.0, nan]], unit="N m")
     problem = SimpleNamespace(episodes=[SimpleNamespace(measurements=[first]), SimpleNamespace(measurements=[second])])
-    found = {entry.channel: entry for entry in channel_noise_levels(problem)}
+    found = {entry.channel: entry for entry in assumed_channel_noise_levels(problem)}
     assert set(found) == {"points.a", "points.b"}
     assert (found["points.a"].noise_std, found["points.a"].n_samples) == (3.0, 5)
     assert (found["points.b"].noise_std, found["points.b"].n_samples, found["points.b"].unit) == (9.0, 1, "m")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import AdditionalLoadDerivatives, compile_step_like, linearized_steps
+from yid_ocp.integrator.step import StepDerivativesByLoad, compile_step_like, linearized_steps
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 
 
@@ -141,7 +141,7 @@ def test_single_steps_are_those_of_a_rollout_by_both_kernels(case):
     rollout, rng = case.rollout(), np.random.default_rng(3)
     assert rollout.status.is_converged, rollout.status.message
     rows, momentum = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2)), rng.normal(size=(sizes["n"], 2))
-    loads = AdditionalLoadDerivatives(rows, momentum)
+    loads = StepDerivativesByLoad(rows, momentum)
     made, expected = (list(linearized_steps(s, case.theta, rollout, loads)) for s in (case.step, slow))
     for name in vars(made[0]):
         one, other = (np.stack([getattr(step, name) for step in steps]) for steps in (made, expected))

@@ -122,7 +122,7 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
     if not resolve_recording_path(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
     way = "plan={point: p6, target_offset: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
-    fewer = ("child_vertices={}", "branches={}", "parent_vertices=[p0, p1, p4, p6, p8, p11, p12]")
+    fewer = ("child_branch_points={}", "branches={}", "parent_branch_points=[p0, p1, p4, p6, p8, p11, p12]")
     coarse = [f"model.object.{entry}" for entry in fewer]
     coarse += ["model.object.branches={parent: {separate_twist_damping: true, linear_density: 0.05}}"]
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", "problem.use_compiler=false", *coarse, way)

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from yid_ocp.data.channel_checks import _measured_positions, median_point_pair_distances
+from yid_ocp.data.channel_checks import _measured_positions, typical_point_pair_distances
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import DataError, ModelError
@@ -98,9 +98,11 @@ def twin(cable, clamps):
         lengths_per_recording=False,
     )
     stub = as_recording(cable, t, held)
-    system = cable_system(median_point_pair_distances(cable.edges, [as_recording(cable, t, {})]), cable, options)
+    system = cable_system(typical_point_pair_distances(cable.edges, [as_recording(cable, t, {})]), cable, options)
     step = compile_step(system, PERIOD)
-    path = prescribed_path(stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamp_paths)
+    path = prescribed_path(
+        stub, system, TimeGrid(0.0, PERIOD, len(t) - 1), LowPassFilter(np.inf), cable.clamp_pose_definitions
+    )
     theta = system.parameters.vector(TRUTH)
     rest = EquilibriumSolver(step).solve(path[0], theta)
     assert rest.is_converged, rest.message
@@ -184,13 +186,13 @@ def test_edges_are_as_long_as_measured(cable):
     t = PERIOD * np.arange(4)
     seen = {v: np.tile(1.25 * np.asarray(UNDEFORMED[v]), (4, 1)) for v in cable.vertices}
     recording = as_recording(cable, t, seen)
-    lengths = median_point_pair_distances(cable.edges, [recording])
+    lengths = typical_point_pair_distances(cable.edges, [recording])
     expected = 1.25 * np.linalg.norm(np.subtract(UNDEFORMED["c2"], UNDEFORMED["c1"]))
     assert lengths["c1", "c2"] == pytest.approx(expected)
-    values = edge_length_parameter_values(cable, median_point_pair_distances(cable.edges, [recording], 2))
+    values = edge_length_parameter_values(cable, typical_point_pair_distances(cable.edges, [recording], 2))
     assert values["c.length_1"] == pytest.approx(expected)
     assert set(values) <= set(
-        cable_system(median_point_pair_distances(cable.edges, [recording]), cable).parameters.names
+        cable_system(typical_point_pair_distances(cable.edges, [recording]), cable).parameters.names
     )
     np.testing.assert_array_equal(_measured_positions(recording, "c1"), seen["c1"])
 
@@ -226,7 +228,7 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository, 
         pytest.skip(f"the recordings are not there: {folder}")
     cable, recording = real.branched_cable(folder), read_recording(folder / "bdlo1_train_021.h5")
     options = CableOptions(shape_memory=0.75)
-    step = compile_step(cable_system(median_point_pair_distances(cable.edges, [recording]), cable, options), PERIOD)
+    step = compile_step(cable_system(typical_point_pair_distances(cable.edges, [recording]), cable, options), PERIOD)
     settings = replace(real.cable_options(cable, [recording], options), duration=1.0)
     problem = EstimationProblem(step, [recording], ("parent.bend", "a.bend"), settings)
     error = real.point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)[recording.name]

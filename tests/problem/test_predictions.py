@@ -18,7 +18,7 @@ from yid_ocp.problem.predictions import (
     interpolated_displacement_baseline,
     measured_point_positions,
     position_rmse,
-    rmse_by_channel,
+    rmse_unit_and_count_by_channel,
 )
 
 FREE = ["elbow.stiffness", "elbow.damping"]
@@ -66,7 +66,7 @@ def test_a_parameter_that_is_not_there_is_named(problem):
 
 def test_residuals_are_those_of_the_result(problem):
     solution = yid.solve(problem, yid.GaussNewton())
-    errors = rmse_by_channel(solution.episode_predictions, problem.episodes)
+    errors = rmse_unit_and_count_by_channel(solution.episode_predictions, problem.episodes)
     found = solution.channel_measurements_and_predictions()
     assert {entry.channel: entry.rmse for entry in found} == pytest.approx({k: v["rmse"] for k, v in errors.items()})
     for entry in found:

@@ -14,7 +14,7 @@ from yid_ocp.problem.measurements import (
     huber_loss_and_residual_factors,
     locate_measurements_on_grid,
     make_time_grid,
-    with_paper_weights,
+    measurements_with_paper_weights,
 )
 from yid_ocp.sensors.base import SensorData
 
@@ -110,7 +110,7 @@ def test_a_noise_level_that_is_not_positive_is_refused_where_something_was_measu
 def test_the_papers_cost_counts_the_end_twice_and_the_start_not_at_all():
     node, fraction = [0, 0, 0, 1, 1, 2, 3], [0.0, 0.49, 0.5, 0.49, 0.5, 0.9, 0.0]
     made = measured(points("p"), node, fraction, [[1.0, NAN, 3.0]] * 7, weight=[[1e3, 0.0, 1e3]] * 7)
-    found = with_paper_weights(made, TimeGrid(0.0, 0.1, 3))
+    found = measurements_with_paper_weights(made, TimeGrid(0.0, 0.1, 3))
     assert (found.node.tolist(), found.fraction.tolist()) == ([0, 0, 1, 1, 2, 3, 3], [0.0] * 7)
     weight = np.array([0.0, 0.0, 1.0, 1.0, 1.0, math.sqrt(2), math.sqrt(2)])
     np.testing.assert_allclose(found.weight, np.stack([weight, 0 * weight, weight], axis=1))

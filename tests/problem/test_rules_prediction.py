@@ -99,14 +99,16 @@ def test_without_derivatives_the_cost_is_the_same(problem):
 def test_what_is_freed_later_has_the_same_derivatives(urdf_folder):
     whole = problem_of(urdf_folder, "driven, filtered")
     x, few = moved(whole), whole.unknown_names[1:4]
-    part = whole.with_free_subset(few).with_parameter_values(dict(zip(whole.unknown_names, x, strict=True)))
+    part = whole.with_compiled_parameters_free(few).with_parameter_values(
+        dict(zip(whole.unknown_names, x, strict=True))
+    )
     own = np.array([x[whole.unknown_names.index(name)] for name in few])
     one, two = part.evaluate(own), whole.evaluate(x)
     data = whole.residual_rows.data
     np.testing.assert_allclose(one.residual[part.residual_rows.data], two.residual[data], atol=1e-9)
     columns = [whole.unknown_names.index(name) for name in few]
     np.testing.assert_allclose(one.jacobian[part.residual_rows.data], two.jacobian[data][:, columns], atol=1e-7)
-    none = whole.with_free_subset(()).with_parameter_values(dict(zip(whole.unknown_names, x, strict=True)))
+    none = whole.with_compiled_parameters_free(()).with_parameter_values(dict(zip(whole.unknown_names, x, strict=True)))
     alone = none.evaluate(np.zeros(0))
     np.testing.assert_allclose(alone.residual, two.residual[data], atol=1e-9)
     assert alone.jacobian.shape == (len(alone.residual), 0)
@@ -191,7 +193,7 @@ def test_a_problem_is_as_recorded_unless_an_effect_may_change_it(urdf_folder):
     neutral = {"encoder_offset@shoulder.offset": 0.0, "effort_gain@shoulder.inverse": 1.0}
     made = problem_of(urdf_folder, "all prescribed", seeds=(1,))
     assert not made.with_parameter_values(neutral).uses_inputs_as_recorded, "a free one may change it"
-    fixed = made.with_free_subset(("elbow.damping",))
+    fixed = made.with_compiled_parameters_free(("elbow.damping",))
     assert fixed.with_parameter_values(neutral).uses_inputs_as_recorded
     assert not fixed.with_parameter_values(neutral | {"encoder_offset@shoulder.offset": 0.01}).uses_inputs_as_recorded
     assert problem_of(urdf_folder, "local", seeds=(1,)).uses_inputs_as_recorded

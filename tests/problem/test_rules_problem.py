@@ -193,14 +193,14 @@ def test_the_papers_rows_are_metres_and_inform_in_units_of_the_noise(make, state
     evaluation = problem.evaluate(problem.initial_unknowns + np.array([0.0, 2.0, 0.0]))
     # 75 coordinates of 2 cm and 39 of 5 cm in each recording
     noise = stated or math.sqrt((75 * 0.02**2 + 39 * 0.05**2) / 114)
-    assert problem.data_residual_noise_std == pytest.approx(noise)
+    assert problem.rms_noise_of_data_residuals == pytest.approx(noise)
     residual, jacobian = linearization_without_weak_priors(problem, evaluation)
     data = problem.residual_rows.data
     np.testing.assert_allclose(residual[data], evaluation.residual[data] / noise)
     np.testing.assert_allclose(jacobian[data], evaluation.jacobian[data] / noise)
     assert residual[-1] == 2.0
     assert jacobian[-1].tolist() == [0.0, 1.0, 0.0]
-    assert make().data_residual_noise_std == 1.0
+    assert make().rms_noise_of_data_residuals == 1.0
 
 
 def test_predictions_are_those_of_a_rollout_from_rest(make, free_step, roll):
@@ -333,7 +333,7 @@ def test_the_first_moments_are_at_least_two_steps_of_a_fifth_of_a_second(make, h
 
 def test_problems_that_free_other_parameters_share_all_else(make):
     problem = make(may_free=("elbow.damping",), local_parameters=("elbow.rest",))
-    other = problem.with_free_subset(("elbow.damping", "shoulder.stiffness"))
+    other = problem.with_compiled_parameters_free(("elbow.damping", "shoulder.stiffness"))
     assert other.unknown_names == ("elbow.damping", "shoulder.stiffness")
     assert other.episodes is problem.episodes
     assert other.model_functions is problem.model_functions

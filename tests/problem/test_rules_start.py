@@ -20,7 +20,7 @@ from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.episode_prediction import _MAX_FIRST_SAMPLE_TIME
 from yid_ocp.problem.initial_state_fit import InitialStateFitter, _speed
-from yid_ocp.problem.predictions import rmse_by_channel
+from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
 from yid_ocp.sensors import sensor_reading_function
 from yid_ocp.sensors.points import PointSensor
 
@@ -262,14 +262,14 @@ def test_errors_are_euclidean_for_points_and_plain_for_efforts():
     result = SimpleNamespace(
         predicted_outputs=(np.array([[3.0, 4, 0, 1, 0, 0], [0, 0, 1, 5, 5, 5]]), np.array([[4.0], [6.0], [9.0]]))
     )
-    found = rmse_by_channel([result, result], [SimpleNamespace(measurements=(tips, loads))] * 2)
+    found = rmse_unit_and_count_by_channel([result, result], [SimpleNamespace(measurements=(tips, loads))] * 2)
     assert found == {
         "points.a": {"rmse": pytest.approx(math.sqrt(13.0)), "unit": "m", "n": 4},
         "points.b": {"rmse": 1.0, "unit": "m", "n": 2},
         "joints.effort.j": {"rmse": pytest.approx(math.sqrt(12.5)), "unit": "N m", "n": 4},
     }
     hidden = SimpleNamespace(measurements=(measured(efforts("j"), [0], [0.0], [[NAN]]),))
-    assert rmse_by_channel([SimpleNamespace(predicted_outputs=(np.zeros((1, 1)),))], [hidden]) == {}
+    assert rmse_unit_and_count_by_channel([SimpleNamespace(predicted_outputs=(np.zeros((1, 1)),))], [hidden]) == {}
 
 
 POSTURE = (0.5, 0.5)

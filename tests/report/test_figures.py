@@ -15,7 +15,7 @@ from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.report import figures
-from yid_ocp.report.animation import ModelTrajectory, make_animation, recording_animation
+from yid_ocp.report.animation import ConfigurationTrajectory, make_animation, recording_animation
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
 
@@ -30,7 +30,7 @@ def point(system: System, name: str, q: np.ndarray) -> np.ndarray:
 
 
 def animated(system: System, q: np.ndarray):
-    told = ModelTrajectory("predicted", system, system.parameters.vector(), np.arange(len(q)), q)
+    told = ConfigurationTrajectory("predicted", system, system.parameters.vector(), np.arange(len(q)), q)
     return make_animation("a", [told]).motions[0]
 
 
@@ -69,7 +69,7 @@ def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
     seen = np.arange(9.0).reshape(3, 1, 3)
     seen[1] = np.nan
     recording = Recording(joints, (PointGroup("camera", ("w_T1",), seldom, seen),), name="a")
-    told = ModelTrajectory("predicted", single_arm, single_arm.parameters.vector(), t, q)
+    told = ConfigurationTrajectory("predicted", single_arm, single_arm.parameters.vector(), t, q)
     made = make_animation("a", [told], recording)
     assert [motion.name for motion in made.motions] == ["predicted", "measured"]
     assert len(made.t) == 150

@@ -123,10 +123,10 @@ def test_fifty_variables_from_far_away(two_arms, solver):
 
 def test_steepest_descent_lowers_the_papers_cost_and_with_a_memory_returns_the_best_point(make_problem):
     problem = make_problem(free=("T1.bend", "T2.bend"), duration=2.0, weighting="paper")
-    solution = solve(problem, SteepestDescent(max_iterations=60, first_trial_step="spectral"))
+    solution = solve(problem, SteepestDescent(max_iterations=60, first_trial_step_rule="spectral"))
     assert solution.history[-1].cost < 0.05 * solution.history[0].cost
     assert solution.parameters["T1.bend"].value == pytest.approx(22.0, rel=0.05)
-    patient = SteepestDescent(first_trial_step="spectral", nonmonotone_memory=10, gradient_tolerance=1e-4)
+    patient = SteepestDescent(first_trial_step_rule="spectral", nonmonotone_memory=10, gradient_tolerance=1e-4)
     solution = solve(problem, patient)
     costs = [entry.cost for entry in solution.history]
     assert solution.status == Status.CONVERGED

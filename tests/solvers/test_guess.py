@@ -15,7 +15,7 @@ from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.solvers.initial_guess import guess_node_states, unknowns_with_active_effects
+from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, unknowns_with_active_effects
 from yid_ocp.solvers.multiple_shooting import _ShootingIntervals
 
 START = np.array([5.0, 4.0])
@@ -49,7 +49,7 @@ def test_larger_parameters_are_tried_until_states_fit(problem, misfits, taken, t
         told.append(factor)
         return misfits[factor]
 
-    found = guess_node_states(problem, nodes_of(problem), START, misfit)
+    found = guess_unknowns_and_node_states(problem, nodes_of(problem), START, misfit)
     np.testing.assert_allclose(found.x, taken * START)
     assert list(dict.fromkeys(told)) == tried
     rest = problem.initial_state(problem.episodes[0], problem.split(found.x, 0)[0])
@@ -60,14 +60,14 @@ def test_what_fits_is_the_rollout_and_what_does_not_is_rest_where_the_arm_was(pr
     nodes, episode = nodes_of(problem), problem.episodes[0]
     driven = list(problem.system.driven_coordinate_indices)
     rolled = problem.evaluate(START).episode_predictions[0].rollout
-    found = guess_node_states(problem, nodes, START, lambda i, state, x: 1.0)
+    found = guess_unknowns_and_node_states(problem, nodes, START, lambda i, state, x: 1.0)
     np.testing.assert_allclose(found.node_states[0], rolled.state, atol=1e-9)
     np.testing.assert_allclose(found.multipliers[0], rolled.multipliers, atol=1e-9)
 
     def strays(i, state, x):
         return 1e3 * np.abs(state[:, driven] - episode.measured_driven_angles).max() + 20.0
 
-    found = guess_node_states(problem, nodes, START, strays)
+    found = guess_unknowns_and_node_states(problem, nodes, START, strays)
     np.testing.assert_allclose(found.node_states[0][:, driven], episode.measured_driven_angles, atol=1e-12)
     assert np.abs(rolled.state[:, driven] - episode.measured_driven_angles).max() > 1e-4
 

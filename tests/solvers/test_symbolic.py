@@ -20,7 +20,7 @@ from yid_ocp.inference.whitening import (
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, Status, solve
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram, _VectorBlock
-from yid_ocp.solvers.program_terms import LocalVariableFunction, ProgramTerm, ResidualTerm, RidgeRegularization
+from yid_ocp.solvers.program_terms import GaussNewtonHessianRidge, LocalVariableFunction, ProgramTerm, ResidualTerm
 from yid_ocp.solvers.symbolic_transcription import problem_unknowns_from_program, transcribe
 
 TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
@@ -338,7 +338,7 @@ def test_placed_derivatives_are_those_that_casadi_finds(use_compiler, threshold)
 
 
 def test_gauss_newton_leaves_out_curvature_but_not_that_of_what_was_added():
-    ridge = RidgeRegularization(np.array([0]), np.array([0.5]), 0.2)
+    ridge = GaussNewtonHessianRidge(np.array([0]), np.array([0.5]), 0.2)
     program = chain(ridge=ridge)
     w = program.w
     slope, cost, first = at(program, program.jac_r, program.f, w[0])
@@ -387,7 +387,7 @@ QUIET = {
 @pytest.mark.parametrize("hessian", ["gauss_newton", "exact"])
 @pytest.mark.parametrize("plugin", list(QUIET))
 def test_any_plugin_finds_the_same_optimum_with_the_derivatives_it_is_given(plugin, hessian, capfd):
-    program = chain(ridge=RidgeRegularization(np.array([0]), np.array([1.0]), 0.1))
+    program = chain(ridge=GaussNewtonHessianRidge(np.array([0]), np.array([1.0]), 0.1))
     program = program.with_user_terms(ca.sumsqr(program.w - 0.1) / 2, program.w[1] + program.w[3], 0.5, 2.0)
     # `work` is no equality here: leave it free
     arguments = program.solver_arguments

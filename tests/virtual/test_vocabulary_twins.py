@@ -16,7 +16,7 @@ from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import screen_candidates
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
-from yid_ocp.export.models import effect_format_support, parameter_format_support
+from yid_ocp.export.models import format_support_by_effect, format_support_by_parameter
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.mechanism import Frame, Inertia, Joint, Placement
@@ -244,10 +244,10 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(servo_arm: System) -> 
     effects += [("servo_saturation", "lift", {"limit": 0.9}), ("backlash", "elbow", {"width": 0.01})]
     system = servo_arm.with_effects([make_effect(kind, place, servo_arm, values) for kind, place, values in effects])
     values = dict(zip(system.parameters.names, system.parameters.vector(VALUES), strict=True))
-    said = effect_format_support(system, values, "mjcf")
+    said = format_support_by_effect(system, values, "mjcf")
     assert [said[f"{kind}@{place}"].status for kind, place, _ in effects] == ["native"] * 3 + ["not representable"]
     for form, status in (("mjcf", "native"), ("urdf", "not representable"), ("sdf", "not representable")):
-        own = parameter_format_support(system, effect_format_support(system, values, form), form)
+        own = format_support_by_parameter(system, format_support_by_effect(system, values, form), form)
         names = ("gain", "damping", "delay", "torque_limit")
         assert {own[f"wrist_flex.servo_{name}"].status for name in names} == {status}
     kept = servo_arm.with_effects([make_effect(kind, place, servo_arm, values) for kind, place, values in effects[:3]])

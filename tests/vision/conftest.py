@@ -74,7 +74,7 @@ def recording(system, run):
 
 
 # a quarter of an Xtion's pixels, each as good: a test has four times as many frames in the time
-COARSE = vision.DepthCamera(
+COARSE = vision.DepthSensorModel(
     CameraIntrinsics.from_field_of_view(320, 240, math.radians(58.0)), disparity_std=1 / 32, disparity_step=1 / 16
 )
 

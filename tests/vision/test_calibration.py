@@ -125,7 +125,7 @@ def test_slopes_of_the_state_are_derivatives():
     state = CameraState(POSE, 1.03, 0.02, 0.1, 1e-3, 5.0)
     seen = state.world_to_measured_points(POINTS)
     assert np.allclose(state.measured_to_world_points(seen), POINTS, atol=1e-12)
-    slopes = state.world_point_jacobian(POINTS)
+    slopes = state.world_point_jacobian_by_pose_and_depth(POINTS)
     for k in range(CLOCK_OFFSET_INDEX):
         change = 1e-6 * np.eye(CAMERA_STATE_SIZE)[k]
         both = (state.with_state_increment(by) for by in (change, -change))
@@ -242,7 +242,7 @@ def test_frames_stamped_late_do_not_pull(robot):
     for by, expected in ((0.0, False), (0.15, True)):
         stamp = 2.6 + found.camera_state.clock_offset + by
         points = found.camera_state.measured_to_world_points(cloud)
-        own = calibration.estimate_excess_stamp_delay(
+        own = calibration.stamp_delay_beyond_clock_offset(
             arm_of(robot), found.camera_state, stamp, points, rng, found.usual_square_distance
         )
         assert own.delay == pytest.approx(by, abs=max(4 * own.std, 0.01))

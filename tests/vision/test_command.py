@@ -119,7 +119,7 @@ def result_of(folder):
 
 def test_what_an_interrupted_run_did_is_used_and_several_workers_do_the_rest(cli, config, whole, tmp_path, monkeypatch):
     """Killed after the first frame: the next run does the others alone, with the same result to the last bit."""
-    worked, work = [], FrameTracker.track_frame
+    worked, work = [], FrameTracker.process_frame
 
     def interrupted(self, index, common):
         if worked:
@@ -127,7 +127,7 @@ def test_what_an_interrupted_run_did_is_used_and_several_workers_do_the_rest(cli
         worked.append(work(self, index, common))
         return worked[0]
 
-    monkeypatch.setattr(FrameTracker, "track_frame", interrupted)
+    monkeypatch.setattr(FrameTracker, "process_frame", interrupted)
     assert cli("track", config, "--out", tmp_path / "run").code not in (0, 1)
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()

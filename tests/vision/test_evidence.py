@@ -10,9 +10,9 @@ from yid_ocp.vision.shape_evidence import (
     ProcessedFrameCloud,
     TubeLinks,
     assess_shape_against_cloud,
-    line_of_sight_residuals,
     nearest_surface_residuals,
-    tube_like_node_point_masks,
+    surface_depth_residuals,
+    tube_like_node_and_point_masks,
 )
 
 CAMERA = np.zeros(3)
@@ -103,12 +103,14 @@ def test_points_on_a_swath_are_wider_than_the_tube_and_tubes_are_slender():
     assert np.sqrt(blurred.excess_variance) == pytest.approx(RADIUS * np.sqrt((1.8**2 - 1) / 3), rel=0.15)
     points = np.concatenate([tube(), wall((-0.3, 0.3), (0.3, 0.6), 2.0)])
     nodes = np.array([[-0.1, 0.0, 1.985], [0.1, 0.0, 1.985], [0.0, 0.45, 2.0]])
-    thin, mine = tube_like_node_point_masks(ProcessedFrameCloud(points, np.ones(len(points)), nodes, CAMERA), RADIUS)
+    thin, mine = tube_like_node_and_point_masks(
+        ProcessedFrameCloud(points, np.ones(len(points)), nodes, CAMERA), RADIUS
+    )
     assert thin.tolist() == [True, True, False]
     assert mine.sum() == len(tube())
 
 
-@pytest.mark.parametrize("ask", [nearest_surface_residuals, line_of_sight_residuals])
+@pytest.mark.parametrize("ask", [nearest_surface_residuals, surface_depth_residuals])
 def test_residuals_move_as_their_derivatives_say(ask):
     points = tube(noise=0.003)[::7]
     base = ask(TUBES.link_ends, TUBES.radius, points, CAMERA)
@@ -134,5 +136,5 @@ def test_residuals_move_as_their_derivatives_say(ask):
 def test_noise_along_the_sight_leaves_the_radius():
     """The mean error of a tube of the right radius is nothing along the sight; the nearest way it is not."""
     points = np.concatenate([tube(noise=0.005, seed=seed) for seed in range(8)])
-    found = line_of_sight_residuals(TUBES.link_ends, TUBES.radius, points, CAMERA)
+    found = surface_depth_residuals(TUBES.link_ends, TUBES.radius, points, CAMERA)
     assert abs(found.signed_distance.mean()) < 0.0004

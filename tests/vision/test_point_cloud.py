@@ -120,7 +120,7 @@ def test_nodes_and_edges_are_a_tree_on_the_centre_lines_from_the_lowest_point():
     nodes, label = found.nodes, found.node_of_point
     assert np.median(from_bones(nodes)) < 0.005
     assert from_bones(nodes).max() < 0.02
-    assert found.has_skeleton_node.mean() > 0.9
+    assert found.is_point_assigned_to_node.mean() > 0.9
     for i in range(len(nodes)):
         mine = cloud.points[label == i]
         assert len(mine) <= 50
@@ -142,8 +142,8 @@ def test_two_parts_and_a_stray_heap():
     points = np.concatenate([cloud.points[near], far])
     found = extract_skeleton(WeightedCloud(points, np.ones(len(points))), np.random.default_rng(0))
     assert set(found.component_of_node.tolist()) == {0, 1}
-    assert not found.has_skeleton_node[-60:].any()
-    weights = np.bincount(found.component_of_node[found.node_of_point[found.has_skeleton_node]])
+    assert not found.is_point_assigned_to_node[-60:].any()
+    weights = np.bincount(found.component_of_node[found.node_of_point[found.is_point_assigned_to_node]])
     assert weights[0] > weights[1]
 
 
@@ -154,7 +154,7 @@ def test_too_little_gives_nothing_and_points_at_one_place_do_not_hang_it():
     assert len(empty.nodes) == len(empty.edges) == len(empty.node_of_point) == 0
     found = extract_skeleton(WeightedCloud(np.zeros((500, 3)), np.ones(500)), np.random.default_rng(0))
     assert len(found.nodes) == 10
-    assert found.has_skeleton_node.all()
+    assert found.is_point_assigned_to_node.all()
     ring = WeightedCloud(
         0.069 * np.column_stack([np.cos(np.arange(40)), np.sin(np.arange(40)), np.zeros(40)]), np.ones(40)
     )

@@ -31,7 +31,7 @@ def clock(monkeypatch):
 
 
 def test_lines_for_stages_iterates_and_tenths(capsys, clock):
-    progress = command_runner.StderrLineProgress()
+    progress = command_runner.StderrLogLinesProgress()
     progress.begin_stage("solving")
     progress.report_iterate(ENTRY)
     for _ in range(2):  # the tenths begin again with every stage
@@ -48,7 +48,7 @@ def test_lines_for_stages_iterates_and_tenths(capsys, clock):
                        (3000.0, ["about 6.7 h", "about 50 min"])]
 )  # fmt: skip
 def test_the_time_left_counts_what_this_run_did(capsys, clock, pace, left):
-    progress = command_runner.StderrLineProgress()
+    progress = command_runner.StderrLogLinesProgress()
     progress.begin_stage("diagnosing")
     for done in (10, 12, 19, 20):  # ten were done before and took nothing
         clock[0] = 100.0 + pace * (done - 10)
@@ -59,7 +59,7 @@ def test_the_time_left_counts_what_this_run_did(capsys, clock, pace, left):
 
 
 def test_slow_parts_have_a_line_each_and_quick_ones_one_in_ten(capsys, clock):
-    progress = command_runner.StderrLineProgress()
+    progress = command_runner.StderrLogLinesProgress()
     progress.begin_stage("diagnosing")
     for done in range(4):
         clock[0] += 30.0
@@ -97,7 +97,7 @@ def test_who_does_not_look_is_shown_nothing_or_lines():
     for arguments, kind in (
         (asked(quiet=True), None),
         (asked(program=True), None),
-        (asked(), command_runner.StderrLineProgress),
+        (asked(), command_runner.StderrLogLinesProgress),
     ):
         with command_runner.stderr_progress_display(arguments) as progress:
             assert progress is NULL_PROGRESS if kind is None else isinstance(progress, kind)

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from small_problems import pendulum_step
 
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import StoredFit
 from yid_ocp.diagnosis.refit import REFIT_SOLVER
 from yid_ocp.errors import ConfigError
-from yid_ocp.inference.whitening import estimate_recording_torque_biases, problem_whitened_at
+from yid_ocp.inference.whitening import problem_whitened_at, torque_biases_and_stds_by_recording
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.progress import Progress
 from yid_ocp.workflow.diagnose import JsonRefitStore, _with_noise_only_stds, run_diagnose
@@ -127,7 +127,7 @@ def test_the_result_says_how_sure_a_closure_is_and_where_the_unknown_forces_are(
 def test_the_command_that_gives_a_result_again(rubbing, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     changed = load_config(rubbing, ["diagnosis.significance_level=0.02"])
-    embedded = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG)
+    embedded = load_config(None, (), DEFAULT_DIAGNOSIS_CONFIG_FILE)
     for settings, command in ((changed, "yid-ocp diagnose 'runs/a b/config.yaml'"), (embedded, "yid-ocp diagnose")):
         with atomic_run_folder(settings, tmp_path / "runs" / "a b") as folder:
             folder.record_run_start(settings, "diagnose")
@@ -200,7 +200,7 @@ def settings(share=SHARE):
     def refuse(what, *where, **more):
         return ConfigError(what, where=".".join(where), **more)
 
-    return SimpleNamespace(diagnosis=SimpleNamespace(noise_fraction=share), config_error=refuse)
+    return SimpleNamespace(diagnosis=SimpleNamespace(noise_fraction_of_std=share), config_error=refuse)
 
 
 @pytest.mark.parametrize("encoders", [False, True])
@@ -216,8 +216,8 @@ def test_errors_of_torques_shrink_like_all_other_noise(problem_of, encoders):
     np.testing.assert_allclose(after.residual, before.residual / SHARE, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(after.jacobian, before.jacobian / SHARE, rtol=1e-6, atol=1e-6)
     (value, std), (smaller_value, smaller_std) = (
-        estimate_recording_torque_biases(one, x)[0],
-        estimate_recording_torque_biases(other, x)[0],
+        torque_biases_and_stds_by_recording(one, x)[0],
+        torque_biases_and_stds_by_recording(other, x)[0],
     )
     np.testing.assert_allclose(smaller_value, value, rtol=1e-6)
     np.testing.assert_allclose(smaller_std, SHARE * std, rtol=1e-6)
@@ -276,7 +276,7 @@ def test_a_diagnosis_leaves_a_run_folder(carried_out, pendulum):
     ("setting", "said"),
     [
         ("diagnosis.candidates=[kelvin_voigt]", "kelvin_voigt does not fit"),
-        ("diagnosis.noise_fraction=0.1", "set sensors.joints.effort.std"),
+        ("diagnosis.noise_fraction_of_std=0.1", "set sensors.joints.effort.std"),
     ],
 )
 def test_what_cannot_be_diagnosed_is_said(cli, pendulum, tmp_path, setting, said):
@@ -290,7 +290,7 @@ def test_a_deviation_that_is_mostly_the_models_error(carried_out, pendulum):
     chosen = ("diagnosis.candidates=[joint_coulomb]", "output.write_report=false")
     found = []
     for std, share in ((0.01, 1.0), (0.1, 0.1)):
-        settings = (f"sensors.joints.effort.std={std}", f"diagnosis.noise_fraction={share}", *chosen)
+        settings = (f"sensors.joints.effort.std={std}", f"diagnosis.noise_fraction_of_std={share}", *chosen)
         done = carried_out("diagnose", pendulum, settings=settings, out=f"run_{share}")
         found.append(done.result["gap"]["before"]["chi2_per_dof"])
     assert found[1] == pytest.approx(found[0], rel=0.01)

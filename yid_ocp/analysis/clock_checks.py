@@ -28,7 +28,7 @@ from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
 
 # From times on the joints' clock (N,) to places (N, np, 3) [m].
-PositionFunction = Callable[[Array], Array]
+PositionsAtTimes = Callable[[Array], Array]
 
 _MIN_Z = 5.0  # standard deviations from which on a clock's error counts
 # No sensor takes longer for one sample: a slow camera knows when a frame was taken better than to its period [s].
@@ -105,7 +105,13 @@ def _by_clock(t: Array, speed: Array, span: tuple[float, float]) -> Array:
 
 
 def check_robot_held_point_clock(
-    joints: JointGroup, group: PointGroup, t: Array, seen: Array, by_angle: Array, std: float, path: PositionFunction
+    joints: JointGroup,
+    group: PointGroup,
+    t: Array,
+    seen: Array,
+    by_angle: Array,
+    std: float,
+    path: PositionsAtTimes,
 ) -> Iterator[Issue]:
     """Issues of clock offset or drift of points whose positions follow from the joint angles.
 
@@ -165,7 +171,7 @@ def timestamp_correction_advice(late: float, drift: float, middle: float) -> str
 
 
 def search_clock_offset_and_drift(
-    path: PositionFunction, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
+    path: PositionsAtTimes, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float]:
     """Clock offset [s] and relative drift that bring points nearest to a path, by a coarse-to-fine search.
 
@@ -198,13 +204,13 @@ def search_clock_offset_and_drift(
     return float(fine.x[0]), float(fine.x[1]) / span
 
 
-def check_fit_residuals(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
+def check_fit_for_drift_and_noise(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> list[Issue]:
     """New data-quality issues found in the residuals of a fit: drifting clocks and overstated noise.
 
     A constant offset of a camera's clock looks like damping that the model lacks; to tell the two is a diagnosis's task
     (effect `camera_latency`). One that grows over a recording is a clock's.
     """
-    if not evaluation.ok or evaluation.jacobian is None or problem.data_residual_noise_std != 1.0:
+    if not evaluation.ok or evaluation.jacobian is None or problem.rms_noise_of_data_residuals != 1.0:
         return []
     known = {(issue.cause, issue.recording, issue.group) for issue in problem.options.data_issues}
     found = [*_drifts(problem, x, evaluation), *_overstated(problem, evaluation)]

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from yid_ocp.analysis.profile import with_profile_intervals
+from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.inference.linearized_residual import step_within_unknown_sizes
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
 from yid_ocp.inference.uncertainty import (
@@ -25,7 +25,7 @@ from yid_ocp.inference.uncertainty import (
     interval_text,
 )
 from yid_ocp.inference.whitening import problem_without_input_errors
-from yid_ocp.model.objects.cable import START_SPEED_PARAMETER_NAME, START_SPEED_SCALE_PARAMETER_NAME
+from yid_ocp.model.objects.cable import MEMORY_HALVING_SPEED_PARAMETER_NAME, START_SPEED_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.solvers import GaussNewton, Iterate, Solution, Status, solve
@@ -106,14 +106,14 @@ def compare_methods(
         runs.append(_MethodResult(solver.name, solution, cost, own.predict_held_out(solution.x), *taken))
     best = min(runs, key=lambda run: run.whitened_cost)
     if best.method != "steepest_descent":
-        shown = replace(best, solution=with_profile_intervals(problem, best.solution))
+        shown = replace(best, solution=solution_with_profile_intervals(problem, best.solution))
         runs[runs.index(best)] = best = shown
     judged, held_out = best.solution, best.held_out_predictions
     if whole.has_process_noise:
         able: Solver = next((solver for solver in solvers if uses_process_noise_covariance(solver)), GaussNewton())
         judged = solve(whole, able, callback=listener(_ALL_NOISE_LABEL), limits=limits)
         weighted = judged.problem or whole
-        judged, held_out = with_profile_intervals(weighted, judged), weighted.predict_held_out(judged.x)
+        judged, held_out = solution_with_profile_intervals(weighted, judged), weighted.predict_held_out(judged.x)
     agreement = {run.method: _differences(run, best, judged.parameters) for run in runs}
     explained = tuple(_explanations(runs, judged.parameters, truth or {}, whole.has_process_noise))
     return MethodComparison(tuple(runs), best.method, whole.has_process_noise, judged, held_out, agreement, explained)
@@ -257,8 +257,8 @@ def decide_cable_memory(
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:
     """The problem with the cable's memory parameters fixed at zero."""
     memory = _memory_parameters(problem)
-    free = tuple(name for name in problem.free if name not in (*memory, START_SPEED_SCALE_PARAMETER_NAME))
-    return problem.with_free_subset(free).with_parameter_values(dict.fromkeys(memory, 0.0))
+    free = tuple(name for name in problem.free if name not in (*memory, MEMORY_HALVING_SPEED_PARAMETER_NAME))
+    return problem.with_compiled_parameters_free(free).with_parameter_values(dict.fromkeys(memory, 0.0))
 
 
 def _memory_parameters(problem: EstimationProblem) -> list[str]:

@@ -91,7 +91,7 @@ def fine_joints_by_coarse_joint(coarse: System, fine: System) -> dict[str, tuple
     return found
 
 
-def discretisation_estimate_shifts(
+def parameter_shifts_in_finer_model(
     refined: FinerDiscretisationProblem,
     coarse: EstimationProblem,
     x: Array,
@@ -210,7 +210,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
     return values[np.abs(values) > 0.2]
 
 
-def min_grasp_closure_errors(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
+def min_closure_error_by_grasp(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Smallest remaining gap of each grasp [m], by name: the robot's joints are fixed, the object may bend.
 
     `posture` are driven and prescribed coordinates [rad or m]; lengths are taken from `theta`.
@@ -273,7 +273,7 @@ class AlternatingErrorGrowth:
     time_step: float
 
     @property
-    def is_stable(self) -> bool:
+    def keeps_errors_below_resolution(self) -> bool:
         """Whether rounding errors stay below sensor resolution."""
         return self.growth_decades <= _MAX_GROWTH_DECADES
 
@@ -281,7 +281,7 @@ class AlternatingErrorGrowth:
     def description(self) -> str:
         """A sentence on the stability and, where unstable, on the remedy."""
         step = f"{self.recording_name}: the step of {self.time_step:g} s is"
-        if self.is_stable:
+        if self.keeps_errors_below_resolution:
             return f"{step} stable along the motion"
         grows = f"grows by {100 * (self.max_step_factor - 1):.2g} % in a step at {self.max_growth_time:.3g} s"
         remedy = f"take a shorter problem.time_step ({self.time_step / 2:g} s, say)"

@@ -71,7 +71,7 @@ class _ParameterDrift:
 
 
 @dataclass(frozen=True)
-class RunConsistency:
+class RunOutlierTest:
     """Test of one run against the pooled estimates of all others."""
 
     run_name: str
@@ -89,7 +89,7 @@ class EstimateHistory:
 
     run_names: tuple[str, ...]
     parameter_drifts: tuple[_ParameterDrift, ...]
-    run_consistencies: tuple[RunConsistency, ...]
+    run_outlier_tests: tuple[RunOutlierTest, ...]
     chi2: float
     degrees_of_freedom: int
     p_value: float
@@ -135,7 +135,7 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
     return RunEstimates(label, names, mean * unit, covariance, units, explains, effects), chi2, degrees
 
 
-def assess_drift(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateHistory:
+def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateHistory:
     """Test which parameters drifted between runs, in the order of time, and which run is an outlier.
 
     Each parameter is tested by its marginal variances, each run by its whole covariance; the significance level is
@@ -158,7 +158,7 @@ def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterD
     return _ParameterDrift(name, mean.units.get(name, ""), places, values, std, *pooled, chi2, p, p < level)
 
 
-def _against(i: int, runs: Sequence[RunEstimates], level: float) -> RunConsistency:
+def _against(i: int, runs: Sequence[RunEstimates], level: float) -> RunOutlierTest:
     """One run against the mean of all others; distrusted where they agree without it."""
     chi2, degrees, worst = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
     p = chi2_p_value(chi2, degrees)
@@ -166,7 +166,7 @@ def _against(i: int, runs: Sequence[RunEstimates], level: float) -> RunConsisten
     rest, free = without[i]
     agree = chi2_p_value(rest, free) >= level or rest < 0.5 * min(r for k, (r, _) in enumerate(without) if k != i)
     alone = len(runs) > 2 and p < level and agree
-    return RunConsistency(runs[i].run_name, chi2, degrees, p, worst, runs[i].is_fit_adequate, alone)
+    return RunOutlierTest(runs[i].run_name, chi2, degrees, p, worst, runs[i].is_fit_adequate, alone)
 
 
 def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, int, str]:

@@ -14,7 +14,7 @@ import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.identifiability import InitialStateKnowledge, transfer_unknowns_by_name, with_nuisance_unknowns
-from yid_ocp.analysis.torque_error_propagation import episode_sensitivities_and_information
+from yid_ocp.analysis.torque_error_propagation import point_sensitivities_and_joint_information
 from yid_ocp.arrays import Array
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError, SolverError, YidError
@@ -32,7 +32,7 @@ from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
     JOINT_POSITION_GROUP_NAME,
     PositionSensor,
-    is_measured_by_arm,
+    is_point_group_measured_by_arm,
 )
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
@@ -78,7 +78,7 @@ class RecordedExperiment:
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
-    def arm_sample_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
+    def arm_point_sample_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
         """Point group, sample times [s] and standard deviation [m] of points that the arms measure."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
@@ -178,7 +178,7 @@ class CandidateExperiment:
     """One variant of an experiment, with the sensitivities of all frames that could be measured.
 
     Sensitivities of a frame's position at every node, by (episode, group, frame), are by the unknowns, then by the q
-    that stand for the errors of the torques that drive this episode (`episode_sensitivities_and_information`).
+    that stand for the errors of the torques that drive this episode (`point_sensitivities_and_joint_information`).
     """
 
     problem: EstimationProblem  # with nuisances, and every measurable frame observed at every node
@@ -281,7 +281,9 @@ class CandidateExperimentBuilder:
         encoders = self._with_encoders(problem)
         for i in range(len(problem.episodes)):
             finest = self._finest(base.episodes[i % len(base.episodes)])
-            points, by_joints[i] = episode_sensitivities_and_information(problem, evaluation, x, i, finest, encoders)
+            points, by_joints[i] = point_sensitivities_and_joint_information(
+                problem, evaluation, x, i, finest, encoders
+            )
             slopes |= {(i, *key): value for key, value in points.items()}
         names = tuple(name for name in problem.unknown_names if name.split("[")[0] in base.free)
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
@@ -305,7 +307,7 @@ class CandidateExperimentBuilder:
     def _finest(self, episode: Episode) -> dict[str, float]:
         """Least standard deviation that each group's points can have in a recording [m]."""
         finest = {}
-        samplings = self.setting.camera_sample_times_and_std, self.setting.arm_sample_times_and_std
+        samplings = self.setting.camera_sample_times_and_std, self.setting.arm_point_sample_times_and_std
         for default, sampling in zip((CAMERA_GROUP, ARM_GROUP), samplings, strict=True):
             group, _, std = sampling(episode)
             finest[default if group is None else group.name] = std
@@ -323,7 +325,7 @@ class CandidateExperimentBuilder:
         sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
         recordings = []
         for recording in (episode.recording for episode in problem.episodes):
-            seen = tuple(group for group in recording.points if not is_measured_by_arm(group))
+            seen = tuple(group for group in recording.points if not is_point_group_measured_by_arm(group))
             recordings.append(replace(recording, points=seen))
         values = dict(zip(problem.system.parameters.names, map(float, problem.theta), strict=True))
         options = replace(problem.options, sensors=sensors)
@@ -425,7 +427,10 @@ class CandidateExperimentBuilder:
         wanted: dict[str, dict[str, None]] = {}
         for view in setting.existing_sensor_observations(episode):
             wanted.setdefault(view.point_group, {})[view.frame] = None
-        camera, arm = setting.camera_sample_times_and_std(episode)[0], setting.arm_sample_times_and_std(episode)[0]
+        camera, arm = (
+            setting.camera_sample_times_and_std(episode)[0],
+            setting.arm_point_sample_times_and_std(episode)[0],
+        )
         look = wanted.setdefault(CAMERA_GROUP if camera is None else camera.name, {})
         look |= dict.fromkeys(sight.name for sight in seen)
         feel = wanted.setdefault(ARM_GROUP if arm is None else arm.name, {})

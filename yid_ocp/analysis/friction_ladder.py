@@ -39,7 +39,7 @@ class FrictionLawFit:
     is_converged: bool
 
 
-def motion_kinds(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
+def recordings_by_motion_kind(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
     """Recordings by kind of motion: names up to a number, or each by itself; without those whose motors are off."""
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
@@ -78,7 +78,9 @@ def fit_friction_law(
     return FrictionLawFit(law, free, errors, unit, solution.status.value == "converged")
 
 
-def mean_and_standard_error(errors: Mapping[str, float], kinds: Mapping[str, Sequence[str]]) -> tuple[float, float]:
+def left_out_error_mean_and_std_error(
+    errors: Mapping[str, float], kinds: Mapping[str, Sequence[str]]
+) -> tuple[float, float]:
     """Mean over kinds of motion of errors by recording, and its standard error."""
     by_kind = np.array([np.mean([errors[name] for name in own]) for own in kinds.values()])
     return float(np.mean(by_kind)), float(np.std(by_kind, ddof=1) / np.sqrt(len(by_kind)))
@@ -89,7 +91,7 @@ def warranted_law(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[s
 
     Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, 7.10, doi:10.1007/978-0-387-84858-7.
     """
-    sizes = [mean_and_standard_error(fit.left_out_errors, kinds) for fit in fits]
+    sizes = [left_out_error_mean_and_std_error(fit.left_out_errors, kinds) for fit in fits]
     least, error = min((size for size in sizes if np.isfinite(size[0])), default=(np.inf, np.inf))
     return next((fit for fit, (mean, _) in zip(fits, sizes, strict=True) if mean <= least + error), fits[0])
 
@@ -166,11 +168,11 @@ def _load_function(problem: EstimationProblem) -> ca.Function:
     state = MidpointState(
         system, forward_kinematics(system.mechanism, q), q, v, none, none, u, none, {}, ca.SX(problem.step.time_step)
     )
-    outside = ca.vertcat(*(system.weight_and_grasp_force(state, i) for i in range(n)))
+    outside = ca.vertcat(*(system.weight_and_grasp_force_on_coordinate(state, i) for i in range(n)))
     return ca.Function("load", [q, v, u, system.parameters.symbols], [system.input_force(u, q, v) - outside])
 
 
-def without_held_out(problem: EstimationProblem) -> EstimationProblem:
+def problem_estimating_on_held_out_too(problem: EstimationProblem) -> EstimationProblem:
     """The problem that estimates on its held-out recordings too."""
     added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)
     filters = (*problem.whitening_filters, *problem.held_out_whitening_filters)

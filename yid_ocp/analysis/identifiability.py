@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.analysis.profile import (
     ParameterProfileLikelihood,
+    apply_to_parameters_at_optimum,
     compute_profile_likelihood_interval,
-    map_parameters_at_optimum,
-    reject_undetermined_small_estimate,
+    mark_unidentifiable_small_estimate,
 )
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
@@ -26,7 +26,7 @@ from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, Excess
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
     MAX_WEAK_RELATIVE_STD,
-    MIN_UNINFORMED_RELATIVE_STD,
+    MIN_RELATIVE_STD_TAKEN_AS_INFINITE,
     VERDICT_TABLE_TEXTS,
     ParameterEstimate,
     assess_goodness_of_fit,
@@ -145,7 +145,7 @@ def identifiability(
         along, with the problem's prior about what it assumes.
     grasp_std : float, optional
         Prior standard deviation of the fixed `grasp_offset@...` parameters of a system that has any (see
-        `with_grasp_offset_effects`), which are estimated along [m]; None for grasps that are known.
+        `system_with_grasp_offset_effects`), which are estimated along [m]; None for grasps that are known.
     intervals : iterable of str, or "all"
         Parameters whose interval by profile likelihood is wanted.
     limits : ExcessResidualCriteria, optional
@@ -206,16 +206,16 @@ def _profiles(
     def one(name: str, best: Array, there: Evaluation) -> tuple[ParameterProfileLikelihood, ParameterEstimate]:
         index, size, entry = problem.unknown_names.index(name), sizes[name.split("[")[0]], judged[name]
         found = compute_profile_likelihood_interval(problem, best, index, float(entry.std), there)
-        said = reject_undetermined_small_estimate(problem, best, index, entry, size, there)
+        said = mark_unidentifiable_small_estimate(problem, best, index, entry, size, there)
         return found, with_profile_interval(entry, found.interval, size) if said.verdict == entry.verdict else said
 
     progress.begin_stage(f"intervals of {len(wanted)} parameters by profile likelihood")
-    pairs = map_parameters_at_optimum(one, problem, view.x, wanted, progress)
+    pairs = apply_to_parameters_at_optimum(one, problem, view.x, wanted, progress)
     judged.update({name: said for name, (_, said) in pairs.items()})
     return {name: profile for name, (profile, _) in pairs.items()}
 
 
-def with_grasp_offset_effects(system: System) -> System:
+def system_with_grasp_offset_effects(system: System) -> System:
     """The system with a `grasp_offset` effect, at its neutral value, on every grasp that has none."""
     there = {effect.location for effect in system.effects if effect.kind == _GRASP_OFFSET_KIND}
     places = [grasp.name for grasp in system.grasps if grasp.name not in there]
@@ -317,7 +317,7 @@ class _Sensitivities:
         """Correlations of the parameters, NaN where nothing informs one."""
         own = covariance[np.ix_(self.chosen, self.chosen)]
         std = np.sqrt(np.diag(own))
-        most = MIN_UNINFORMED_RELATIVE_STD * np.maximum(self.scale, self.problem.unknown_scales[self.chosen])
+        most = MIN_RELATIVE_STD_TAKEN_AS_INFINITE * np.maximum(self.scale, self.problem.unknown_scales[self.chosen])
         std = np.where(std < most, std, np.nan)
         return np.asarray(own / np.outer(std, std))
 
@@ -441,7 +441,7 @@ def _moved(view: _Sensitivities, changes: Mapping[str, float]) -> float:
         return math.inf
     rows = problem.residual_rows.data
     change = np.zeros((len(view.nuisance), 1))
-    change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.data_residual_noise_std
+    change[rows, 0] = (evaluation.residual[rows] - view.evaluation.residual[rows]) / problem.rms_noise_of_data_residuals
     return float(np.linalg.norm(_orthogonal_part(change, view.nuisance))) / view.inflation
 
 

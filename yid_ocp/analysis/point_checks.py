@@ -13,7 +13,7 @@ import numpy as np
 import scipy.interpolate
 
 from yid_ocp.analysis.clock_checks import (
-    PositionFunction,
+    PositionsAtTimes,
     check_robot_held_point_clock,
     search_clock_offset_and_drift,
     timestamp_correction_advice,
@@ -150,7 +150,7 @@ def _changed_names(seen: Array, place: Array, names: Sequence[str]) -> Iterator[
         yield _Change("point_swapped", words, advice, _rms(seen[:, order] - place))
 
 
-def _changed_times(path: PositionFunction, knots: tuple[float, float], t: Array, seen: Array) -> Iterator[_Change]:
+def _changed_times(path: PositionsAtTimes, knots: tuple[float, float], t: Array, seen: Array) -> Iterator[_Change]:
     """Points recorded earlier or later than the angles, or by a clock that runs faster or more slowly."""
     before, middle = _rms(seen - path(t)), 0.5 * (t[0] + t[-1])
 
@@ -365,7 +365,7 @@ def _upside_down(
     """A cable that rises between its clamps by more than its own shape does: gravity points the other way."""
     pull = float(np.linalg.norm(gravity))
     free = [name for name in cable.free_vertex_names if name in at]
-    ends = [name for name in (cable.parent_vertices[0], cable.parent_vertices[-1]) if name in at]
+    ends = [name for name in (cable.parent_branch_points[0], cable.parent_branch_points[-1]) if name in at]
     if pull == 0 or len(ends) < 2 or not free:
         return None
     up = -gravity / pull

@@ -17,7 +17,7 @@ from yid_ocp.inference.uncertainty import (
     ConfidenceInterval,
     ParameterEstimate,
     cost_without_weak_priors,
-    is_std_sufficient,
+    needs_no_profile_likelihood,
     parameter_unknown_names,
     typical_parameter_magnitudes,
     unknowns_covariance_and_reduced_chi2,
@@ -89,13 +89,13 @@ def compute_profile_likelihood_interval(
     return ParameterProfileLikelihood(name, float(x[index]), lower, upper, values, deltas, tuple(walk.notes))
 
 
-def with_profile_intervals(
+def solution_with_profile_intervals(
     problem: EstimationProblem, solution: Solution, progress: Progress = NULL_PROGRESS
 ) -> Solution:
     """The solution with profile-likelihood intervals, and the verdicts they allow, for weakly determined parameters.
 
     There the cost is not a parabola; nor is it for stiffnesses that are small compared with their typical size
-    (`reject_undetermined_small_estimate`). Unchanged where the problem is too large for profiles.
+    (`mark_unidentifiable_small_estimate`). Unchanged where the problem is too large for profiles.
     """
     usable = solution.evaluation is not None and problem.options.weighting != "paper"
     if not usable or not is_small_enough_for_profiles(problem):
@@ -105,25 +105,25 @@ def with_profile_intervals(
     for name, entry in solution.parameters.items():
         size = sizes.get(name.split("[")[0], math.nan)
         small = entry.value < _SMALL_VALUE_FRACTION * size
-        if entry.verdict in ("identifiable", "weak") and (small or not is_std_sufficient(entry)):
+        if entry.verdict in ("identifiable", "weak") and (small or not needs_no_profile_likelihood(entry)):
             asked[name] = size
     if not asked:
         return solution
 
     def judged(name: str, best: Array, there: Evaluation) -> ParameterEstimate:
         index, size = problem.unknown_names.index(name), asked[name]
-        entry = reject_undetermined_small_estimate(problem, best, index, solution.parameters[name], size, there)
-        if entry.verdict != "not_identifiable" and not is_std_sufficient(entry):
+        entry = mark_unidentifiable_small_estimate(problem, best, index, solution.parameters[name], size, there)
+        if entry.verdict != "not_identifiable" and not needs_no_profile_likelihood(entry):
             profile = compute_profile_likelihood_interval(problem, best, index, entry.std, there)
             entry = with_profile_interval(entry, profile.interval, size)
         return entry
 
     progress.begin_stage(f"intervals of {', '.join(asked)} by profile likelihood")
-    found = map_parameters_at_optimum(judged, problem, solution.x, tuple(asked), progress)
+    found = apply_to_parameters_at_optimum(judged, problem, solution.x, tuple(asked), progress)
     return replace(solution, parameters={**solution.parameters, **found})
 
 
-def map_parameters_at_optimum(
+def apply_to_parameters_at_optimum(
     judged: Callable[[str, Array, Evaluation], _Found],
     problem: EstimationProblem,
     x: Array,
@@ -142,7 +142,7 @@ def map_parameters_at_optimum(
     return dict(zip(names, map_with_batched_calls(one, names), strict=True))
 
 
-def reject_undetermined_small_estimate(
+def mark_unidentifiable_small_estimate(
     problem: EstimationProblem, x: Array, index: int, entry: ParameterEstimate, size: float, evaluation: Evaluation
 ) -> ParameterEstimate:
     """The estimate, or `not_identifiable` where it is small and the data do not rule out its typical size at 99.9 %.

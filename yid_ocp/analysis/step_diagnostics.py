@@ -121,7 +121,7 @@ _MAX_LISTED_ROWS = 8  # rows that are named one by one
 
 
 @dataclass(frozen=True)
-class ParameterEquationDependence:
+class ParameterRowsAndSensorResponse:
     """The equations of a step that one parameter enters, and how strongly sensors respond to it."""
 
     parameter: str
@@ -167,14 +167,14 @@ class ParameterEquationDependence:
         return f"{said}, {len(self.seen)} of which sensors see to first order ({_summarize_rows(self.seen)}){best}"
 
 
-def parameter_dependences(
+def parameter_rows_and_sensor_responses(
     step: Step,
     symbols: StepSymbols,
     episode: Episode | None,
     state: Array,
     theta: Array,
     stages: StepEquationLinearizations,
-) -> tuple[ParameterEquationDependence, ...]:
+) -> tuple[ParameterRowsAndSensorResponse, ...]:
     """Dependence of the step equations and of a recording's sensors on every parameter, about a state (nx,).
 
     A unit is added to one row of one step that starts at `state`; with A - B_u K the steps after it are linear, K the
@@ -188,7 +188,7 @@ def parameter_dependences(
             entered[column - at.start].append(row)
     known = [(p.name, p.unit, tuple(names[r] for r in sorted(entered[i]))) for i, p in enumerate(parameters)]
     if episode is None:
-        return tuple(ParameterEquationDependence(*entry, None, "", (), None, 0.0) for entry in known)
+        return tuple(ParameterRowsAndSensorResponse(*entry, None, "", (), None, 0.0) for entry in known)
     gain = np.zeros((step.sizes["nu"], step.sizes["nx"]))
     if episode.tracking_feedback is not None:
         gain[:, episode.tracking_feedback.state_indices] = episode.tracking_feedback.gain[0]
@@ -204,7 +204,7 @@ def parameter_dependences(
         best = sensors[int(np.argmax(np.max(by_row[:, answered], axis=1)))].name if answered else ""
         seen, read = tuple(names[r] for r in answered), tuple(s.name for s in sensors if np.any(s.by_theta[:, i]))
         moved = float(np.max(by_theta[:, i], initial=0.0))
-        found.append(ParameterEquationDependence(*entry, seen, best, read, moved, span))
+        found.append(ParameterRowsAndSensorResponse(*entry, seen, best, read, moved, span))
     return tuple(found)
 
 

@@ -16,9 +16,9 @@ import scipy.linalg
 
 from yid_ocp.arrays import Array
 from yid_ocp.errors import SolverError
-from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory
+from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory_from_prediction
 from yid_ocp.integrator.step import linearized_steps
-from yid_ocp.integrator.tracking_feedback import applied_torque_error_feedthrough
+from yid_ocp.integrator.tracking_feedback import applied_torque_by_torque_error
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel
 from yid_ocp.problem.evaluation import Evaluation
@@ -29,7 +29,7 @@ _NEGLIGIBLE_STD = 0.1  # standard deviation that is left out, in units of a read
 _INITIAL_RANDOM_SAMPLES, _MAX_RANDOM_SAMPLES = 128, 512
 
 
-def episode_sensitivities_and_information(
+def point_sensitivities_and_joint_information(
     problem: EstimationProblem,
     evaluation: Evaluation,
     x: Array,
@@ -59,7 +59,7 @@ def episode_sensitivities_and_information(
             shown.append((samples.sensor, block.reshape(len(samples.value), -1, len(x))))
         else:
             told.append(block)
-    course = nominal_trajectory(problem.predictor, episode, result, problem.split(x, i)[0])
+    course = nominal_trajectory_from_prediction(problem.predictor, episode, result, problem.split(x, i)[0])
     units = [finest[sensor.group_name] for sensor, block in shown for _ in range(block.shape[1])]
     by_state = []
     for sensor, _ in shown:
@@ -144,7 +144,7 @@ class _Motion:
             state, by_error = here.state_by_state.copy(), here.state_by_torque.copy()
             angles = np.zeros_like(by_error)
             if feedback is not None:
-                by_error = here.state_by_torque @ applied_torque_error_feedthrough(feedback.gain[k], momentum)
+                by_error = here.state_by_torque @ applied_torque_by_torque_error(feedback.gain[k], momentum)
                 pulled = here.state_by_torque @ feedback.gain[k]
                 state[:, feedback.state_indices] -= pulled
                 angles = pulled[:, : angles.shape[1]] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)

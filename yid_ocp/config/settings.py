@@ -16,9 +16,9 @@ from annotated_types import Ge, Gt, Le, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
-from yid_ocp.data.recording import ClockKind
+from yid_ocp.data.recording import RecordedOrNominalClock
 from yid_ocp.diagnosis.thresholds import Thresholds
-from yid_ocp.effects.friction import FrictionLaw
+from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.errors import ConfigError
 from yid_ocp.inference.null_test import ExcessResidualCriteria
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
@@ -122,7 +122,7 @@ class FrictionSettings:
     """Ordinary friction in the robot's joints, whose size is estimated."""
 
     law: Annotated[
-        FrictionLaw,
+        FrictionLawName,
         OptionInfo(
             "viscous; coulomb beside it; stribeck (more at low speed) beside both; presliding (Dahl: holds at rest); "
             "load (grows with the torque through the gear) beside Coulomb; load_stribeck, all of them"
@@ -208,7 +208,7 @@ class ImportSettings:
     torque_constants: Annotated[_Numbers, OptionInfo("by joint or pattern, where efforts are currents", "N m/A")] = None
     gears: Annotated[_Numbers, OptionInfo("turns of the motor per turn of the joint, by joint or pattern; or 1")] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
-    clock: Annotated[ClockKind | None, OptionInfo("of a table: whether its times were measured")] = None
+    clock: Annotated[RecordedOrNominalClock | None, OptionInfo("of a table: whether its times were measured")] = None
     sensor: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
     frame: Annotated[str | None, OptionInfo("frame of reference of the points, of a table or C3D file")] = None
 
@@ -240,21 +240,21 @@ class DiagnosisSettings(Thresholds):
 
     candidates: Annotated[Literal["all"] | _Names, OptionInfo("effects to try: all, kind or kind@location")] = "all"
     exclude: Annotated[_Names, OptionInfo("candidates not to try, by kind or kind@location")] = ()
-    noise_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("part of stated std that is noise, not model error")] = (
-        1.0
-    )
+    noise_fraction_of_std: Annotated[
+        float, Gt(0), Le(1), OptionInfo("part of stated std that is noise, not model error")
+    ] = 1.0
     baseline: Annotated[tuple[_FilePath, ...], OptionInfo("earlier runs of this model, to ask what differs")] = ()
 
     @property
     def null_test_residual_limits(self) -> ExcessResidualCriteria:
         """Limits of the null test on the residual after a fit, in units of the sensors' stated standard deviations."""
-        return replace(self.null_test_limits, noise_fraction=self.noise_fraction)
+        return replace(self.null_test_limits, noise_fraction_of_std=self.noise_fraction_of_std)
 
 
 def _compared() -> dict[str, Solver]:
     return {
         "steepest_descent": SteepestDescent(
-            first_trial_step="spectral", nonmonotone_memory=10, max_iterations=800, gradient_tolerance=1e-4
+            first_trial_step_rule="spectral", nonmonotone_memory=10, max_iterations=800, gradient_tolerance=1e-4
         ),
         "single_shooting": SingleShooting(),
         "gauss_newton": GaussNewton(),

@@ -242,7 +242,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
                 yield Issue("saturated", what, "not_trusted", ratio, advice, "", group, channel, begin, end)
 
 
-def median_point_pair_distances(
+def typical_point_pair_distances(
     edges: Sequence[tuple[str, str]], recordings: Sequence[Recording], frames: int | None = None
 ) -> dict[tuple[str, str], float]:
     """Distance between the points of every pair: mean over a recording's frames, median over recordings [m].

@@ -14,7 +14,7 @@ from yid_ocp.sensors import SensorOptions
 
 Severity = Literal["warning", "not_trusted", "refused"]
 
-MAX_ISSUE_EVIDENCE = 1e3
+MAX_EVIDENCE_RATIO = 1e3
 """Largest value of `Issue.evidence`; larger ratios are clipped."""
 DEGREES_PER_RADIAN = math.degrees(1.0)
 MIN_DIFFERENCES_FOR_NOISE_STD = 30
@@ -53,7 +53,7 @@ class Issue:
     what: str  # the same in one sentence, with numbers
     # whether a run goes on as it would (and says so), goes on but says of no number that it is found, or stops
     weight: Severity
-    evidence: float  # how many times what was seen exceeds the limit from which on it counts, 1 to `MAX_ISSUE_EVIDENCE`
+    evidence: float  # how many times what was seen exceeds the limit from which on it counts, 1 to `MAX_EVIDENCE_RATIO`
     advice: str  # what to do
     # where; empty for all of them
     recording: str
@@ -67,7 +67,7 @@ class Issue:
     def __post_init__(self) -> None:
         if self.cause not in ISSUE_CAUSE_DESCRIPTIONS:
             raise ValueError(f"there is no cause '{self.cause}'")
-        object.__setattr__(self, "evidence", float(min(max(self.evidence, 1.0), MAX_ISSUE_EVIDENCE)))
+        object.__setattr__(self, "evidence", float(min(max(self.evidence, 1.0), MAX_EVIDENCE_RATIO)))
 
     @property
     def certainty_word(self) -> str:

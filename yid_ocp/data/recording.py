@@ -17,7 +17,7 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.sensors.base import EffortKind, declared_channel_kinds
 
-ClockKind = Literal["recorded", "nominal"]
+RecordedOrNominalClock = Literal["recorded", "nominal"]
 
 JOINT_CHANNEL_UNITS: Mapping[str, str] = {
     "position": "rad",
@@ -31,7 +31,7 @@ JOINT_CHANNEL_UNITS: Mapping[str, str] = {
 """Channels of a joint group and their units."""
 
 _STD_NAMES = ("position_std", "velocity_std", "effort_std", "effort_bias_std")
-JOINT_CONSTANT_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
+PER_JOINT_ATTRIBUTE_NAMES = (*_STD_NAMES, "position_resolution", "proportional_gain")
 """Constants that a joint group may have, not negative, of all joints or one for each."""
 POINT_GROUP_NAME_PATTERN = re.compile(r"points(_[^/]+)?")
 """Pattern of allowed names of point groups."""
@@ -81,12 +81,12 @@ class JointGroup(ReprMixin):
     position_resolution: float | Array | None = None
     proportional_gain: float | Array | None = None
     effort_kind: EffortKind | None = None
-    clock: ClockKind = "recorded"
+    clock: RecordedOrNominalClock = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t", *JOINT_CHANNEL_UNITS))
-        for name in JOINT_CONSTANT_NAMES:
+        for name in PER_JOINT_ATTRIBUTE_NAMES:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _constant(getattr(self, name), f"joints, attribute {name}"))
 
@@ -128,7 +128,7 @@ class PointGroup(ReprMixin):
     sensor: str = "unknown"
     frame: str = "world"
     pose: Array | None = None
-    clock: ClockKind = "recorded"
+    clock: RecordedOrNominalClock = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -162,7 +162,7 @@ class ChannelGroup(ReprMixin):
     t: Array
     values: Mapping[str, Array]
     stds: Mapping[str, float | Array] = field(default_factory=dict)
-    clock: ClockKind = "recorded"
+    clock: RecordedOrNominalClock = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -376,7 +376,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
     enabled = joints.torque_enable
     ok = enabled is None or np.isin(enabled, (0.0, 1.0)).all()
     require_data(ok, "torque_enable is neither 0 nor 1", f"{where}/torque_enable", "0 (off) or 1 (on)")
-    for name in JOINT_CONSTANT_NAMES:
+    for name in PER_JOINT_ATTRIBUTE_NAMES:
         std, place = getattr(joints, name), f"{where}, attribute {name}"
         if std is not None:
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")
@@ -476,7 +476,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | ChannelGroup, where:
         require_data(usable, what, place, allowed, "rename it")
         what = f"the name '{name}' occurs {count} times"
         require_data(count == 1, what, place, "every name once", "rename all but one")
-    clocks, place = get_args(ClockKind), f"{where}, attribute clock"
+    clocks, place = get_args(RecordedOrNominalClock), f"{where}, attribute clock"
     require_data(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))

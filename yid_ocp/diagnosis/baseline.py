@@ -145,9 +145,9 @@ class BaselineData:
         found = self.compare_with_baseline(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
-    def predict_counterfactual(
+    def predict_with_effects_removed_and_added(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> CounterfactualTest | None:
+    ) -> EffectRemovalAndAdditionTest | None:
         """Predict reference recordings with the effects of `last` removed, and the diagnosed ones with them added.
 
         None without effects or reference recordings. Without earlier runs what is known of the world without the
@@ -167,8 +167,8 @@ class BaselineData:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return CounterfactualTest(removed, _nothing(present, error.what))
-        return CounterfactualTest(removed, _predicted(last, present, then, {**then, **effects}))
+            return EffectRemovalAndAdditionTest(removed, _nothing(present, error.what))
+        return EffectRemovalAndAdditionTest(removed, _predicted(last, present, then, {**then, **effects}))
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
@@ -218,7 +218,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class CounterfactualTest:
+class EffectRemovalAndAdditionTest:
     """Prediction errors with the effects removed, and with the effects added."""
 
     # made without the effects: by the diagnosed model less its effects, against the nominal model as it was fitted
@@ -267,7 +267,7 @@ def _errors(problem: EstimationProblem, values: Mapping[str, float], effects: Se
 
 def _estimated_without(last: RefittedModel, without: Sequence[Recording], shared: Sequence[str]) -> dict[str, float]:
     """The nominal parameters as they are estimated on the recordings without the effects."""
-    problem = _on(last, without).with_free_subset(shared)
+    problem = _on(last, without).with_compiled_parameters_free(shared)
     outcome = REFIT_SOLVER.minimize_cost(problem, problem.initial_unknowns, None)
     if outcome.status == Status.FAILED:
         what = "the nominal model cannot be fitted to the recordings without the effects"

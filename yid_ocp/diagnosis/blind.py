@@ -162,7 +162,7 @@ class BlindCase:
     excluded_kinds: tuple[str, ...]  # left out of the library; mostly one that has nothing to do with the case
 
 
-def seal_labels_with_hash(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
+def sealed_labels_and_hash(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
     """Return the labels as JSON text and its SHA-256 hash, published before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
@@ -276,15 +276,15 @@ class BlindCaseGenerator:
             for s in self._linearize_clean_recordings().signatures
         )
 
-    def detectable_effect_sizes_to_json(self) -> list[dict[str, Any]]:
+    def candidate_sensitivities_to_json(self) -> list[dict[str, Any]]:
         """Return the sensitivity of every candidate, which gives its detectable size, JSON-compatible."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable
         ]
 
-    def load_detectable_effect_sizes(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Load detectable sizes computed by another process, from `detectable_effect_sizes_to_json`."""
+    def load_candidate_sensitivities(self, detectable: Sequence[Mapping[str, Any]]) -> None:
+        """Load detectable sizes computed by another process, from `candidate_sensitivities_to_json`."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))

@@ -35,7 +35,7 @@ from yid_ocp.diagnosis.hypotheses import (
 )
 from yid_ocp.diagnosis.localise import (
     GapLocation,
-    attribute_gap_to_effects,
+    gap_locations_by_effect_closure,
     localise_gap,
     main_gap_locations,
     merge_time_intervals,
@@ -53,17 +53,17 @@ from yid_ocp.diagnosis.select import UNDEFINED_GAP_CLOSURE, SelectedEffect, held
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.diagnosis.verdict import (
     check_parameter_transfer,
-    compute_explained_chi2_fraction,
     decide_verdict,
+    explained_fraction_of_smoother_chi2,
     find_unknown_verdict_reason,
+    fit_with_disagreement_in_std,
     has_significant_gap,
-    inflate_std_by_disagreement,
     is_chance_excess,
 )
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.null_test import (
     NullTestResult,
-    channel_noise_levels,
+    assumed_channel_noise_levels,
     residual_channel_samples,
     run_null_test,
     whiten_with_extra_errors,
@@ -199,12 +199,12 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
     clock["refits"] = time.perf_counter()
     carried = check_parameter_transfer(search, added[-1].refitted_model) if added else ()
     if carried:
-        last = inflate_std_by_disagreement(added[-1].refitted_model, carried)
+        last = fit_with_disagreement_in_std(added[-1].refitted_model, carried)
         added = (*added[:-1], replace(added[-1], refitted_model=last))
     clock["carry_over"] = time.perf_counter()
     last = added[-1].refitted_model if added else nominal
     total = held_out_gap_closure(nominal.held_out_loss, last.held_out_loss, limits) if added else UNDEFINED_GAP_CLOSURE
-    explained = compute_explained_chi2_fraction(nominal, added, trusted)
+    explained = explained_fraction_of_smoother_chi2(nominal, added, trusted)
     same = all(entry.is_consistent for entry in carried)
     reason = find_unknown_verdict_reason(added, total, limits, explained, same)
     # what parameters explain by moving is no gap
@@ -217,7 +217,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
     clock["remaining"] = time.perf_counter()
     finding = DiagnosisResult(
         verdict=verdict,
-        noise_floor=channel_noise_levels(nominal.problem),
+        noise_floor=assumed_channel_noise_levels(nominal.problem),
         nominal_test=before,
         nominal_held_out_test=held,
         detectability=screened.detectability,
@@ -244,7 +244,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
         stage_seconds={name: clock[name] - clock[last] for last, name in itertools.pairwise(clock)},
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
-        counterfactual=earlier.predict_counterfactual(nominal, final, search.progress),
+        counterfactual=earlier.predict_with_effects_removed_and_added(nominal, final, search.progress),
     )
     return replace(finding, summary=diagnosis_summary_text(finding))
 
@@ -438,7 +438,7 @@ def _after(
         place, part = entry.effect.location, entry.cumulative_closure.fraction
         closed[place] = closed.get(place, 0.0) + max(part - most, 0.0)
         most = max(part, most)
-    return remaining, attribute_gap_to_effects(where, closed, rest, windows), rest
+    return remaining, gap_locations_by_effect_closure(where, closed, rest, windows), rest
 
 
 def _changes(before: RefittedModel, after: RefittedModel) -> tuple[NominalParameterChange, ...]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from yid_ocp.diagnosis.baseline import BaselineComparison, CounterfactualTest
+from yid_ocp.diagnosis.baseline import BaselineComparison, EffectRemovalAndAdditionTest
 from yid_ocp.diagnosis.events import NO_EVENTS, DisturbanceEvent, EventSet
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.localise import GapLocation, main_gap_locations
@@ -32,13 +32,13 @@ from yid_ocp.diagnosis.verdict import (
     UnknownVerdictReason,
     failed_transfer_checks,
     independent_assumption_count,
-    required_explained_fraction,
+    required_fraction_of_smoother_chi2,
 )
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.effects import EffectBase
 from yid_ocp.effects.base import EXCITATION_DESCRIPTIONS
 from yid_ocp.files import attributes_to_json, to_json_types
-from yid_ocp.inference.null_test import ChannelNoiseLevel, NullTestResult, min_bonferroni_p_value
+from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult, min_bonferroni_p_value
 from yid_ocp.inference.smoother import SmootherResult
 from yid_ocp.inference.uncertainty import covariance_to_dict, unknowns_covariance_and_reduced_chi2
 
@@ -61,7 +61,7 @@ class DiagnosisResult(ReprMixin):
     """The result of a diagnosis: verdict, gap, locations, effects and the statistics behind them."""
 
     verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
-    noise_floor: tuple[ChannelNoiseLevel, ...]
+    noise_floor: tuple[AssumedChannelNoiseLevel, ...]
     nominal_test: NullTestResult  # on the recordings to estimate on
     nominal_held_out_test: NullTestResult
     detectability: tuple[CandidateDetectability, ...]
@@ -83,7 +83,7 @@ class DiagnosisResult(ReprMixin):
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]
     baseline_comparison: BaselineComparison | None = None
-    counterfactual: CounterfactualTest | None = None
+    counterfactual: EffectRemovalAndAdditionTest | None = None
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
     unknown_reason: UnknownVerdictReason = ""
@@ -149,7 +149,7 @@ class DiagnosisResult(ReprMixin):
             "side": None if smoothed is None else smoothed.gap_origin,
             "evidence": {} if smoothed is None else dict(smoothed.log_evidence),
             "explainable": None if smoothed is None else smoothed.explainable_gap_fraction,
-            "statistics": statistics_compared_with_thresholds(self),
+            "statistics": decision_statistics_to_dict(self),
             "summary": self.summary,
             "message": self.message,
             "held_out_in_blocks": self.is_split_in_blocks,
@@ -173,7 +173,7 @@ class DiagnosisResult(ReprMixin):
         }
 
 
-def statistics_compared_with_thresholds(finding: DiagnosisResult) -> dict[str, Any]:
+def decision_statistics_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     """Return the statistics compared with `Thresholds`, JSON-compatible, from which these are calibrated.
 
     `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the worst
@@ -260,7 +260,7 @@ def _rejected_candidates(finding: DiagnosisResult) -> list[dict[str, Any]]:
     failed, listed = failed_transfer_checks(finding.transfer_checks), []
     for entry in finding.selected_effects if finding.unknown_reason == "stand_in" else ():
         own = [check for check in failed if check.effect_label == entry.effect.label] or failed
-        reason = "; ".join(check.disagreement_text for check in own)
+        reason = "; ".join(check.both_estimates_text for check in own)
         closed = to_json_types(entry.cumulative_closure.fraction)
         listed.append({**attributes_to_json(entry.effect, _EFFECT), "closure": closed, "reason": reason})
     return listed
@@ -438,7 +438,7 @@ def _places(finding: DiagnosisResult) -> str:
 def _nameless(finding: DiagnosisResult) -> str:
     """Why no effect is named, with the numbers that say so."""
     added, tried, reason = finding.selected_effects, finding.single_effect_models, finding.unknown_reason
-    apart = [entry.disagreement_text for entry in failed_transfer_checks(finding.transfer_checks)]
+    apart = [entry.both_estimates_text for entry in failed_transfer_checks(finding.transfer_checks)]
     count = independent_assumption_count(added)
     return _UNKNOWN_REASON_TEXTS[reason if reason != "none" or tried else "nothing"].format(
         best=tried[0].effects[0].label if tried else "",
@@ -450,7 +450,7 @@ def _nameless(finding: DiagnosisResult) -> str:
         least=100 * finding.thresholds.min_gap_closed,
         explained=100 * finding.explained_fraction,
         asked=f"of the former are asked of {count} assumptions" if count > 1 else "of either are asked",
-        enough=100 * required_explained_fraction(added, finding.thresholds),
+        enough=100 * required_fraction_of_smoother_chi2(added, finding.thresholds),
         apart="; ".join(apart[:2]),
     )
 
@@ -533,7 +533,7 @@ _COUNTERFACTUAL_TEXTS = (
 """Beginning, how the recordings were made, and what the prediction is compared with: effects removed, and added."""
 
 
-def _counterfactual(found: CounterfactualTest) -> list[str]:
+def _counterfactual(found: EffectRemovalAndAdditionTest) -> list[str]:
     """Whether taking the effects away predicts the world without them, and adding them the world with them."""
     text = []
     both = (found.effects_removed, found.effects_added)

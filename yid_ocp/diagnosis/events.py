@@ -33,7 +33,7 @@ from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.files import attributes_to_json
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, times_since_recording_start
 from yid_ocp.inference.smoother import SmootherResult, force_log_likelihood_coefficients
-from yid_ocp.inference.smoother_model import linear_residual_models, sensor_bias_source_name
+from yid_ocp.inference.smoother_model import linear_residual_models, sensor_bias_location
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
@@ -211,7 +211,7 @@ def _read_forces(
         if not samples.sensor.effort_joints or samples.node.ndim > 1 or len(samples.node) < 10:
             continue
         error, held = _allowed(torques, run, samples.node, limits)
-        unit_effort = samples.sensor.effort_per_output
+        unit_effort = samples.sensor.effort_per_unit_reading
         weight = np.where(samples.used_output_mask, samples.weight, 0.0) / unit_effort
         value = np.where(samples.used_output_mask, predicted - samples.value, 0.0) * unit_effort
         times = times_since_recording_start(episode, samples)
@@ -319,7 +319,7 @@ def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterat
         for column, channel in enumerate(samples.output_channel_names):
             location = channel.rpartition(".")[2]
             if sensor.outputs_per_channel > 1:
-                location = sensor_bias_source_name(problem.system, sensor, sensor.output_frames[column])
+                location = sensor_bias_location(problem.system, sensor, sensor.output_frames[column])
             seen, about = samples.used_output_mask[:, column], (location, sensor.output_names[column], sensor.unit)
             values = (samples.value - predicted)[seen, column]
             yield from _alone(t[seen], values, samples.std[seen, column], episode.name, about)

@@ -178,7 +178,7 @@ class AllCandidatesProblem:
     def with_free_effects(self, effects: Sequence[EffectBase]) -> EstimationProblem:
         """Return the problem with the nominal parameters and those of some effects free."""
         own = (name for effect in effects for name in effect.parameters.names)
-        return self.problem.with_free_subset((*self.nominal_free_parameters, *own))
+        return self.problem.with_compiled_parameters_free((*self.nominal_free_parameters, *own))
 
     def relinearized_with_effects(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
         """Return the problem with some effects free, relinearised about the torque errors that remain with them.

@@ -89,7 +89,7 @@ def merge_time_intervals(spans: Sequence[tuple[float, float]]) -> tuple[tuple[fl
     return tuple(joined)
 
 
-def attribute_gap_to_effects(
+def gap_locations_by_effect_closure(
     before: Sequence[GapLocation],
     closed: Mapping[str, float],
     rest: Sequence[GapLocation],

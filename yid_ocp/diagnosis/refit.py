@@ -28,7 +28,7 @@ from yid_ocp.parallel import map_with_batched_calls
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import EquilibriumGuesses, Evaluation
-from yid_ocp.problem.predictions import rmse_by_channel
+from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
 from yid_ocp.progress import ParallelProgress, Progress
 from yid_ocp.solvers import GaussNewton, Solution, Status
 from yid_ocp.solvers.base import SolverResult
@@ -386,7 +386,7 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
 def held_out_channel_errors(found: Sequence[tuple[Episode, EpisodePrediction | str]]) -> dict[str, tuple[float, str]]:
     """Root mean square error and its unit by channel, over the held-out recordings that could be predicted."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
-    errors = rmse_by_channel(*map(list, zip(*predicted, strict=True))) if predicted else {}
+    errors = rmse_unit_and_count_by_channel(*map(list, zip(*predicted, strict=True))) if predicted else {}
     return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}
 
 

@@ -97,7 +97,7 @@ def linearize_candidates(
         chosen = [effect for effect in problem.candidate_effects if k < len(grids.get(effect.label, ()))]
         shape = {name: value for effect in chosen for name, value in grids[effect.label][k].items()}
         amplitudes = [name for effect in chosen for name in effect.amplitude_names]
-        trial = placed.with_free_subset((*problem.nominal_free_parameters, *own, *amplitudes))
+        trial = placed.with_compiled_parameters_free((*problem.nominal_free_parameters, *own, *amplitudes))
         trial = trial.with_parameter_values(shape)
         evaluation = trial.evaluate(trial.vector(values), equilibrium_guesses=warm)
         if not evaluation.ok or evaluation.jacobian is None:
@@ -299,7 +299,7 @@ class AllCandidatesScoreModel:
             yield (one, other), values, float(penalized)
 
 
-def score_candidates_jointly(
+def make_joint_score_model(
     point: AllCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
 ) -> AllCandidatesScoreModel:
     """Return the joint linear model of all candidates, at the scores' shape values or the middle of the grid."""
@@ -338,7 +338,7 @@ class ScreeningResult:
     detectability: tuple[CandidateDetectability, ...]
     candidate_scores: tuple[CandidateScore, ...]  # best first
     confusability: ConfusabilityMatrix
-    joint_scores: AllCandidatesScoreModel
+    joint_score_model: AllCandidatesScoreModel
 
 
 def screen_candidates(
@@ -351,5 +351,5 @@ def screen_candidates(
     point = linearize_candidates(problem, base, values, limits.shape_grid_size)
     visible = candidate_detectability(point, limits.detection_z)
     ranked = score_candidates(point, residual_channel_samples(problem.problem), visible)
-    everything = score_candidates_jointly(point, ranked)
+    everything = make_joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, confusability_matrix(everything), everything)

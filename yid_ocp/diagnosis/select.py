@@ -312,7 +312,7 @@ def _pairs_to_refit(screened: ScreeningResult, limits: Thresholds, without: Effe
 
     labels = [score.effect.label for score in screened.candidate_scores if score.effect.label != without.label]
     chosen: list[_Start] = []
-    for (a, b), values, _ in screened.joint_scores.ranked_pairs(labels):
+    for (a, b), values, _ in screened.joint_score_model.ranked_pairs(labels):
         if len(chosen) == limits.n_refit_pairs:
             break
         before = (pair for pair, _ in chosen)

@@ -40,7 +40,7 @@ class ParameterTransferCheck:
     is_consistent: bool
 
     @property
-    def disagreement_text(self) -> str:
+    def both_estimates_text(self) -> str:
         """Both estimates, in words."""
         here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
@@ -93,7 +93,7 @@ def _compare(
     return found
 
 
-def inflate_std_by_disagreement(fit: RefittedModel, entries: Sequence[ParameterTransferCheck]) -> RefittedModel:
+def fit_with_disagreement_in_std(fit: RefittedModel, entries: Sequence[ParameterTransferCheck]) -> RefittedModel:
     """Return the fit with amplitude standard deviations inflated by the disagreement between the recordings.
 
     Where two fits differ by more than `_DISAGREEMENT_Z` standard deviations of both together, each is known to the
@@ -173,7 +173,7 @@ def independent_assumption_count(added: Sequence[SelectedEffect]) -> int:
     return len({entry.effect.label if entry.effect.is_local else entry.effect.kind for entry in added})
 
 
-def required_explained_fraction(added: Sequence[SelectedEffect], limits: Thresholds) -> float:
+def required_fraction_of_smoother_chi2(added: Sequence[SelectedEffect], limits: Thresholds) -> float:
     """Return the fraction of the smoother's explained chi2 that the effects are required to explain.
 
     Each further assumption has to explain that part of what could be left.
@@ -186,8 +186,8 @@ def find_unknown_verdict_reason(
 ) -> UnknownVerdictReason:
     """Return why a gap has no accepted effect; empty if it has one.
 
-    Effects have to explain the part `required_explained_fraction` of what the smoother explains where the model was
-    fitted; a single assumption passes too where the lower 95 % bound of its held-out closure reaches
+    Effects have to explain the part `required_fraction_of_smoother_chi2` of what the smoother explains where the model
+    was fitted; a single assumption passes too where the lower 95 % bound of its held-out closure reaches
     `min_explained_fraction`.
     """
     if not added:
@@ -195,12 +195,12 @@ def find_unknown_verdict_reason(
     if not (total.ci_low > limits.min_gap_closed or total.is_decisive):
         return "unsure"
     elsewhere = independent_assumption_count(added) == 1 and total.ci_low >= limits.min_explained_fraction
-    if explained < required_explained_fraction(added, limits) and not elsewhere:
+    if explained < required_fraction_of_smoother_chi2(added, limits) and not elsewhere:
         return "little"
     return "" if carried else "stand_in"
 
 
-def compute_explained_chi2_fraction(
+def explained_fraction_of_smoother_chi2(
     nominal: RefittedModel, added: Sequence[SelectedEffect], smoothed: SmootherResult | None
 ) -> float:
     """Return the decrease of r'r by the effects over that by the smoother, both less degrees of freedom; else one."""

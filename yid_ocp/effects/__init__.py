@@ -40,7 +40,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     return base.build_effect(kind, location, system, values or {})
 
 
-def sensor_kinds() -> frozenset[str]:
+def required_signal_kinds() -> frozenset[str]:
     """`_SENSOR_KINDS` and what effects of one's own require."""
     return frozenset(_SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
 
@@ -48,10 +48,11 @@ def sensor_kinds() -> frozenset[str]:
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
     """Every pair (effect kind, location) possible in a system and visible in its recorded signals, ordered by kind.
 
-    The system is without the effects in question, the signals are among `sensor_kinds`. What works only on prescribed
-    joints is left out where no effort was recorded, for there nothing would show it. `ModelError` of another signal.
+    The system is without the effects in question, the signals are among `required_signal_kinds`. What works only on
+    prescribed joints is left out where no effort was recorded, for there nothing would show it. `ModelError` of another
+    signal.
     """
-    present, known = set(recorded_sensors), sensor_kinds()
+    present, known = set(recorded_sensors), required_signal_kinds()
     for name in sorted(present - known):
         raise ModelError(f"there is no kind of sensor '{name}'", **unknown_name_details(name, sorted(known)))
     unseen = set() if "joints.effort" in present else set(system.prescribed)

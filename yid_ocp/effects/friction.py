@@ -18,8 +18,8 @@ _SMOOTHING_TORQUE = 1e-3  # below which |torque| is smoothed [N m]
 _ABS_SMOOTHING_ANGLE = 1e-7  # turned in a step, below which |d| in Dahl's law is smoothed [rad]
 _SERIES_MAX_ANGLE_RATIO = 1e-2  # of step angle to yield angle, below which the exponential loses digits to a series
 
-FrictionLaw = Literal["viscous", "coulomb", "stribeck", "presliding", "load", "load_stribeck"]
-FRICTION_LAWS: Mapping[FrictionLaw, tuple[str, ...]] = {
+FrictionLawName = Literal["viscous", "coulomb", "stribeck", "presliding", "load", "load_stribeck"]
+FRICTION_LAW_EFFECT_KINDS: Mapping[FrictionLawName, tuple[str, ...]] = {
     "viscous": (),
     "coulomb": ("joint_coulomb",),
     "stribeck": ("joint_coulomb", "joint_stribeck"),
@@ -103,7 +103,7 @@ class JointLoadFriction(_JointFriction):
     def _load(self, state: MidpointState) -> ca.SX:
         """Torque through the gear [N m]."""
         system, index = state.system, state.system.mechanism.joint_index(self.location)
-        outside = system.weight_and_grasp_force(state, index)
+        outside = system.weight_and_grasp_force_on_coordinate(state, index)
         if self.location not in system.driven:  # its motor is taken to balance what pulls from outside
             return -2 * outside
         return system.input_force(state.u, state.q, state.v)[index] - outside

@@ -188,7 +188,7 @@ _NEUTRAL = FormatSupport("native", "neutral: it changes nothing and is left out"
 _UNUSED = FormatSupport("native", "it enters nothing in this model")
 
 
-def effect_format_support(system: System, values: Mapping[str, float], form: str) -> dict[str, FormatSupport]:
+def format_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FormatSupport]:
     """Whether an export format (`mjcf`, `urdf`, `sdf`) can express each effect of a system, by effect label."""
     value, found = ParameterEvaluator(system, values), dict[str, FormatSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
@@ -204,7 +204,7 @@ def effect_format_support(system: System, values: Mapping[str, float], form: str
     return found
 
 
-def parameter_format_support(
+def format_support_by_parameter(
     system: System, effects: Mapping[str, FormatSupport], form: str
 ) -> dict[str, FormatSupport]:
     """Whether an export format can express each parameter; an effect's parameters are as the effect."""

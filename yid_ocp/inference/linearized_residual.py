@@ -39,7 +39,7 @@ class NominalTrajectory:
     initial_state_by_torque: Array
 
 
-def nominal_trajectory(
+def nominal_trajectory_from_prediction(
     predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
 ) -> NominalTrajectory:
     """Trajectory of an episode about which its residual is linearized."""
@@ -140,7 +140,7 @@ def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Ev
     assert evaluation.jacobian is not None
     rows = problem.residual_rows
     units = np.ones(len(evaluation.residual))
-    units[rows.data] = problem.data_residual_noise_std
+    units[rows.data] = problem.rms_noise_of_data_residuals
     units = units[kept := rows.slice_without_weak_priors]
     return evaluation.residual[kept] / units, evaluation.jacobian[kept] / units[:, None]
 
@@ -172,7 +172,7 @@ def predicted_cost_reduction(jacobian: Array, residual: Array, step: Array) -> f
 
 def is_stationary_point(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
     """Whether no step from a point (evaluated with its Jacobian) promises a relevant cost reduction."""
-    noise = problem.data_residual_noise_std**2
+    noise = problem.rms_noise_of_data_residuals**2
     worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * noise)
     return achievable_cost_reduction(problem, x, evaluation) <= worth
 

@@ -27,12 +27,12 @@ class ExcessResidualCriteria:
     """Significance level and smallest excess chi2 at which a residual counts as exceeding its noise.
 
     It does where it is significant at the level and chi2/n - 1 is at least `min_excess_chi2`; of the stated standard
-    deviations `noise_fraction` is noise, the rest represents model error.
+    deviations `noise_fraction_of_std` is noise, the rest represents model error.
     """
 
     significance_level: float = 0.01
     min_excess_chi2: float = 0.1
-    noise_fraction: float = 1.0
+    noise_fraction_of_std: float = 1.0
 
 
 DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
@@ -52,7 +52,7 @@ class ResidualChannelSamples:
 
 
 @dataclass(frozen=True)
-class ChannelNoiseLevel:
+class AssumedChannelNoiseLevel:
     """Median standard deviation of the noise of one channel's samples, after smoothing where they are smoothed."""
 
     channel: str
@@ -83,7 +83,7 @@ class NullTestResult:
     windows: tuple[_ResidualWindow, ...]
 
 
-def channel_noise_levels(problem: EstimationProblem) -> tuple[ChannelNoiseLevel, ...]:
+def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
     """Noise levels that the problem assumes, channel by channel."""
     found: dict[str, list[Array]] = {}
     units: dict[str, str] = {}
@@ -93,7 +93,9 @@ def channel_noise_levels(problem: EstimationProblem) -> tuple[ChannelNoiseLevel,
                 found.setdefault(channel, []).append(samples.std[np.isfinite(samples.std[:, column]), column])
                 units[channel] = samples.sensor.unit
     joined = {channel: np.concatenate(parts) for channel, parts in found.items()}
-    return tuple(ChannelNoiseLevel(c, units[c], float(np.median(v)), len(v)) for c, v in joined.items() if len(v))
+    return tuple(
+        AssumedChannelNoiseLevel(c, units[c], float(np.median(v)), len(v)) for c, v in joined.items() if len(v)
+    )
 
 
 def _variance_inflation(colour: Array) -> float:

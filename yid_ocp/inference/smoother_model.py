@@ -26,8 +26,17 @@ from annotated_types import Ge, Gt, Le
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.effects.base import arm_joint_names
-from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualDerivativesAtNodes, nominal_trajectory
-from yid_ocp.integrator.step import AdditionalLoadDerivatives, active_state_mask, applied_joint_torque, linearized_steps
+from yid_ocp.inference.linearized_residual import (
+    NominalTrajectory,
+    ResidualDerivativesAtNodes,
+    nominal_trajectory_from_prediction,
+)
+from yid_ocp.integrator.step import (
+    StepDerivativesByLoad,
+    applied_joint_torque,
+    linearized_steps,
+    moving_observable_state_mask,
+)
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo
@@ -134,7 +143,7 @@ def _smoother_unknowns(course: _LinearizedEpisode, limits: SmootherThresholds) -
             frame = sensor.output_frames[column]
             biased.append((k, column))
             names.append(name)
-            sources.append(SmoothedUnknownGroup(sensor_bias_source_name(course.system, sensor, frame), "bias"))
+            sources.append(SmoothedUnknownGroup(sensor_bias_location(course.system, sensor, frame), "bias"))
             reference.append(limits.bias_prior_std * float(np.nanmedian(samples.std[:, column])))
     held, biases = np.array(grasped, int), tuple(biased)
     return _SmootherUnknowns(tuple(names), tuple(sources), np.array(reference), forced, held, tuple(pushed), biases)
@@ -161,7 +170,7 @@ def _unknown_forces(
     return names, sources, [size[place[name]] for name in names], forced
 
 
-def sensor_bias_source_name(system: System, sensor: Sensor, frame: str) -> str:
+def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
     """Return the location of a sensor's bias: the camera, the arm that holds the frame, else the sensor's group."""
     if sensor.camera_pose is not None:
         return "camera"
@@ -269,7 +278,7 @@ def linear_residual_models(
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
         groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
-        nominal = nominal_trajectory(problem.predictor, episode, result, problem.split(x, i)[0])
+        nominal = nominal_trajectory_from_prediction(problem.predictor, episode, result, problem.split(x, i)[0])
         pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
         blocks = [samples.residual_block(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
         course = _LinearizedEpisode(problem, episode, nominal)
@@ -282,7 +291,7 @@ def linear_residual_models(
     return (replace(found[0], intervals=(first, *later)), *found[1:])
 
 
-def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> AdditionalLoadDerivatives:
+def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> StepDerivativesByLoad:
     """What unknown forces and grasp offsets of their reference size add to every step."""
     step = course.problem.step
     n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
@@ -294,11 +303,11 @@ def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Additi
     rows[unknowns.forced, np.arange(forces)] = first_share * impulse
     momentum[unknowns.forced, np.arange(forces)] = (1 - first_share) * impulse
     rows[n + nz + unknowns.grasped, np.arange(forces, loading)] = unknowns.reference[forces:loading]
-    return AdditionalLoadDerivatives(rows, momentum)
+    return StepDerivativesByLoad(rows, momentum)
 
 
 def _steps(
-    course: _LinearizedEpisode, loads: AdditionalLoadDerivatives, pushes: Array, moving: IntArray, first: int, last: int
+    course: _LinearizedEpisode, loads: StepDerivativesByLoad, pushes: Array, moving: IntArray, first: int, last: int
 ) -> tuple[Array, Array, Array]:
     """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd'); pushes in forces."""
     a, e, effort = [], [], []
@@ -339,7 +348,7 @@ def _recording(
     pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
     linear = partial(linearized_steps, course.problem.step, course.nominal.theta, course.nominal.rollout, loads)
     ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
-    moving = np.flatnonzero(active_state_mask(course.problem.step, ends))
+    moving = np.flatnonzero(moving_observable_state_mask(course.problem.step, ends))
     slopes = ResidualDerivativesAtNodes.along(course.nominal).select_states(moving)
     by_bias = _bias_slopes(course, unknowns)
     interval_of_row = np.clip(np.searchsorted(edges, slopes.node, side="right") - 1, 0, len(edges) - 2)

@@ -26,7 +26,7 @@ ConfidenceInterval = tuple[float | None, float | None]
 MAX_IDENTIFIABLE_RELATIVE_STD = 0.1
 MAX_WEAK_RELATIVE_STD = 4.0
 # A standard deviation of so many times the value, or its typical size, stands for none at all.
-MIN_UNINFORMED_RELATIVE_STD = 1e6
+MIN_RELATIVE_STD_TAKEN_AS_INFINITE = 1e6
 # A value so near its bound, in units of the unknown's typical size, lies at it.
 _AT_BOUND_FRACTION = 1e-4
 # 95 % quantiles of chi2 with one degree of freedom, for an interval with one end and with two.
@@ -94,7 +94,7 @@ def assess_goodness_of_fit(
                 parts.append(((predicted - samples.value) / samples.std)[samples.used_output_mask])
         residual = np.concatenate(parts)
     series = residual_channel_samples(problem)
-    found = run_null_test(series, residual / limits.noise_fraction, len(problem.unknown_names))
+    found = run_null_test(series, residual / limits.noise_fraction_of_std, len(problem.unknown_names))
     explains = not residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_no_serious_data_issues)
 
@@ -199,7 +199,7 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
     for name in parameters if len(parameters) <= _MAX_CHECKED_PARAMETERS else ():
         i = problem.unknown_names.index(name)
         size = max(abs(float(x[i])), float(problem.unknown_scales[i]))
-        if not MAX_IDENTIFIABLE_RELATIVE_STD * abs(x[i]) < spread[i] < MIN_UNINFORMED_RELATIVE_STD * size:
+        if not MAX_IDENTIFIABLE_RELATIVE_STD * abs(x[i]) < spread[i] < MIN_RELATIVE_STD_TAKEN_AS_INFINITE * size:
             continue
         heights = []
         for sign, room in ((-1.0, float(x[i] - lower[i])), (1.0, float(upper[i] - x[i]))):
@@ -246,7 +246,7 @@ def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation)
     """Cost of data and stated priors in units of the noise."""
     rows = problem.residual_rows
     weak, stated = (0.5 * float(np.sum(evaluation.residual[r] ** 2)) for r in (rows.weak_priors, rows.stated_priors))
-    return (evaluation.cost - weak - stated) / problem.data_residual_noise_std**2 + stated
+    return (evaluation.cost - weak - stated) / problem.rms_noise_of_data_residuals**2 + stated
 
 
 def parameter_verdict(
@@ -312,7 +312,7 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
     return replace(entry, std=std, verdict=said, interval=interval)
 
 
-def is_std_sufficient(entry: ParameterEstimate) -> bool:
+def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
     """Whether the standard deviation describes the uncertainty, so that no profile likelihood is needed."""
     return entry.verdict == "identifiable" and entry.std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry.value)
 
@@ -371,7 +371,7 @@ def parameter_estimates(
     for name, at in free.items():
         entry = problem.system.parameters[name.split("[")[0]]
         value, std, low, high, scale = (float(v[at]) for v in (x, spread, lower, upper, scales))
-        std = std if std < MIN_UNINFORMED_RELATIVE_STD * max(abs(value), scale) else math.inf
+        std = std if std < MIN_RELATIVE_STD_TAKEN_AS_INFINITE * max(abs(value), scale) else math.inf
         near = _AT_BOUND_FRACTION * scale
         side = (-1 if value - low <= near else 1 if high - value <= near else 0) if known else 0
         explains = fit is None or (fit.explains and fit.believed)

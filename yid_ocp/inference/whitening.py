@@ -7,7 +7,7 @@ a recording; encoders by v. Along a rollout the error d of its state, model less
     d_{k+1} = (A_k - B_k K_k) d_k + B_k (G_k (w_k + b) - K_k v_k)      where they are not,
 
 with the correction du_k that the tracking filter K_k added to the recorded torque, and G_k what an error of the torque
-comes to with the momentum that the filter follows (`applied_torque_error_feedthrough`). In the first form du is known,
+comes to with the momentum that the filter follows (`applied_torque_by_torque_error`). In the first form du is known,
 and the outcome does not depend on the filter; in the second the filter is part of the model, as its reference is no
 measurement. Residuals are r = H d + v, so that with the filter's prediction m of (d, w, b)
 
@@ -41,9 +41,13 @@ import scipy.linalg.lapack
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
-from yid_ocp.inference.linearized_residual import NominalTrajectory, ResidualDerivativesAtNodes, nominal_trajectory
-from yid_ocp.integrator.step import LinearizedStep, active_state_mask, linearized_steps
-from yid_ocp.integrator.tracking_feedback import applied_torque_error_feedthrough
+from yid_ocp.inference.linearized_residual import (
+    NominalTrajectory,
+    ResidualDerivativesAtNodes,
+    nominal_trajectory_from_prediction,
+)
+from yid_ocp.integrator.step import LinearizedStep, linearized_steps, moving_observable_state_mask
+from yid_ocp.integrator.tracking_feedback import applied_torque_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
 from yid_ocp.problem.episode_prediction import EpisodePredictor
@@ -236,7 +240,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     linear = partial(linearized_steps, step, course.theta, course.rollout)
     slopes = ResidualDerivativesAtNodes.along(course)
     ends = [*linear(chosen=slice(0, 1)), *linear(chosen=slice(count - 1, count))]
-    live = active_state_mask(step, ends, slopes.visible_state_mask)
+    live = moving_observable_state_mask(step, ends, slopes.visible_state_mask)
     kept = np.flatnonzero(live)
     rows_of_node, slopes = slopes.residual_rows_by_node(count), slopes.select_states(kept)
     start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
@@ -289,7 +293,7 @@ def _error_step(
         # an error of the angles that the filter follows; that of the momenta as their slope averages out
         shaken = by_error @ feedback.gain[k][:, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
         # that as half the impulse of the step before does not
-        known = applied_torque_error_feedthrough(feedback.gain[k], momentum)
+        known = applied_torque_by_torque_error(feedback.gain[k], momentum)
         by_error, effort_by_error = by_error @ known, effort_by_error @ known
     effort = np.hstack([effort_by_state[:, kept], effort_by_error, effort_by_error]) if len(effort_by_state) else None
     return np.hstack([by_state[np.ix_(kept, kept)], by_error, by_error]), effort, shaken
@@ -326,7 +330,7 @@ def _whitened_episode(
         result = predictor.predict_episode(episode, *at, False, guess)
     if isinstance(result, str) or episode.input_errors is None:
         return episode, None
-    course = nominal_trajectory(predictor, episode, result, at[0])
+    course = nominal_trajectory_from_prediction(predictor, episode, result, at[0])
     return episode, _build_whitening_filter(course, episode.input_errors)
 
 
@@ -438,7 +442,7 @@ def _with_errors(
     return problem.with_episodes(list(map(without, problem.episodes)), list(map(without, problem.held_out)))
 
 
-def estimate_recording_torque_biases(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
+def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
     """Each recording's constant torque errors at `x`, and their standard deviations, (nu,) [N m].
 
     None where torques are taken as exact, or where no whitening filter is set (`problem_whitened_at`).

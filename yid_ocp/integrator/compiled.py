@@ -28,8 +28,8 @@ from yid_ocp.integrator.step_model import (
     TrackingFeedback,
     allocate_linearization,
     allocate_nan_rollout,
+    attach_step_status,
     out_of_memory_error,
-    rollout_with_status,
 )
 from yid_ocp.parallel import CasadiLockedCache, batched_call, map_in_threads
 
@@ -192,7 +192,7 @@ class CompiledKernel:
         by = (_Sensitivities * len(members))(*sensitivities) if sensitivities else None
         _check(library.yid_rollout(ctypes.c_int(len(members)), *filled, by, outcomes), outcomes[0])
         ends = ((o.status, o.step, o.error, (o.iterations, o.factorisations)) for o in outcomes)
-        return [rollout_with_status(out, sizes, *end) for out, end in zip(outs, ends, strict=True)]
+        return [attach_step_status(out, sizes, *end) for out, end in zip(outs, ends, strict=True)]
 
     def adjoint_gradient(
         self, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, names: tuple[str, ...], by: CostSlopes

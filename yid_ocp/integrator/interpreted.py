@@ -28,7 +28,7 @@ from yid_ocp.integrator.step_model import (
     TrackingFeedback,
     allocate_linearization,
     allocate_nan_rollout,
-    rollout_with_status,
+    attach_step_status,
 )
 from yid_ocp.parallel import CasadiLockedCache
 
@@ -160,7 +160,7 @@ class InterpretedKernel:
                     break
                 by[0][k + 1], by[1][k], by[2][k] = moved
             done = k + 1
-        return rollout_with_status(out, self._model.sizes, code, done, error, (total, total))
+        return attach_step_status(out, self._model.sizes, code, done, error, (total, total))
 
     def _moved(
         self, slopes: Array, wanted: SensitivityDirections, feedback: TrackingFeedback | None, before: Array, k: int

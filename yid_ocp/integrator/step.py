@@ -25,7 +25,7 @@ from yid_ocp.integrator.step_model import (
     StepStatus,
     TrackingFeedback,
     build_step_model,
-    newton_tolerance,
+    newton_correction_tolerance,
 )
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK
@@ -200,7 +200,7 @@ def compile_step(
 
 def step_with_time_step(step: Step, time_step: float) -> Step:
     """A copy of a step with another, positive, time step [s], from the same equations and compiled code."""
-    model = replace(step.model, time_step=_positive(time_step), tolerance=newton_tolerance(time_step))
+    model = replace(step.model, time_step=_positive(time_step), tolerance=newton_correction_tolerance(time_step))
     return Step(model, step.kernel.with_step_model(model), step.is_compiled)
 
 
@@ -346,14 +346,16 @@ class LinearizedStep:
 
 
 @dataclass(frozen=True)
-class AdditionalLoadDerivatives:
+class StepDerivativesByLoad:
     """Derivatives of a step's equations (nt, e) and next momentum (n, e) by e loads, equal in all steps."""
 
     residual: Array
     next_momentum: Array
 
 
-def active_state_mask(step: Step, steps: Sequence[LinearizedStep], seen: BoolArray | None = None) -> BoolArray:
+def moving_observable_state_mask(
+    step: Step, steps: Sequence[LinearizedStep], seen: BoolArray | None = None
+) -> BoolArray:
     """Mask of the states that move and that affect others, efforts or sensors, shape (nx,).
 
     Internal states of a neutral effect are excluded. `steps` are a representative sample, `seen` (nx,) says which
@@ -375,7 +377,7 @@ def linearized_steps(
     step: Step,
     theta: Array,
     rollout: Rollout,
-    loads: AdditionalLoadDerivatives | None = None,
+    loads: StepDerivativesByLoad | None = None,
     chosen: slice = _ALL_STEPS,
 ) -> Iterator[LinearizedStep]:
     """Iterate over the linearized steps of a finished rollout, with prescribed coordinates unchanged.
@@ -384,14 +386,14 @@ def linearized_steps(
     """
     if loads is None:
         rows = sum(step.sizes[key] for key in ("n", "nz", "m"))
-        loads = AdditionalLoadDerivatives(np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0)))
+        loads = StepDerivativesByLoad(np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0)))
     begin, end, _ = chosen.indices(len(rollout.torque))
     for first in range(begin, end, _STEPS_PER_CHUNK):
         yield from _chunk(step, theta, rollout, loads, slice(first, min(first + _STEPS_PER_CHUNK, end)))
 
 
 def _chunk(
-    step: Step, theta: Array, rollout: Rollout, loads: AdditionalLoadDerivatives, span: slice
+    step: Step, theta: Array, rollout: Rollout, loads: StepDerivativesByLoad, span: slice
 ) -> list[LinearizedStep]:
     """Some steps by the implicit function theorem; `numpy.linalg.LinAlgError` where their equations are singular."""
     n, nz, nx, nu = (step.sizes[key] for key in ("n", "nz", "nx", "nu"))

@@ -54,12 +54,12 @@ def build_step_model(
     n, nz = system.n_coordinates, e.z0.numel()
     sizes = {"n": n, "nz": nz, "m": e.lam.numel(), "nu": e.u.numel(), "nc": len(system.prescribed)}
     sizes |= {"nx": 2 * n + nz, "ntheta": e.theta.numel()}
-    limit = newton_tolerance(time_step) if tolerance is None else tolerance
+    limit = newton_correction_tolerance(time_step) if tolerance is None else tolerance
     tables = codegen.step_sparsity_tables(functions)
     return StepModel(system, e, functions, tables, sizes, float(time_step), limit)
 
 
-def newton_tolerance(time_step: float) -> float:
+def newton_correction_tolerance(time_step: float) -> float:
     """Newton's tolerance on the coordinates [rad or m] for a time step [s]."""
     return max(_ROUNDING_FLOOR, min(_COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE * time_step))
 
@@ -273,7 +273,7 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
     return InsufficientMemoryError(said, hint=hint)
 
 
-def rollout_with_status(
+def attach_step_status(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
     """A copy of the rollout with its `StepStatus`; `counts` are Newton iterations and factorisations."""

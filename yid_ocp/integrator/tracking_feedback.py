@@ -142,7 +142,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 
 
 @dataclass(frozen=True)
-class DrivenJointMotion:
+class DifferentiatedJointMotion:
     """Angles and torques of the driven joints over the steps of a recording, with their derivatives.
 
     The latter (..., d) are by d parameters and what follows these; None where nothing depends on them.
@@ -223,7 +223,11 @@ class EffectMomentumShift:
         return np.array(self._impulse(*arguments, theta, self._time_step))
 
     def momentum_shift_and_derivatives(
-        self, recorded: DrivenJointMotion, true: DrivenJointMotion, theta: Array, names: Sequence[str]
+        self,
+        recorded: DifferentiatedJointMotion,
+        true: DifferentiatedJointMotion,
+        theta: Array,
+        names: Sequence[str],
     ) -> tuple[Array, Array]:
         """Momentum with effects minus recorded, at every node but the last, (N, nu), and its derivatives, (N, nu, d).
 
@@ -257,7 +261,7 @@ class EffectMomentumShift:
         return (value - plain)[:, :, 0], total
 
     def _remembered(
-        self, motion: DrivenJointMotion, theta: Array, wanted: _Wanted, width: int
+        self, motion: DifferentiatedJointMotion, theta: Array, wanted: _Wanted, width: int
     ) -> tuple[Array, Array | None]:
         """What joints remember at every node but the last, (N, nk), and its derivatives, (N, nk, d), or None."""
         steps = len(motion.torque)
@@ -282,7 +286,7 @@ class EffectMomentumShift:
         return not set(names).isdisjoint(self.parameter_names) or bool(np.any(theta[self._columns] != self._neutral))
 
 
-def applied_torque_error_feedthrough(gain: Array, by_torque: Array) -> Array:
+def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
     """Derivative of the applied torque by an error of the recorded torque, feedback included, (nu, nu).
 
     The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
@@ -312,7 +316,7 @@ class _Memory:
         compiled = step.is_compiled
         self._maps = CasadiLockedCache[None, MappedFunction](lambda _: MappedFunction(function, (3, 4), compiled))
 
-    def along(self, motion: DrivenJointMotion, start: Array, theta: Array) -> Array:
+    def along(self, motion: DifferentiatedJointMotion, start: Array, theta: Array) -> Array:
         """Values at every node but the last, shape (N, k)."""
         before, now = motion._before_and_after
         found = [start]
@@ -322,7 +326,13 @@ class _Memory:
         return np.stack(found)
 
     def slopes(
-        self, motion: DrivenJointMotion, values: Array, start: list[int], theta: Array, columns: _Wanted, width: int
+        self,
+        motion: DifferentiatedJointMotion,
+        values: Array,
+        start: list[int],
+        theta: Array,
+        columns: _Wanted,
+        width: int,
     ) -> Array:
         """Derivatives of the values, shape (N, k, d)."""
         before, now = motion._before_and_after

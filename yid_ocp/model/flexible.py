@@ -31,7 +31,7 @@ class Segment:
     mass: float
     """Of the whole segment, spread along its length [kg]."""
     radius: float | None = None
-    """Of the solid cylinder that gives each link's inertia [m]; this or `cross_section`."""
+    """Of the solid cylinder that gives each link's inertia [m]; this or `cross_section_size`."""
     links: int = 4
     link_lengths: Sequence[float] | None = None
     """Unequal links, base to tip [m]."""
@@ -57,7 +57,7 @@ class Segment:
     one (only matters with `stiffness_per_curvature`)."""
     joint_axes: str = "xyz"
     """Axes of the turns at each joint, base to tip; about those left out the segment is rigid."""
-    cross_section: tuple[float, float] | None = None
+    cross_section_size: tuple[float, float] | None = None
     """Extents of a rectangular section along the links' x and y axes [m]."""
     link_length_parameters: bool = False
     """Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`, for
@@ -206,7 +206,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
     parts.layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, radius, mass, segment.parent)
 
 
-def parallel_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
+def relative_parallel_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
     """Twist-free rotation of each edge's frame against that of the edge before, a list of one (3, 3) per edge.
 
     They are what `Segment.rest_rotation` and `Segment.link_rest_rotations` take. `vertices`, shape (k, 3), are the
@@ -259,7 +259,7 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
     rows.append(("mass", segment.mass, "kg", small, "mass of the segment"))
     if segment.radius is not None:
         rows.append(("radius", segment.radius, "m", small, "radius of the solid cylinder"))
-    for axis, size in zip("xy", segment.cross_section or (), strict=False):
+    for axis, size in zip("xy", segment.cross_section_size or (), strict=False):
         rows.append((f"size_{axis}", size, "m", small, f"extent of the section along {axis}"))
     rows += [
         ("bend", segment.bend, per, 0.0, "bending stiffness of every joint, about x and y"),
@@ -276,7 +276,7 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
 
 def _check(segment: Segment, known: Mapping[str, SegmentLayout]) -> None:
     parent, at, axes = segment.parent, segment.parent_link_index, segment.joint_axes
-    section, lengths, turns = segment.cross_section, segment.link_lengths, segment.link_rest_rotations
+    section, lengths, turns = segment.cross_section_size, segment.link_lengths, segment.link_rest_rotations
     count = segment.links if lengths is None else len(lengths)
 
     def refuse(what: str, allowed: str = "", hint: str = "") -> NoReturn:
@@ -288,10 +288,10 @@ def _check(segment: Segment, known: Mapping[str, SegmentLayout]) -> None:
         what = f"parent '{parent}' of segment '{segment.name}' does not come before it"
         refuse(what, hint=nearest_name_hint(parent, known))
     if (segment.radius is None) == (section is None):
-        refuse("a segment needs a radius or a section", "one of the two", "cross_section: [0.001, 0.08]")
+        refuse("a segment needs a radius or a section", "one of the two", "cross_section_size: [0.001, 0.08]")
     sizes = {"mass": segment.mass, **({"length": segment.length} if lengths is None else {})}
     sizes |= {} if segment.radius is None else {"radius": segment.radius}
-    for quantity, value in (sizes | {f"cross_section[{i}]": size for i, size in enumerate(section or ())}).items():
+    for quantity, value in (sizes | {f"cross_section_size[{i}]": size for i, size in enumerate(section or ())}).items():
         if not (math.isfinite(value) and value > 0):
             refuse(f"{quantity} = {value}", "a positive number in SI units")
     if lengths is None and count < 1:

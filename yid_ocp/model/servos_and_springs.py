@@ -240,7 +240,7 @@ def _servo_parameters(joint: Joint) -> list[Parameter]:
     ]
 
 
-def without_gravity(tree: Mechanism) -> Mechanism:
+def mechanism_without_gravity(tree: Mechanism) -> Mechanism:
     """The robot without gravity on its bodies, as when its controller compensates its own weight."""
     joints = tuple(
         replace(joint, bodies=tuple(replace(body, gravity_fraction=ca.SX(0)) for body in joint.bodies))

@@ -24,7 +24,7 @@ from yid_ocp.model.servos_and_springs import (
     build_joint_servos,
     joint_damping_parameters,
     joint_spring_parameters,
-    without_gravity,
+    mechanism_without_gravity,
 )
 
 if TYPE_CHECKING:
@@ -280,7 +280,7 @@ class System(ReprMixin):
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
         moved, own = ({}, []) if servos is None else build_joint_servos(tree, driven, servos)
-        tree = without_gravity(tree) if servos is not None and servos.has_gravity_compensation else tree
+        tree = mechanism_without_gravity(tree) if servos is not None and servos.has_gravity_compensation else tree
         segments: list[SegmentLayout] = []
         for item, frame, placement in options.get("objects", ()):
             tree = tree.with_attached_mechanism(item.mechanism, frame, placement)
@@ -381,7 +381,7 @@ class System(ReprMixin):
             force[index] = u[row] if servo is None else servo.torque(u[row], q[index], v[index])
         return ca.vertcat(*force)
 
-    def weight_and_grasp_force(self, state: MidpointState, index: int) -> ca.SX:
+    def weight_and_grasp_force_on_coordinate(self, state: MidpointState, index: int) -> ca.SX:
         """Force of weights and grasps on one coordinate, from what it moves, at a step's midpoint [N m or N]."""
         kinematics, tree = state.kinematics, self.mechanism
         screw, force = kinematics.joint_screws[index], ca.SX(0)

@@ -14,7 +14,7 @@ from yid_ocp.analysis.identifiability import identifiability
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.effects import EffectBase, make_effect
 from yid_ocp.errors import ConfigError, SolverError, nearest_name_hint
-from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_UNINFORMED_RELATIVE_STD
+from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD, MIN_RELATIVE_STD_TAKEN_AS_INFINITE
 from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.options import check_option_bounds
 from yid_ocp.planning.joint_paths import FramePositionFunction, PlannedMotion, PlanOptions
@@ -196,7 +196,7 @@ def _check_room(search: InformativeMotionSearch, limits: PlanResidualsAndLimits)
             what = f"{name} begins {max(low, -high):.3g} beyond the limit of the joint"
             hint = "give a plan.start_joint_positions within the limits"
             raise ConfigError(what, where="plan.start_joint_positions", hint=hint)
-    broken = limits.worst_violation_per_limit(limits.limited_quantity_values(mover.simulate_path(still), still)[0])
+    broken = limits.worst_violated_row_by_limit(limits.limited_quantity_values(mover.simulate_path(still), still)[0])
     if broken:
         parts = ((what, *passed) for what, passed in broken.items())
         said = "; ".join(f"{name}: {x:.4g} where {bound:.4g} is allowed, {what}" for what, name, x, bound in parts)
@@ -323,12 +323,12 @@ def _parameters(experiment: PlannedExperiment, w: Array) -> tuple[dict[str, _Par
     """Parameters of the nominal problem before, after and with both, and what the planned recording leaves open."""
     problem = experiment.configured_problem
     before = identifiability(problem.with_parameter_values(experiment.parameter_values))
-    after = identifiability(experiment.planned_estimation_problem(w).with_free_subset(problem.free))
+    after = identifiability(experiment.planned_estimation_problem(w).with_compiled_parameters_free(problem.free))
     shared = [name for name in problem.free if name not in problem.options.local_parameters]
     at = [[entry.parameter_names.index(name) for name in shared] for entry in (before, after)]
     both = sum(entry.fisher_information[np.ix_(i, i)] for entry, i in zip((before, after), at, strict=True))
     values, vectors = np.linalg.eigh(np.atleast_2d(both))
-    together = np.sqrt(np.sum(vectors**2 / np.maximum(values, MIN_UNINFORMED_RELATIVE_STD**-2), axis=1))
+    together = np.sqrt(np.sum(vectors**2 / np.maximum(values, MIN_RELATIVE_STD_TAKEN_AS_INFINITE**-2), axis=1))
     found = {}
     for name, std in zip(shared, together, strict=True):
         first, last = before.parameters[name].std_relative, after.parameters[name].std_relative
@@ -357,7 +357,7 @@ def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: 
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
 
     values = limits.limited_quantity_values(mover.simulate_path(w), w)[0]
-    for rows, own in limits.limits_with_quantity_values(values):
+    for rows, own in limits.limit_rows_and_values(values):
         near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
         found[rows.description] = reached(rows.row_names, near)
     flat = w.ravel()

@@ -374,7 +374,7 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
             raise ConfigError(what, where=where, allowed=f"up to {limit:.4g} {unit}", hint=hint)
 
 
-def solve_end_equilibrium(
+def solve_equilibrium_at_target(
     step: Step, theta: Array, start: Equilibrium, point: FramePositionFunction, place: Array, tolerance: float
 ) -> Equilibrium:
     """Solve for the equilibrium near the start, joints within their limits, at which the point rests at its target.
@@ -393,7 +393,7 @@ def solve_end_equilibrium(
         raise ConfigError(what, where="plan.point", allowed=allowed, hint="set model.grasp, or name another point")
     guess = [start.state[:n]]
 
-    @last_value_kept
+    @memoize_last_call
     def rows(x: Array) -> tuple[Array, Array]:
         rest = statics.solve(x, theta, guess=guess[0])
         if not rest.is_converged:
@@ -422,7 +422,7 @@ def solve_end_equilibrium(
     return rest
 
 
-def last_value_kept(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
+def memoize_last_call(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
     """The function with its last value kept: searches ask for residual and slope of a point one after the other."""
     last: list[tuple[Array, _Value]] = []
 

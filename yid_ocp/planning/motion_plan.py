@@ -22,7 +22,7 @@ from yid_ocp.planning.joint_paths import (
     PlanOptions,
     SplinePath,
     check_standstill_limits,
-    solve_end_equilibrium,
+    solve_equilibrium_at_target,
     solve_start_equilibrium,
     start_joint_positions_as_array,
 )
@@ -91,7 +91,7 @@ def plan_motion_to_target(
     if inside is not None:
         _check_box(options, inside, mover.trajectories(inside, start.state[None])[0], place)
     check_standstill_limits(step, values, start, options.limits, "where the motion begins")
-    end = solve_end_equilibrium(step, values, start, point, place, options.position_tolerance)
+    end = solve_equilibrium_at_target(step, values, start, point, place, options.position_tolerance)
     check_standstill_limits(step, values, end, options.limits, "where it ends")
 
     def attempt(duration: float) -> TargetMotionPlan:
@@ -249,7 +249,7 @@ def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: Para
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
     course = rows.reference_point_positions
     off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
-    broken = rows.worst_violation_per_limit(rows.limited_quantity_values(rollout, shot.w)[0])
+    broken = rows.worst_violated_row_by_limit(rows.limited_quantity_values(rollout, shot.w)[0])
     message = shot.message
     for what, (name, value, bound) in broken.items():
         message += f"; {name} passes its limit of {what}: {value:.4g} where {bound:.4g} is allowed"

@@ -24,7 +24,7 @@ from scipy.optimize import least_squares, minimize
 from yid_ocp.arrays import Array
 from yid_ocp.inference.uncertainty import MAX_WEAK_RELATIVE_STD
 from yid_ocp.integrator.step_model import Rollout
-from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanOptions, last_value_kept
+from yid_ocp.planning.joint_paths import FramePositionFunction, PathSimulator, PlanOptions, memoize_last_call
 from yid_ocp.planning.planned_experiment import PlannedExperiment
 from yid_ocp.progress import NULL_PROGRESS, Progress
 
@@ -149,15 +149,15 @@ class PlanResidualsAndLimits:
             found.append(_LimitRows("place [m]", low, high, np.full(len(low), 0.1), axes * nodes))
         return found
 
-    def limits_with_quantity_values(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
+    def limit_rows_and_values(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
         """Every kind of limit with its rows of `limited_quantity_values`."""
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
-    def worst_violation_per_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
+    def worst_violated_row_by_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
         """The worst violated row of each kind of limit: its name, value and bound."""
         found = {}
-        for rows, own in self.limits_with_quantity_values(value):
+        for rows, own in self.limit_rows_and_values(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
             worst = int(np.argmax(over)) if len(own) else 0
             if len(own) and over[worst] > 1e-4:
@@ -203,7 +203,7 @@ class PlanShootingProblem:
 
     def __init__(self, cases: Sequence[PlanResidualsAndLimits], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
-        self._residual_and_limit_values = last_value_kept(self._evaluated)
+        self._residual_and_limit_values = memoize_last_call(self._evaluated)
         self._unit, self._lower, self._upper = _limit_units_and_scaled_bounds(self._cases[0].limit_rows)
         self.evaluations = 0
 

@@ -64,9 +64,9 @@ class PlannedExperiment:
         `ConfigError` or `ModelError`: no joint moves, or clamps follow measured points; there is no rest to begin from.
         """
         system, episode = problem.system, problem.episodes[0]
-        if problem.options.clamp_paths or not (system.driven or system.prescribed):
+        if problem.options.clamp_pose_definitions or not (system.driven or system.prescribed):
             said, allowed = "no joint moves whose motion could be planned", "a robot whose arms move"
-            if problem.options.clamp_paths:
+            if problem.options.clamp_pose_definitions:
                 said = "the ends of a cable follow measured points: there is no joint whose motion could be planned"
             raise ConfigError(said, where="plan", allowed=allowed, hint="set model.robot and model.arms")
         if system.servos:
@@ -173,7 +173,7 @@ class PlannedExperiment:
         free = [name for name in self.free_parameters if name in self.configured_problem.free]
         extra = [name for name in self.free_parameters if name not in free]
         problem = EstimationProblem(step, [recording], free, options, self.parameter_values, (), extra)
-        return problem.with_free_subset(self.free_parameters)
+        return problem.with_compiled_parameters_free(self.free_parameters)
 
     def configured_problem_sensitivities(self, w: Array) -> Array:
         """As `existing_recording_sensitivities`, of the planned one; `SolverError` if its torques do not follow it."""
@@ -183,7 +183,7 @@ class PlannedExperiment:
     def existing_recording_sensitivities(self) -> Array:
         """Whitened sensitivities of existing recordings to relative changes of the configured problem's unknowns."""
         problem = self.configured_problem.with_parameter_values(self.parameter_values)
-        return self._weighted(problem.with_free_subset(self.free_parameters))
+        return self._weighted(problem.with_compiled_parameters_free(self.free_parameters))
 
     def _weighted(self, problem: EstimationProblem) -> Array:
         problem = problem_whitened_at(problem, problem.initial_unknowns)

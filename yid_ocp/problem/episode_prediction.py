@@ -13,7 +13,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step, checked_rollout_inputs, simulate_batch
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
-from yid_ocp.integrator.tracking_feedback import DrivenJointMotion
+from yid_ocp.integrator.tracking_feedback import DifferentiatedJointMotion
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialState
@@ -85,7 +85,7 @@ class EpisodePredictor:
             for kind, name in split
         )
 
-    def with_fitted_initial_state(self, episode: Episode, theta: Array) -> Episode:
+    def episode_with_fitted_initial_state(self, episode: Episode, theta: Array) -> Episode:
         """Episode with its initial state fitted to the first measured points, where the options ask for it."""
         if episode.fixed_initial_state is not None or self.options.initial_state != "fitted_to_points":
             return episode
@@ -175,7 +175,7 @@ class EpisodePredictor:
         if not self._follows_momenta:
             return inputs
         rows = slice(2 * self.system.n_coordinates, None)
-        recorded = DrivenJointMotion(episode.smoothed_driven_angles, episode.torque, state[rows])
+        recorded = DifferentiatedJointMotion(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
         return inputs.with_momentum_shift(
             self.model_functions.momentum_shift, recorded, episode.measured_driven_angles, theta, wanted, by_internal
@@ -210,7 +210,7 @@ class EpisodePredictor:
         if (lag := corrections.joint_times("torque_lag", theta, wanted)) is not None:
             torque, by_torque = FirstOrderLag(*lag, self.step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
-            left = errors.torque_error_subtracted_after_effects
+            left = errors.remaining_torque_error_after_effects
             torque, first = torque - left, first - left[0]
         if corrections.corrects_angles:
             true, _, by_angle, _, _ = corrections.true_angles_and_efforts(
@@ -258,7 +258,7 @@ class EpisodePredictor:
             return start.failure_message
         by_start = start.state_sensitivity
         inputs = self.corrected_inputs_with_momentum_shift(episode, theta, wanted, start.state, by_start)
-        feedback, driven = episode.feedback_about_smoothed_motion, self.system.driven_coordinate_indices
+        feedback, driven = episode.feedback_with_smoothed_reference, self.system.driven_coordinate_indices
         directions = None
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity
@@ -480,7 +480,7 @@ class _Trajectory:
 # -- what a recording shows of its start and of its loads --------------------------------------------------------------
 
 
-def with_observed_equilibrium_and_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+def with_observed_equilibrium_and_gear_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
     """Episode with the initial equilibrium that its points show and gear loads without effort noise, at a theta."""
     return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
 

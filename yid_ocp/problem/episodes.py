@@ -24,7 +24,7 @@ from yid_ocp.problem.measurements import (
     TimeGrid,
     locate_measurements_on_grid,
     make_time_grid,
-    with_paper_weights,
+    measurements_with_paper_weights,
 )
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions, SensorOptions
@@ -35,7 +35,7 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_efforts,
 )
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
-from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorReadingContext
+from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
     JOINT_POSITION_GROUP_NAME,
@@ -112,7 +112,7 @@ class InputErrorModel:
         return self.torque_bias + self.torque_noise
 
     @property
-    def torque_error_subtracted_after_effects(self) -> Array:
+    def remaining_torque_error_after_effects(self) -> Array:
         """Part of the torque error still to be subtracted after effects on torques apply, shape (N, nu) [N m]."""
         return self.total_torque_error - self.transmitted_torque_noise
 
@@ -190,7 +190,7 @@ class Episode:
     equilibrium_guess: Array | None = None  # near the initial equilibrium, where that is not of least energy, (n,)
 
     @property
-    def feedback_about_smoothed_motion(self) -> TrackingFeedback | None:
+    def feedback_with_smoothed_reference(self) -> TrackingFeedback | None:
         """Tracking filter with the smoothed motion as its reference where that is known."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback
@@ -219,7 +219,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     if system.driven and recording.joints is None:
         raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)
     low_pass = LowPassFilter(options.path_cutoff)
-    path = prescribed_path(recording, system, grid, low_pass, options.clamp_paths)
+    path = prescribed_path(recording, system, grid, low_pass, options.clamp_pose_definitions)
     arm = smooth = np.zeros((grid.steps + 1, 0))
     torque = np.zeros((grid.steps, 0))
     if recording.joints is not None:
@@ -307,7 +307,7 @@ def _joint_mass_matrices(step: Step, theta: Array, names: tuple[str, ...], angle
 def _samples(
     step: Step, recording: Recording, options: ProblemOptions, theta: Array, grid: TimeGrid
 ) -> tuple[Measurements, ...]:
-    around = SensorReadingContext(
+    around = SensorDataInputs(
         step.system,
         recording,
         lambda group: options.sensors.get(group, SensorOptions()),
@@ -325,4 +325,4 @@ def _samples(
     if not any(s.n_residuals for s in samples):
         what = "the recording holds no measurement that the model could be compared with"
         raise DataError(what, where=recording.name, hint="check `sensors` and the names of the recorded points")
-    return tuple(with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples
+    return tuple(measurements_with_paper_weights(s, grid) for s in samples) if options.weighting == "paper" else samples

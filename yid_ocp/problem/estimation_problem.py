@@ -15,7 +15,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
-from yid_ocp.problem.episode_prediction import EpisodePredictor, with_observed_equilibrium_and_loads
+from yid_ocp.problem.episode_prediction import EpisodePredictor, with_observed_equilibrium_and_gear_loads
 from yid_ocp.problem.episodes import (
     Episode,
     EpisodePrediction,
@@ -71,7 +71,7 @@ class EstimationProblem(ReprMixin):
     held_out : sequence of Recording
         Not used by the fit, only predicted by `predict_held_out`.
     may_free : sequence of str, optional
-        Further parameters that `with_free_subset` may be asked for.
+        Further parameters that `with_compiled_parameters_free` may be asked for.
 
     Attributes
     ----------
@@ -114,9 +114,9 @@ class EstimationProblem(ReprMixin):
         prepare = partial(prepare_episode, functions, options=options, theta=theta)
         episodes, others = (tuple(map(prepare, group)) for group in (recordings, held_out))
         self._set(functions, options, tuple(free), theta, episodes, others)
-        fitted = (self.predictor.with_fitted_initial_state(episode, theta) for episode in episodes)
+        fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
         ready, other = (
-            tuple(with_observed_equilibrium_and_loads(self.predictor, e, theta) for e in group)
+            tuple(with_observed_equilibrium_and_gear_loads(self.predictor, e, theta) for e in group)
             for group in (fitted, others)
         )
         self._set(functions, options, tuple(free), theta, ready, other)
@@ -203,7 +203,7 @@ class EstimationProblem(ReprMixin):
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 
     @property
-    def data_residual_noise_std(self) -> float:
+    def rms_noise_of_data_residuals(self) -> float:
         """Noise std of the data residuals: 1 where they are whitened, else the points' RMS noise [m]."""
         if self.options.weighting != "paper":
             return 1.0
@@ -346,7 +346,7 @@ class EstimationProblem(ReprMixin):
                 episode = replace(held, fixed_initial_state=self.episodes[shared].fixed_initial_state)
                 found.append((episode, theta, self.split(x, shared)[1]))
                 continue
-            episode = self.predictor.with_fitted_initial_state(held, theta)
+            episode = self.predictor.episode_with_fitted_initial_state(held, theta)
             std = self.initial_state_prior_std
             found.append((episode, theta, _estimated_initial_state_offset(self.predictor, episode, theta, std)))
         return found
@@ -384,7 +384,7 @@ class EstimationProblem(ReprMixin):
 
     # -- problems like this one ---------------------------------------------------------------------------------------
 
-    def with_free_subset(self, names: Sequence[str]) -> EstimationProblem:
+    def with_compiled_parameters_free(self, names: Sequence[str]) -> EstimationProblem:
         """The same problem with other free parameters among `free` and `may_free`; shares the compiled functions."""
         return self._changed(free=tuple(names))
 

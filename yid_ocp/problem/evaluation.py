@@ -16,7 +16,7 @@ from yid_ocp.problem.measurements import (
     Measurements,
     ResidualBlock,
     huber_loss_and_residual_factors,
-    sensitivities_to_constant_errors,
+    measurement_sensitivities_to_biases,
     whitened_by_constant_errors,
 )
 
@@ -118,7 +118,7 @@ def whitened_episode_residual(
 
     Constant sensor errors count as noise, see `whitened_by_constant_errors`.
     """
-    by_constants = sensitivities_to_constant_errors(episode.measurements)
+    by_constants = measurement_sensitivities_to_biases(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
     plain = _sensor_whitened_residual(episode.measurements, result)

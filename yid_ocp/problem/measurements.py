@@ -117,7 +117,7 @@ class Measurements:
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
-    def decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
+    def output_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
         """Matrix R^(-1/2) that decorrelates normalized residuals, shape (nr, nr); None without correlation.
 
         R is the noise correlation of one sample's outputs; zero-phase (ZCA) whitening (Kessy, Lewin and Strimmer 2018,
@@ -135,20 +135,20 @@ class Measurements:
 
     def decorrelate(self, rows: Any) -> Any:
         """Decorrelate rows normalized by their standard deviations, shape (nr,) or (nr, d), dense or sparse."""
-        return rows if self.decorrelation_matrix is None else self.decorrelation_matrix @ rows
+        return rows if self.output_decorrelation_matrix is None else self.output_decorrelation_matrix @ rows
 
     def whitened_residual(self, predicted: Array) -> Array:
         """Whitened residual, prediction minus measurement, zero where nothing was measured, shape (M, k)."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
-        if self.decorrelation_matrix is not None:
-            plain[self.used_output_mask] = self.decorrelation_matrix @ plain[self.used_output_mask]
+        if self.output_decorrelation_matrix is not None:
+            plain[self.used_output_mask] = self.output_decorrelation_matrix @ plain[self.used_output_mask]
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
         """Adjoint of `whitened_residual`: cost derivative by the prediction from that by the residual, shape (M, k)."""
-        if self.decorrelation_matrix is not None:
+        if self.output_decorrelation_matrix is not None:
             pull = pull.copy()
-            pull[self.used_output_mask] = self.decorrelation_matrix.T @ pull[self.used_output_mask]
+            pull[self.used_output_mask] = self.output_decorrelation_matrix.T @ pull[self.used_output_mask]
         return np.asarray(pull * self.weight)
 
     def residual_block(
@@ -232,7 +232,7 @@ def locate_measurements_on_grid(data: SensorData, grid: TimeGrid, where: str) ->
     return Measurements(data.sensor, node, fraction, data.value, weight, std, span, bias, data.noise_correlation)
 
 
-def with_paper_weights(samples: Measurements, grid: TimeGrid) -> Measurements:
+def measurements_with_paper_weights(samples: Measurements, grid: TimeGrid) -> Measurements:
     """Measurements with the source paper's weights: 1 at the nearest node, 0 at k = 0, the last node counted twice.
 
     J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].
@@ -273,7 +273,7 @@ def estimated_constant_errors(slopes: Array, residual: Array) -> Array:
     return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
 
 
-def sensitivities_to_constant_errors(samples: Sequence[Measurements]) -> Array:
+def measurement_sensitivities_to_biases(samples: Sequence[Measurements]) -> Array:
     """Sensitivities of whitened measurements to constant sensor errors [standard deviations], shape (r, m).
 
     Those of the residual, prediction minus measurement, have the opposite sign.
@@ -294,7 +294,7 @@ def subtract_estimated_biases(samples: Sequence[Measurements], predicted: Sequen
 
     `predicted` has the shape (M, k) for each.
     """
-    slopes = sensitivities_to_constant_errors(samples)
+    slopes = measurement_sensitivities_to_biases(samples)
     if not slopes.shape[1]:
         return tuple(samples)
     pairs = zip(samples, predicted, strict=True)

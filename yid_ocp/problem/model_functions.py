@@ -14,7 +14,11 @@ from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import TrackingFeedback
-from yid_ocp.integrator.tracking_feedback import DrivenJointMotion, EffectMomentumShift, driven_joints_only_step
+from yid_ocp.integrator.tracking_feedback import (
+    DifferentiatedJointMotion,
+    EffectMomentumShift,
+    driven_joints_only_step,
+)
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.initial_state_fit import InitialStateFitter
@@ -64,7 +68,7 @@ class CorrectedInputs:
     def with_momentum_shift(
         self,
         shift: EffectMomentumShift,
-        recorded: DrivenJointMotion,
+        recorded: DifferentiatedJointMotion,
         measured: Array,
         theta: Array,
         wanted: Sequence[str],
@@ -81,7 +85,7 @@ class CorrectedInputs:
             return self
         smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
         remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
-        true = DrivenJointMotion(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
+        true = DifferentiatedJointMotion(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
         momentum, slope = shift.momentum_shift_and_derivatives(recorded, true, theta, wanted)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 

@@ -85,7 +85,7 @@ class ProblemOptions:
         float, Gt(0), OptionInfo("low-pass cutoff of prescribed paths and of the efforts compared with them", "Hz")
     ] = 10.0
     sensors: Mapping[str, SensorOptions] = field(default_factory=dict)
-    clamp_paths: tuple[ClampPoseDefinition, ...] = ()
+    clamp_pose_definitions: tuple[ClampPoseDefinition, ...] = ()
     local_parameters: tuple[str, ...] = ()
     prior_stds: Mapping[str, float] = field(default_factory=dict)
     multivariate_prior: MultivariateGaussianPrior = field(default_factory=MultivariateGaussianPrior)

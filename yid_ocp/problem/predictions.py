@@ -177,7 +177,9 @@ def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[Ch
     return tuple(found)
 
 
-def rmse_by_channel(results: Sequence[EpisodePrediction], episodes: Sequence[Episode]) -> dict[str, dict[str, Any]]:
+def rmse_unit_and_count_by_channel(
+    results: Sequence[EpisodePrediction], episodes: Sequence[Episode]
+) -> dict[str, dict[str, Any]]:
     """Root mean square error of every channel: {channel: {rmse, unit, n}}.
 
     For points the error of a sample is the Euclidean distance.
@@ -239,7 +241,11 @@ def synthesize_recording(
 ) -> Recording:
     """Roll out an episode at theta and return it as a synthetic recording."""
     refit = predictor.options.initial_state == "fitted_to_points"
-    fresh = predictor.with_fitted_initial_state(replace(episode, fixed_initial_state=None), theta) if refit else episode
+    fresh = (
+        predictor.episode_with_fitted_initial_state(replace(episode, fixed_initial_state=None), theta)
+        if refit
+        else episode
+    )
     found = predictor.predict_episode(fresh, theta, np.zeros(len(predictor.unknowns.initial_state_names)), False)
     if isinstance(found, str):
         raise SolverError(f"the model cannot be rolled out: {found}", where=episode.name, hint="take other values")
@@ -282,7 +288,7 @@ def _channel_groups(
 def _with_clamps(group: PointGroup, predictor: EpisodePredictor, source: Recording) -> PointGroup:
     """A group with the points that clamps follow, as they were recorded: what moves the object, not what it does."""
     original = next(entry for entry in source.points if entry.name == group.name)
-    clamps = predictor.options.clamp_paths
+    clamps = predictor.options.clamp_pose_definitions
     followed = dict.fromkeys(point for clamp in clamps for point in (clamp.origin_point, clamp.z_axis_point))
     names = tuple(name for name in followed if name in original.names and name not in group.names)
     if not names:

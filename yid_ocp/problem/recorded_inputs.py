@@ -9,7 +9,7 @@ import scipy.interpolate
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.effects import sensor_kinds
+from yid_ocp.effects import required_signal_kinds
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.objects.base import ClampPoseDefinition
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, SERVO_GAIN_FACTOR, PositionServo
@@ -78,7 +78,7 @@ def _motor_off_steps(
     return np.asarray(enabled[np.clip(row, 0, len(joints.t) - 1)] < 0.5)
 
 
-def recorded_servo_gain_factors(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
+def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
     """Firmware gains that recordings state, as values of `JOINT.servo_gain_factor` by recording.
 
     `DataError` where some recordings state it and others, whose motors are on, do not: their gains would not compare.
@@ -191,7 +191,7 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
 
 
 def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
-    """Sensors that the recordings contain, among those that effects require (`effects.sensor_kinds`)."""
+    """Sensors that the recordings contain, among those that effects require (`effects.required_signal_kinds`)."""
     found = set()
     for recording in recordings:
         own = {} if recording.joints is None else {"joints": recording.joints.channels}
@@ -204,7 +204,7 @@ def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
             found.add("camera")
         if any(group.clock == "nominal" for group in recording.all_groups):
             found.add("nominal_clock")
-    return frozenset(found) & sensor_kinds()
+    return frozenset(found) & required_signal_kinds()
 
 
 def prescribed_path(

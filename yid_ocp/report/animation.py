@@ -71,7 +71,7 @@ class Animation:
 
 
 @dataclass(frozen=True)
-class ModelTrajectory:
+class ConfigurationTrajectory:
     """Trajectory of a model: configurations q (N, n) at times t (N,) [s]."""
 
     name: str
@@ -85,7 +85,7 @@ class ModelTrajectory:
         return np.stack([np.interp(t, self.t, column) for column in self.q.T], axis=1)
 
 
-def _model_motion(told: ModelTrajectory, q: Array) -> _AnimatedMotion:
+def _model_motion(told: ConfigurationTrajectory, q: Array) -> _AnimatedMotion:
     """Joints, tips and points of a system at configurations q (F, n), and the lines between them."""
     system, tree = told.system, told.system.mechanism
     symbols, names, owned = ca.SX.sym("q", system.n_coordinates), tree.joint_names, _link_radii(system, told.theta)
@@ -150,7 +150,9 @@ def _shown_frames(system: System) -> list[str]:
     return list(dict.fromkeys([*shown, *hands]))
 
 
-def make_animation(title: str, told: Sequence[ModelTrajectory], recording: Recording | None = None) -> Animation:
+def make_animation(
+    title: str, told: Sequence[ConfigurationTrajectory], recording: Recording | None = None
+) -> Animation:
     """Animation of model trajectories, the first of which fixes clock and joints, and of the recorded motion.
 
     Of a recording its points are shown, and its arms where it recorded their angles; at most `_MAX_FRAMES` frames.
@@ -165,12 +167,12 @@ def make_animation(title: str, told: Sequence[ModelTrajectory], recording: Recor
 def recording_animation(title: str, system: System, theta: Array, recording: Recording) -> Animation | None:
     """Animation of a recording alone; None where it holds no positions."""
     clock = max((group.t for group in recording.groups), key=len)
-    told = ModelTrajectory("measured", system, theta, clock, np.zeros((len(clock), system.n_coordinates)))
+    told = ConfigurationTrajectory("measured", system, theta, clock, np.zeros((len(clock), system.n_coordinates)))
     motion = _measured_motion(told, recording, t := _frame_times(clock))
     return Animation(title, t, (motion,)) if motion.sticks or motion.point_indices else None
 
 
-def _measured_motion(told: ModelTrajectory, recording: Recording, t: Array) -> _AnimatedMotion:
+def _measured_motion(told: ConfigurationTrajectory, recording: Recording, t: Array) -> _AnimatedMotion:
     """Recorded arms and points at times t; a point stays for half a period after it was measured."""
     system, joints = told.system, recording.joints
     moved = {*system.driven, *system.prescribed}

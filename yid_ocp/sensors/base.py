@@ -240,7 +240,7 @@ class Sensor(ABC):
         return ()
 
     @property
-    def effort_per_output(self) -> Array:
+    def effort_per_unit_reading(self) -> Array:
         """Joint effort that one unit of each output stands for, shape (len(effort_joints),) [N m per unit]."""
         return np.ones(len(self.effort_joints))
 
@@ -300,7 +300,7 @@ class _SmoothingFilter(Protocol):
 
 
 @dataclass(frozen=True)
-class SensorReadingContext:
+class SensorDataInputs:
     """What is needed to read a sensor's measurements from a recording.
 
     `joint_mass_matrices` maps joint names and some of their configurations, shape (K, k), to their part of the mass
@@ -329,5 +329,5 @@ class SensorData:
     noise_correlation: Array | None = None  # of the outputs of one sample, shape (M, k, k)
 
 
-SENSOR_READERS: Registry[Callable[[SensorReadingContext], list[SensorData]]] = Registry("kind of sensor")
+SENSOR_READERS: Registry[Callable[[SensorDataInputs], list[SensorData]]] = Registry("kind of sensor")
 """Functions that take all measurements of one kind of sensor from a recording, by kind."""

@@ -23,8 +23,8 @@ from yid_ocp.sensors.base import (
     RecordedPointGroup,
     Sensor,
     SensorData,
+    SensorDataInputs,
     SensorOptions,
-    SensorReadingContext,
     expand_to_joint_values,
     recorded_joint_columns,
 )
@@ -100,24 +100,24 @@ class _MotorCurrentSensor(_JointSensor):
         return self.joint_names
 
     @property
-    def effort_per_output(self) -> Array:
+    def effort_per_unit_reading(self) -> Array:
         return np.array(self.torque_constants)
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         return self.select_sensor_joint_rows(state.load, state) / ca.DM(self.torque_constants)
 
 
-def is_measured_by_arm(group: RecordedPointGroup) -> bool:
+def is_point_group_measured_by_arm(group: RecordedPointGroup) -> bool:
     """Whether the arm itself measured these points, usually from its encoders."""
     return "arm" in (group.sensor, group.name.rpartition("_")[2])
 
 
 @SENSOR_READERS.register(JOINT_POSITION_GROUP_NAME)
-def _read_joint_angles(around: SensorReadingContext) -> list[SensorData]:
+def _read_joint_angles(around: SensorDataInputs) -> list[SensorData]:
     """Measurements of driven joints' angles without the first sample, which defines the initial configuration."""
     joints, choice, system = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME), around.system
     names = system.driven if joints is not None else ()
-    arm = [group.name for group in around.recording.points if is_measured_by_arm(group)]
+    arm = [group.name for group in around.recording.points if is_point_group_measured_by_arm(group)]
     arm = [name for name in arm if around.sensor_usage(name).use is not False]
     if joints is None or not names or choice.use is False or (choice.use is None and arm):
         return []
@@ -134,7 +134,7 @@ def _read_joint_angles(around: SensorReadingContext) -> list[SensorData]:
 
 
 @SENSOR_READERS.register(JOINT_EFFORT_GROUP_NAME)
-def _read_joint_efforts(around: SensorReadingContext) -> list[SensorData]:
+def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
     """Measurements of prescribed joints' efforts, low-pass filtered and thinned out to independent samples."""
     joints, choice = around.recording.joints, around.sensor_usage(JOINT_EFFORT_GROUP_NAME)
     if joints is None or joints.effort is None or choice.use is False:
@@ -155,7 +155,7 @@ def _read_joint_efforts(around: SensorReadingContext) -> list[SensorData]:
 
 
 def smoothed_effort_data(
-    around: SensorReadingContext,
+    around: SensorDataInputs,
     sensor: _JointSensor,
     t: Array,
     values: Array,
@@ -187,7 +187,7 @@ def smoothed_effort_data(
         what = f"{steps * step:.3g} s of efforts are too short for a filter of {low_pass.cutoff:g} Hz"
         allowed, hint = f"more than {2 * ends * step:.3g} s", "use a longer recording, or raise problem.path_cutoff"
         raise DataError(what, where=around.recording.name, allowed=allowed, hint=hint)
-    unit = sensor.effort_per_output
+    unit = sensor.effort_per_unit_reading
     total, correlation = _smoothed_effort_noise(around, sensor.joint_names, std * np.abs(unit), period, times[kept])
     if correlation is not None:
         correlation = correlation * np.outer(np.sign(unit), np.sign(unit))
@@ -195,12 +195,12 @@ def smoothed_effort_data(
 
 
 @SENSOR_READERS.register("motors.current")
-def _read_motor_currents(around: SensorReadingContext) -> list[SensorData]:
+def _read_motor_currents(around: SensorDataInputs) -> list[SensorData]:
     groups = (group for group in around.recording.channel_groups if _CURRENT.is_in_group(group.name))
     return [found for group in groups if (found := _currents(around, group)) is not None]
 
 
-def _currents(around: SensorReadingContext, group: RecordedChannelGroup) -> SensorData | None:
+def _currents(around: SensorDataInputs, group: RecordedChannelGroup) -> SensorData | None:
     key, where = f"{group.name}.{_CURRENT.quantity}", f"{around.recording.name}: {group.name}"
     choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
     if choice.use is False or not names or around.recording.joints is None:
@@ -272,7 +272,7 @@ def _estimated_noise_std(values: Array, where: str, group: str, unit: str) -> Ar
 
 
 def _smoothed_effort_noise(
-    around: SensorReadingContext, names: tuple[str, ...], std: Array, period: float, times: Array
+    around: SensorDataInputs, names: tuple[str, ...], std: Array, period: float, times: Array
 ) -> tuple[Array, Array | None]:
     """Noise of filtered efforts at some times, from the effort sensors and from accelerations of noisy encoders.
 

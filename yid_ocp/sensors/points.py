@@ -18,8 +18,8 @@ from yid_ocp.sensors.base import (
     RecordedPointGroup,
     Sensor,
     SensorData,
+    SensorDataInputs,
     SensorOptions,
-    SensorReadingContext,
 )
 
 _POINTS = CHANNEL_KINDS.register("points")(ChannelKind("points", "position", "m", ("x", "y", "z")))
@@ -48,12 +48,12 @@ class PointSensor(Sensor):
 
 
 @SENSOR_READERS.register("points")
-def _read_point_groups(around: SensorReadingContext) -> list[SensorData]:
+def _read_point_groups(around: SensorDataInputs) -> list[SensorData]:
     groups = ((group, around.sensor_usage(group.name)) for group in around.recording.points)
     return [_points(around, group, choice) for group, choice in groups if choice.use is not False]
 
 
-def _points(around: SensorReadingContext, group: RecordedPointGroup, choice: SensorOptions) -> SensorData:
+def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorOptions) -> SensorData:
     where = around.recording.name
     wanted = choice.points if choice.points is not None else group.names
     frames = {p: choice.frames.get(p, p) for p in wanted}

@@ -137,7 +137,7 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
     if len(history) <= _PATIENCE_STEPS:
         return None
     before, last = history[-1 - _PATIENCE_STEPS], history[-1]
-    saved, unit = before.cost - last.cost, problem.data_residual_noise_std**2
+    saved, unit = before.cost - last.cost, problem.rms_noise_of_data_residuals**2
     if saved > _NEGLIGIBLE_COST_REDUCTION * unit:
         return None
     if achievable_cost_reduction(problem, last.x, now) > 0.5 * CHI2_95_TWO_SIDED * unit:
@@ -225,7 +225,7 @@ class SteepestDescent(CheckedSolver):
     ] = 1e-5
     sufficient_decrease: Annotated[float, Gt(0), Lt(1), OptionInfo("Armijo's constant")] = 1e-4
     backtracking_factor: Annotated[float, Gt(0), Lt(1), OptionInfo("backtracking factor")] = 0.5
-    first_trial_step: Annotated[
+    first_trial_step_rule: Annotated[
         Literal["last", "spectral"], OptionInfo("first length tried in an iteration; last is the paper's")
     ] = "last"
     nonmonotone_memory: Annotated[
@@ -270,7 +270,7 @@ class SteepestDescent(CheckedSolver):
             cost, gradient, evaluation = problem.cost_and_gradient(x, attempt)
             length /= self.backtracking_factor
             turned = gradient - before
-            if self.first_trial_step == "spectral" and float(moved @ turned) > 0:
+            if self.first_trial_step_rule == "spectral" and float(moved @ turned) > 0:
                 length = float(moved @ moved) / float(moved @ turned)
         size = np.maximum(np.abs(x), problem.unknown_scales)
         recorder.record_iterate(cost, x, projected_gradient_norm(x, gradient, lower, upper, size))

@@ -38,7 +38,7 @@ _EQUILIBRIUM_SPACING = 0.1
 
 
 @dataclass(frozen=True)
-class NodeStateGuess:
+class UnknownsAndNodeStateGuess:
     """Guess of the unknown vector, and of each recording's initial state, node states and constraint multipliers."""
 
     x: Array
@@ -47,9 +47,9 @@ class NodeStateGuess:
     multipliers: tuple[Array, ...]  # shape (K, m) or (N, m) each
 
 
-def guess_node_states(
+def guess_unknowns_and_node_states(
     problem: EstimationProblem, nodes: Sequence[IntArray], x: Array, misfit: _MisfitFunction
-) -> NodeStateGuess:
+) -> UnknownsAndNodeStateGuess:
     """Guess node states near a solution, at an unknown vector or, where that fits poorly, at multiples of it.
 
     A recording's states are the rollout under the tracking filter, which has no defects, or, where that fails or strays
@@ -57,7 +57,7 @@ def guess_node_states(
     then, which has defects but follows the data.
     """
     lower, upper = problem.bounds
-    best: tuple[float, NodeStateGuess] | None = None
+    best: tuple[float, UnknownsAndNodeStateGuess] | None = None
     for factor in _PARAMETER_FACTORS:
         moved = np.where(problem.positive_unknowns_mask, np.clip(factor * x, lower, upper), x)
         begins, states, multipliers, total = [], [], [], 0.0
@@ -76,7 +76,7 @@ def guess_node_states(
             multipliers.append(pull)
             total += min(sizes) / len(problem.episodes)
         if best is None or total < best[0]:
-            best = total, NodeStateGuess(moved, tuple(begins), tuple(states), tuple(multipliers))
+            best = total, UnknownsAndNodeStateGuess(moved, tuple(begins), tuple(states), tuple(multipliers))
         if best[0] <= _POOR_GUESS_CHI2 or not np.any(problem.positive_unknowns_mask):
             break
     assert best is not None

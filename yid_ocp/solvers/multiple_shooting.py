@@ -28,7 +28,7 @@ from yid_ocp.solvers.base import (
     Status,
     projected_gradient_norm,
 )
-from yid_ocp.solvers.initial_guess import guess_node_states, mean_square_residual_without_efforts
+from yid_ocp.solvers.initial_guess import guess_unknowns_and_node_states, mean_square_residual_without_efforts
 from yid_ocp.solvers.nonlinear_program import (
     QUIET_NLPSOL_OPTIONS,
     HessianKind,
@@ -268,7 +268,7 @@ class _Watch(ca.Callback):
         self.recorder, self.best, self._ridge = recorder, program.initial_guess, ridge
         self._problem, self._program, self._functions = problem, program, functions
         cost = float(functions(program.initial_guess, program.parameter_values)[0])
-        self.unit = max(cost, 0.5 * program.residual.numel() * problem.data_residual_noise_std**2)
+        self.unit = max(cost, 0.5 * program.residual.numel() * problem.rms_noise_of_data_residuals**2)
         nw, ng = program.w.numel(), program.g.numel()
         self._sizes = {"x": nw, "f": 1, "g": ng, "lam_x": nw, "lam_g": ng, "lam_p": program.p.numel()}
         self.construct("watch", {})
@@ -368,7 +368,7 @@ class _ShootingIntervals:
         shared, x = len(self.problem.shared_parameters), start.copy()
         about = self.problem.initial_unknowns.copy()
         about[:shared] = start[:shared]
-        found = guess_node_states(self.problem, self.node_steps, about, self._misfit)
+        found = guess_unknowns_and_node_states(self.problem, self.node_steps, about, self._misfit)
         x[:shared] = found.x[:shared]
         return x, list(found.node_states)
 

@@ -23,9 +23,9 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import SolverError, nearest_name_hint
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.solvers.program_terms import (
+    GaussNewtonHessianRidge,
     ProgramTerm,
     ResidualTerm,
-    RidgeRegularization,
     ThreadSafeCachedProperty,
     sparse_matrix_from_entries,
     sparse_matrix_summing_duplicates,
@@ -117,7 +117,7 @@ class NonlinearProgram(ReprMixin):
     upper: Array
     initial_guess: Array
     parameter_values: Array  # of `p`, shape (np,)
-    ridge: RidgeRegularization | None
+    ridge: GaussNewtonHessianRidge | None
     w: ca.MX
     p: ca.MX
     user_terms: tuple[_UserTerms, ...] = ()
@@ -285,7 +285,7 @@ class NonlinearProgram(ReprMixin):
         curved = term.weighted_hessian_triplets(self.w, self.p, weight)
         return 0 if curved is None else sparse_matrix_summing_duplicates(*curved, self.w.numel())
 
-    def _ridge(self, ridge: RidgeRegularization) -> ca.MX:
+    def _ridge(self, ridge: GaussNewtonHessianRidge) -> ca.MX:
         count = sum(residual.n_residuals for residual in self.residual_terms)
         at = ridge.index.tolist()
         size = ca.fmax(ca.fabs(self.w[at]), ca.DM(ridge.scale))

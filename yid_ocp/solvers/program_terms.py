@@ -190,7 +190,7 @@ class ResidualTerm:
 
 
 @dataclass(frozen=True)
-class RidgeRegularization:
+class GaussNewtonHessianRidge:
     """Regularization of the Gauss-Newton Hessian by factor * mean square residual / max(|w_i|, scale_i)^2.
 
     Along unknowns that the data hardly inform the curvature that Gauss-Newton leaves out may be as large as its own.

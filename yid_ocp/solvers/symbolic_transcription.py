@@ -34,9 +34,13 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.unknown_vector import SOFT_LOGARITHM_MIN_RATIO
 from yid_ocp.sensors import Sensor, sensor_reading_function
-from yid_ocp.solvers.initial_guess import NodeStateGuess, guess_node_states, mean_square_residual_without_efforts
+from yid_ocp.solvers.initial_guess import (
+    UnknownsAndNodeStateGuess,
+    guess_unknowns_and_node_states,
+    mean_square_residual_without_efforts,
+)
 from yid_ocp.solvers.nonlinear_program import NonlinearProgram, ProgramVectorLayout
-from yid_ocp.solvers.program_terms import LocalVariableFunction, ProgramTerm, ResidualTerm, RidgeRegularization
+from yid_ocp.solvers.program_terms import GaussNewtonHessianRidge, LocalVariableFunction, ProgramTerm, ResidualTerm
 
 # Least curvature for a change of a parameter by its size, over the mean square of the whitened residuals.
 MIN_RIDGE_FACTOR = 0.1
@@ -246,7 +250,9 @@ class _Maker:
         """The program, its guess made near the problem's unknown vector `x`."""
         problem, low, high = self._problem, *self._problem.bounds
         nodes = [np.arange(episode.grid.steps + 1) for episode in problem.episodes]
-        found = guess_node_states(problem, nodes, x, partial(mean_square_residual_without_efforts, problem))
+        found = guess_unknowns_and_node_states(
+            problem, nodes, x, partial(mean_square_residual_without_efforts, problem)
+        )
         x, shared = found.x, len(problem.shared_parameters)
         theta = self._w.extend(x[:shared], low[:shared], high[:shared])
         self._w.name("theta", theta[:, None], problem.shared_parameters)
@@ -269,13 +275,13 @@ class _Maker:
         residuals += self._priors(columns)
         order = [k for k, _ in sorted(columns.items(), key=lambda entry: entry[1])]
         lower, upper, start = (np.concatenate(part) for part in (self._w.lower, self._w.upper, self._w.values))
-        ridge = RidgeRegularization(np.concatenate(at_ridge), problem.unknown_scales[order], MIN_RIDGE_FACTOR)
+        ridge = GaussNewtonHessianRidge(np.concatenate(at_ridge), problem.unknown_scales[order], MIN_RIDGE_FACTOR)
         vectors = lower, upper, start, np.concatenate([np.zeros(0), *self._p.values])
         terms = tuple(constraints), tuple(residuals)
         symbols = ca.MX.sym("w", self._w.size), ca.MX.sym("p", self._p.size)
         return NonlinearProgram(self._w.blocks, self._p.blocks, *terms, *vectors, ridge, *symbols)
 
-    def _laid_out(self, i: int, found: NodeStateGuess, free: IntArray) -> tuple[_Places, list[ResidualTerm]]:
+    def _laid_out(self, i: int, found: UnknownsAndNodeStateGuess, free: IntArray) -> tuple[_Places, list[ResidualTerm]]:
         """The unknowns of a recording at their guess and what drives it; priors of errors."""
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))

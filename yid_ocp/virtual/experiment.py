@@ -19,7 +19,7 @@ from yid_ocp.model.objects.foam_y import foam_y_object
 from yid_ocp.model.system import Grasp, System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.virtual.joint_motion import (
-    BAXTER_ARM_JOINT_NAMES,
+    BAXTER_JOINT_NAMES_WITHOUT_SIDE,
     MultisineMotion,
     MultisineOptions,
     grasping_joint_angles,
@@ -51,7 +51,7 @@ def baxter_foam_y_system(arms: int) -> System:
     if arms not in (1, 2):
         raise ConfigError(f"arms = {arms}", where="paper_system", allowed="1 or 2")
     sides = ("left", "right")[:arms]
-    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_ARM_JOINT_NAMES]
+    names = [f"{side}_{joint}" for side in sides for joint in BAXTER_JOINT_NAMES_WITHOUT_SIDE]
     robot = read_urdf("package:baxter", joints=names)
     grasps = [Grasp(side, f"{side}_gripper", held) for side, held in zip(sides, ("w_T2", "w_T3"), strict=False)]
     return System.build(robot, objects=[(foam_y_object(), None, None)], grasps=grasps, driven=names, damping=0.05)

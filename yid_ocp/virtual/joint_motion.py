@@ -19,11 +19,11 @@ from yid_ocp.model.mechanism import Mechanism, Placement
 from yid_ocp.model.system import System
 from yid_ocp.virtual.mjcf import ParameterEvaluator
 
-BAXTER_ARM_JOINT_NAMES = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
+BAXTER_JOINT_NAMES_WITHOUT_SIDE = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
 _ELBOW_UP_ANGLES: Mapping[str, float] = {
     f"{side}_{joint}": sign * value if joint in ("s0", "e0", "w0", "w2") else value
     for side, sign in (("left", 1.0), ("right", -1.0))
-    for joint, value in zip(BAXTER_ARM_JOINT_NAMES, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
+    for joint, value in zip(BAXTER_JOINT_NAMES_WITHOUT_SIDE, (-0.40, -1.13, -0.15, 1.19, -0.08, 1.13, 0.0), strict=True)
 }  # of Baxter, where a search begins [rad]: elbow above the hand, the right arm mirrored
 _PULL = 1e-5  # [m/rad]; moves the gripper by less than 1e-9 m
 

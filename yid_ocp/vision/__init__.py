@@ -15,7 +15,7 @@ from yid_ocp.vision.frames import look_at_pose as look_at_pose
 from yid_ocp.vision.point_cloud import CloudFilterOptions as CloudFilterOptions
 from yid_ocp.vision.point_cloud import SkeletonOptions as SkeletonOptions
 from yid_ocp.vision.surface_meshes import CameraScene as CameraScene
-from yid_ocp.vision.surface_meshes import DepthCamera as DepthCamera
+from yid_ocp.vision.surface_meshes import DepthSensorModel as DepthSensorModel
 from yid_ocp.vision.surface_meshes import ExtraMesh as ExtraMesh
 from yid_ocp.vision.surface_meshes import FrameTiming as FrameTiming
 from yid_ocp.vision.surface_meshes import VirtualCamera as VirtualCamera

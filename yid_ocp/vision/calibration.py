@@ -82,7 +82,7 @@ class _StampDelay(NamedTuple):
     mean_square_distance: float
 
 
-def estimate_excess_stamp_delay(
+def stamp_delay_beyond_clock_offset(
     arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
     """Delay of one frame's stamp [s] beyond the common offset, from world points (N, 3), the robot's among them [m].
@@ -212,7 +212,7 @@ class CameraCalibration:
         The same error for all of them, as far as they stand at one place; `velocity` (N, 3) [m/s], `stamps` (N,) [s].
         """
         slopes = np.empty((len(points), 3, CAMERA_STATE_SIZE))
-        slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.world_point_jacobian(points)
+        slopes[:, :, :CLOCK_OFFSET_INDEX] = self.camera_state.world_point_jacobian_by_pose_and_depth(points)
         # a point that is dated too early is where it came to be later
         slopes[:, :, CLOCK_OFFSET_INDEX] = velocity
         slopes[:, :, CLOCK_DRIFT_INDEX] = velocity * (stamps - self.camera_state.clock_reference_stamp)[:, None]
@@ -296,7 +296,7 @@ class _Calibrator:
             state = self._rounds(state, chosen, _WIDE[-1], True, _FEW, _ROUNDS)[0]
             state, found, used = self._rounds(state, chosen, _REACH, True, _MANY, _LAST_ROUNDS)
             placed = [(g.stamp, state.measured_to_world_points(g.points)) for g in used]
-            own = [estimate_excess_stamp_delay(self.arm, state, *seen, self.rng) for seen in placed]
+            own = [stamp_delay_beyond_clock_offset(self.arm, state, *seen, self.rng) for seen in placed]
             on_time, usual = _find_on_time_frames(own)
             chosen = [used[i] for i in on_time]
             if len(chosen) < _LEAST_FRAMES:
@@ -393,7 +393,7 @@ class _Calibrator:
         away = np.linalg.norm(state.measured_to_world_points(self.told.world_to_measured_points(points)) - points)
         change = state.difference_from(self.told)
         if away > _NOTED and self.options.fix_pose:
-            slopes = state.world_point_jacobian(points)[0]
+            slopes = state.world_point_jacobian_by_pose_and_depth(points)[0]
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
             if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTED**2 * 3:

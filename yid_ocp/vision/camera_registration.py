@@ -90,7 +90,7 @@ class CameraState:
         at = np.asarray(stamp, float)
         return np.asarray(at - self.clock_offset - self.clock_drift * (at - self.clock_reference_stamp))
 
-    def world_point_jacobian(self, points: Array) -> Array:
+    def world_point_jacobian_by_pose_and_depth(self, points: Array) -> Array:
         """Jacobian of world points, shape (N, 3), with respect to pose and depth, shape (N, 3, 8)."""
         away = points - self.pose[:3, 3]
         ahead = away @ self.pose[:3, 2]
@@ -207,7 +207,7 @@ class ArmSurface:
         points, t = state.measured_to_world_points(glimpse.points), float(state.stamps_to_joint_clock(glimpse.stamp))
         met = self.match_points_to_surface(points, state.pose[:3, 3], t, reach, along)
         slope = np.empty((len(met.point_indices), CAMERA_STATE_SIZE))
-        by_camera = state.world_point_jacobian(points[met.point_indices])
+        by_camera = state.world_point_jacobian_by_pose_and_depth(points[met.point_indices])
         slope[:, :CLOCK_OFFSET_INDEX] = np.einsum("ni,nij->nj", met.normal, by_camera)
         # a later offset takes the surface back along its velocity, away from the point
         slope[:, CLOCK_OFFSET_INDEX] = met.normal_velocity

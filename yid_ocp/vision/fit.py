@@ -31,10 +31,10 @@ from yid_ocp.vision import shape_evidence
 from yid_ocp.vision.initial_shapes import InitialShapeFinder, ObservedObjectEnd
 from yid_ocp.vision.shape_evidence import (
     FrameShapeFit,
+    FrameTubeDimensionCost,
     ProcessedFrameCloud,
     ShapeFitQuality,
     ShapePointClassification,
-    TubeDimensionCost,
     TubeLinks,
     tube_link_projections,
 )
@@ -188,7 +188,7 @@ class ShapeFitter:
         q[known] = q_known[known]
         begun = [self._with_free(q, start[free]) for start in starts or (self.rest_configuration,)]
         everything = np.ones(len(sight.skeleton_nodes), bool), np.ones(len(sight.points), bool)
-        thin = shape_evidence.tube_like_node_point_masks(sight, float(self.link_radii.max()))
+        thin = shape_evidence.tube_like_node_and_point_masks(sight, float(self.link_radii.max()))
         best, evidence = self._attempt(sight, begun, thin if thin[0].any() and thin[1].any() else everything)
         for left in (self._without(best, evidence, sight, self._links_of(self._failed(evidence))), everything):
             failed = self._failed(evidence)
@@ -391,7 +391,7 @@ class ShapeFitter:
         lengths = {name: self._lengths[self._links_of({name})] for name in dict.fromkeys(self.link_segments)}
         return InitialShapeFinder(self.system, self._tree, self.rest_configuration, self.bend_joints, lengths)
 
-    def _size_rows(self, q: Array, task: _Task | None, evidence: ShapePointClassification) -> TubeDimensionCost:
+    def _size_rows(self, q: Array, task: _Task | None, evidence: ShapePointClassification) -> FrameTubeDimensionCost:
         """What a frame's points say of lengths and radii at its shape."""
         names = [segment.name for segment in self.system.segment_layouts]
         free, many = len(self.free_joints), len(names)
@@ -407,7 +407,7 @@ class ShapeFitter:
             hessian[:] += weighted.T @ rows
 
         if task is not None:
-            depths = shape_evidence.line_of_sight_residuals(corners, self.link_radii, task.points, task.camera)
+            depths = shape_evidence.surface_depth_residuals(corners, self.link_radii, task.points, task.camera)
             weight = task.weight[depths.point_indices] / (1 + (depths.signed_distance / task.scale) ** 2) ** 2
             segment = np.array([names.index(owner) for owner in self.link_segments])
             for k in range(len(self.link_radii)):
@@ -432,7 +432,7 @@ class ShapeFitter:
         left = both[free:] - hessian[free:, :free] @ follow
         moved = np.hstack([seen_by_length, np.zeros((len(seen_by_length), many))])
         moved = moved - np.array(self._seen(q)[1]) @ follow[:, 1:]
-        return TubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
+        return FrameTubeDimensionCost(left[:, 0], left[:, 1:], moved.reshape(-1, 3, 2 * many))
 
     def tube_links_at(self, q: Array) -> TubeLinks:
         """Tube links in the world at a configuration."""

@@ -129,7 +129,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
     return ""
 
 
-def mark_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
+def drop_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
     """Frames, with those that deviate from the other good frames marked as dropped."""
     fits = _good_fits(frames)
     if not fits:

@@ -80,7 +80,7 @@ class _Centerline:
         return self.nodes[way[::-1]]
 
 
-def trace_centerline(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
+def trace_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
     """Trace the centerline of an object in a cloud; without nodes where the cloud has too few points.
 
     `diameter` is that of its thickest tube [m]; parts further apart than `gap` [m] do not hang together.

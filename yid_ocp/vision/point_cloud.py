@@ -253,7 +253,7 @@ class CloudSkeleton:
     component_of_node: IntArray  # (K,), connected part of each node, the one with most points first
 
     @property
-    def has_skeleton_node(self) -> BoolArray:
+    def is_point_assigned_to_node(self) -> BoolArray:
         """Whether each point of the cloud belongs to a node, shape (N,)."""
         return self.node_of_point >= 0
 

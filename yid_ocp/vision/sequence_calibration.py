@@ -1,7 +1,7 @@
 """Calibration shared by all frames of a sequence: the camera, background, foreign objects and the object's dimensions.
 
 Of every frame the least cost about the sizes x (logarithms of lengths and radii over the model's), the bends following,
-is g_f'x + x'S_f x/2 (`TubeDimensionCost`). Together, with a wide prior P, the frames fitted anew at every x,
+is g_f'x + x'S_f x/2 (`FrameTubeDimensionCost`). Together, with a wide prior P, the frames fitted anew at every x,
 
     x = -(S + P)^-1 g,    cov x = (S + P)^-1 + (S + P)^-1 (sum_f r_f r_f') (S + P)^-1 + diag(b^2),    r_f = g_f + S_f x
 

@@ -204,7 +204,7 @@ def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near
     )
 
 
-def tube_like_node_point_masks(sight: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
+def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
     """Which nodes (K,), and points (N,) nearest to them, lie where the surface is as narrow as a tube of a radius [m].
 
     About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
@@ -335,7 +335,7 @@ def nearest_surface_residuals(
     return _SurfaceResiduals(np.arange(len(points)), link, error, rows, np.full(len(points), -share))
 
 
-def line_of_sight_residuals(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
+def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
     """Residuals along the lines of sight, where the camera's noise is; parameters as of `nearest_surface_residuals`.
 
     Across the sight a point stands where its pixel does, by u from the axis; towards the camera the surface lies at
@@ -360,7 +360,7 @@ def line_of_sight_residuals(corners: Array, radius: Array, points: Array, camera
 
 
 @dataclass(frozen=True, eq=False)
-class TubeDimensionCost:
+class FrameTubeDimensionCost:
     """Quadratic cost  g'x + x'Sx/2  of the tubes' sizes in one frame, minimised over the joint bends.
 
     The sizes x are the logarithms of all lengths and then of all radii, segment by segment, relative to the fit's.
@@ -381,7 +381,7 @@ class FrameShapeFit(ShapeFitQuality):
     is_point_seen: BoolArray  # (np,), whether a gripper holds it, or there are points enough about it
     grasp_gaps: Array  # (grasps, 3), from what each gripper holds to the gripper [m]
     contested_fraction: float  # of the points on the shape: may belong to a thing which touches it, and are left out
-    dimension_equations: TubeDimensionCost  # what the frame says of lengths and radii
+    dimension_equations: FrameTubeDimensionCost  # what the frame says of lengths and radii
     link_ends: Array  # (K, 2, 3), start and end of every link [m]
 
     @property

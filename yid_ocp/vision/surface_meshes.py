@@ -404,7 +404,7 @@ _PERIOD_JITTER = 0.25  # share of its mean by which a period varies either way
 
 
 @dataclass(frozen=True)
-class DepthCamera:
+class DepthSensorModel:
     """Geometry and errors of a structured-light depth camera; the defaults are an Asus Xtion Pro Live."""
 
     intrinsics: CameraIntrinsics = XTION_INTRINSICS
@@ -503,7 +503,7 @@ class VirtualCamera:
     """Virtual depth camera: sensor model, pose and frame timing."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
-    depth_camera: DepthCamera = field(default_factory=DepthCamera)  # an Asus Xtion Pro Live where absent
+    depth_camera: DepthSensorModel = field(default_factory=DepthSensorModel)  # an Asus Xtion Pro Live where absent
     timing: FrameTiming = field(default_factory=FrameTiming)
     seed: int = 0  # of all that is drawn at random
 

@@ -24,14 +24,14 @@ from yid_ocp.vision.calibration import (
     CameraCalibration,
     calibrate_camera,
     calibration_without_estimation,
-    estimate_excess_stamp_delay,
     is_stamp_delay_significant,
+    stamp_delay_beyond_clock_offset,
 )
 from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
-from yid_ocp.vision.initial_shapes import InitialShapeFinder, system_with_free_root, trace_centerline
+from yid_ocp.vision.initial_shapes import InitialShapeFinder, system_with_free_root, trace_centerline_tree
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
 from yid_ocp.vision.sequence_calibration import BackgroundPoints, ForeignObject, SequenceCalibration, TubeDimensionCheck
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
@@ -71,8 +71,8 @@ def track_object(
     """
     tracker = FrameTracker(scene, recording, sequence, options or TrackOptions(), empty)
     common = tracker.calibrate_sequence()
-    frames = [tracker.track_frame(i, common) for i in tracker.frame_order]
-    return tracker.to_track_result(*tracker.assign_root_and_mark_outliers(frames), common)
+    frames = [tracker.process_frame(i, common) for i in tracker.frame_order]
+    return tracker.to_track_result(*tracker.assign_root_and_drop_outliers(frames), common)
 
 
 @dataclass(eq=False)
@@ -279,7 +279,7 @@ class FrameTracker:
                 raise DataError("no point has one of the object's colours: check filters.object_colours")
         return point_cloud.voxel_averages(points[inside], filters.voxel_size), points
 
-    def track_frame(self, index: int, common: SequenceCalibration) -> FrameReport:
+    def process_frame(self, index: int, common: SequenceCalibration) -> FrameReport:
         """Report of one frame, independent of other frames."""
         work, look = self._look(index, common.camera_calibration, common.background)
         if look is None:
@@ -314,10 +314,10 @@ class FrameTracker:
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
         return FrameReport(index, self.sequence.frame_names[index], stamp, t, reason, 0, 0, 0, math.nan, 0.0, None)
 
-    def assign_root_and_mark_outliers(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
+    def assign_root_and_drop_outliers(self, frames: Sequence[FrameReport]) -> tuple[list[FrameReport], str]:
         """Frames with outlying ones dropped, and how the root end was chosen."""
         rooted, note = frame_selection.with_consistent_root_end(frames, self.options)
-        return frame_selection.mark_outlying_frames(rooted, self.options), note
+        return frame_selection.drop_outlying_frames(rooted, self.options), note
 
     def to_track_result(self, frames: Sequence[FrameReport], note: str, common: SequenceCalibration) -> TrackResult:
         """Tracking result of the frames; `DataError` if none is good."""
@@ -382,7 +382,7 @@ class FrameTracker:
         rng = np.random.default_rng([options.seed, index])
         typical = calibration.usual_square_distance
         if self.arm_surface is not None and typical is not None:
-            own = estimate_excess_stamp_delay(self.arm_surface, state, stamp, cloud.points, rng, typical)
+            own = stamp_delay_beyond_clock_offset(self.arm_surface, state, stamp, cloud.points, rng, typical)
             if own is not None and math.isfinite(own.std):
                 work.say(stamp_delay=own.delay)
                 if is_stamp_delay_significant(own, options.clock):
@@ -419,7 +419,7 @@ class FrameTracker:
         work.say(n_skeleton_nodes=len(found.nodes))
         if not len(found.nodes):
             raise DataError("no part of the cloud is dense enough for a skeleton")
-        work.filtered = rest = cloud.select(found.has_skeleton_node)
+        work.filtered = rest = cloud.select(found.is_point_assigned_to_node)
         return _Look((ProcessedFrameCloud(rest.points, rest.point_weights, found.nodes, *given),), q, ((),))
 
     def _anywhere(
@@ -427,7 +427,7 @@ class FrameTracker:
     ) -> _Look:
         """What is seen of an object whose root is sought, with the ends that it may have where."""
         diameter, options = 2.0 * self._widest, self.options
-        course = trace_centerline(cloud, diameter, options.skeleton.max_edge_length, rng)
+        course = trace_centerline_tree(cloud, diameter, options.skeleton.max_edge_length, rng)
         work.skeleton = course.to_skeleton
         work.say(n_skeleton_nodes=len(course.nodes))
         if len(course.loop_positions):

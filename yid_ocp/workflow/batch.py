@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis.estimate_history import assess_drift
+from yid_ocp.analysis.estimate_history import assess_drift_and_outlier_runs
 from yid_ocp.config.reader import load_config
 from yid_ocp.errors import ConfigError, OutputError, YidError, nearest_name_hint
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_json
@@ -29,7 +29,7 @@ from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_folder import local_time_text
 from yid_ocp.workflow.run_history import estimate_history_result, read_estimates, require_same_model
-from yid_ocp.workflow.run_inputs import input_files
+from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import run_solve
 
 _RUNS_FOLDER, _TASKS_FOLDER = "runs", "tasks"
@@ -119,7 +119,9 @@ def run_batch(
         try:
             run = load_config(member.config_file, member.overrides)
             # what it depends on beside its settings; their content counts, wherever they stand
-            inputs = [Path(path) for path in sorted({str(path.absolute()) for path in input_files(run).values()})]
+            inputs = [
+                Path(path) for path in sorted({str(path.absolute()) for path in input_files_by_name(run).values()})
+            ]
             for path in inputs:
                 file_sha256(path)
         except YidError as error:
@@ -194,7 +196,7 @@ def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
         return None
     try:
         require_same_model(folders)
-        return estimate_history_result(assess_drift([read_estimates(folder) for folder in folders]))
+        return estimate_history_result(assess_drift_and_outlier_runs([read_estimates(folder) for folder in folders]))
     except YidError:
         return None
 

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.config.reader import DEFAULT_CONFIG, DEFAULT_DIAGNOSIS_CONFIG, load_config
+from yid_ocp.config.reader import DEFAULT_CONFIG_FILE, DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
 from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
-from yid_ocp.diagnosis.diagnosis_result import statistics_compared_with_thresholds
+from yid_ocp.diagnosis.diagnosis_result import decision_statistics_to_dict
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
 from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
@@ -51,9 +51,11 @@ log = logging.getLogger(__name__)
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    runs = [load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG) for path in arguments.configs or [None]]
+    runs = [
+        load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE) for path in arguments.configs or [None]
+    ]
     if not arguments.configs and arguments.cases >= _MIN_TWO_ARM_CASES:
-        runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG))
+        runs.append(load_config(None, arguments.overrides, DEFAULT_CONFIG_FILE))
     workers = workers_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     purpose = blind.ENSEMBLE_PURPOSES[int(arguments.calibration)]
     out = arguments.out or f"{runs[0].name}-blind-{'calibration-' if arguments.calibration else ''}{arguments.seed}"
@@ -186,7 +188,7 @@ class _Proof:
         for name, text in configs.items():
             write_text(self.config_file(name), text)
         files = {name: self.config_file(name) for name in configs}
-        experiments, chains = list_experiments(files, self.seed, self.purpose)
+        experiments, chains = blind_experiments_by_name(files, self.seed, self.purpose)
         weights = {name: EXPERIMENT_VARIATIONS[entry.variation].case_fraction for name, entry in experiments.items()}
         plan = blind.plan_blind_cases(self.count, self.seed, weights, chains, self.purpose)
         used = [name for name in experiments if any(entry.experiment == name for entry in plan)]
@@ -201,7 +203,7 @@ class _Proof:
             known = {"first": prepared / f"{name}.h5", "detectable": prepared / f"{name}.json", "folder": str(cases)}
             tasks.append(Task(f"case {entry.number}", {**told[name], **known, "planned": asdict(entry)}))
         made = self.done(_draw_case, tasks, "sealed/drawn")
-        text, digest = blind.seal_labels_with_hash([blind.CaseGroundTruth.from_dict(entry["label"]) for entry in made])
+        text, digest = blind.sealed_labels_and_hash([blind.CaseGroundTruth.from_dict(entry["label"]) for entry in made])
         write_text(self.folder / "sealed/labels.json", text)
         write_json(cases / "cases.json", [entry["case"] for entry in made])
         said = {"sha256": digest, "cases": self.count, "seed": self.seed, "purpose": self.purpose}
@@ -237,7 +239,7 @@ def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -
     first = Path(folder) / f"{name}.h5"
     BlindExperiment(**experiment)._write_first_recording(first)
     _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
-    detectable = ensemble.detectable_effect_sizes_to_json()
+    detectable = ensemble.candidate_sensitivities_to_json()
     write_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 
@@ -247,7 +249,7 @@ def _draw_case(
 ) -> dict[str, Any]:
     """Task: write the recordings of a case; returns its label and the data given to its diagnosis."""
     _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
-    ensemble.load_detectable_effect_sizes(read_input_json(detectable))
+    ensemble.load_candidate_sensitivities(read_input_json(detectable))
     case, label = ensemble.draw_planned_case(blind.PlannedBlindCase(**planned))
     for recording in (*case.estimation_recordings, case.held_out_recording):
         write_recording(recording, Path(folder) / f"{recording.name}.h5")
@@ -280,7 +282,7 @@ def diagnose_case_task(
         wide = blind_scores.permissive_thresholds(run.diagnosis)
         try:
             anything = blind.diagnose_blind_case(ensemble, case, candidates, wide)
-            found["open"] = to_json_types(statistics_compared_with_thresholds(anything))
+            found["open"] = to_json_types(decision_statistics_to_dict(anything))
         except YidError as error:
             found["open"] = {"message": str(error)}
     return found
@@ -417,16 +419,16 @@ def _ensemble(experiment: BlindExperiment, first: Path, written: int) -> tuple[R
 
 
 def _require_compatible(run: RunSettings) -> None:
-    if run.diagnosis.noise_fraction < 1 or any(entry.std is not None for entry in run.sensors.values()):
+    if run.diagnosis.noise_fraction_of_std < 1 or any(entry.std is not None for entry in run.sensors.values()):
         what = "virtual recordings have the noise of `run_virtual_experiment`, not that of these settings"
-        raise run.config_error(what, "sensors", hint="leave sensors.*.std and diagnosis.noise_fraction out")
+        raise run.config_error(what, "sensors", hint="leave sensors.*.std and diagnosis.noise_fraction_of_std out")
     system = build_system(run)
     if not system.driven or system.prescribed or system.servos:
         allowed = "a robot whose arms are driven by torques, nothing prescribed"
         raise run.config_error("a blind proof moves driven arms", "model", "arms", "mode", allowed=allowed)
 
 
-def list_experiments(
+def blind_experiments_by_name(
     configs: Mapping[str, Path], seed: int, purpose: str
 ) -> tuple[dict[str, BlindExperiment], frozenset[str]]:
     """Virtual experiments by name, and the names of those whose object's links can be divided further.

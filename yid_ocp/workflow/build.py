@@ -13,11 +13,11 @@ import numpy as np
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import GraspSettings, ParameterSettings, RunSettings
-from yid_ocp.data.channel_checks import median_point_pair_distances
+from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.recording import Recording
 from yid_ocp.effects import make_effect
 from yid_ocp.effects.base import arm_joint_names
-from yid_ocp.effects.friction import FRICTION_LAWS
+from yid_ocp.effects.friction import FRICTION_LAW_EFFECT_KINDS
 from yid_ocp.errors import DataError, YidError, nearest_name_hint
 from yid_ocp.integrator.step import Step, compile_step
 from yid_ocp.model import FlexibleObject, Grasp, Mechanism, Parameter, System, forward_kinematics
@@ -46,7 +46,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     values outside their bounds.
     """
     model, arms = run.model, run.model.arms
-    run_inputs.input_files(run)
+    run_inputs.input_files_by_name(run)
     run_inputs.load_plugins(run)
     if isinstance(model.object, ClampedObject):
         return _completed(run, _clamped_system(run, model.object, model.object.kind))
@@ -159,7 +159,7 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
         what = f"a {kind}'s lengths come from recordings"
         raise run.config_error(what, "recordings", "estimate", hint="list at least one")
     with add_setting_location_to_errors(run, "model", "object"):
-        return item.clamped_system(median_point_pair_distances(item.topology().edges, recordings), run.model.gravity)
+        return item.clamped_system(typical_point_pair_distances(item.topology().edges, recordings), run.model.gravity)
 
 
 def _completed(run: RunSettings, system: System, link_division: int = 1) -> System:
@@ -167,7 +167,7 @@ def _completed(run: RunSettings, system: System, link_division: int = 1) -> Syst
     named = {f"{said.kind}@{said.location}" for said in run.model.effects}
     for joint in friction_joints(run, system):
         assert run.model.friction is not None
-        kinds = FRICTION_LAWS[run.model.friction.law]
+        kinds = FRICTION_LAW_EFFECT_KINDS[run.model.friction.law]
         system = system.with_effects([make_effect(k, joint, system) for k in kinds if f"{k}@{joint}" not in named])
     for i, said in enumerate(run.model.effects):
         with add_setting_location_to_errors(run, "model", "effects", i):
@@ -228,7 +228,7 @@ def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[s
     wanted = run.model.friction.joints
     arms = {name.rpartition(".")[0] for name in parameters.names if name.endswith(".damping")}
     joints = arms if wanted is None else arms & set(wanted)
-    starts = tuple(f"{kind}@{joint}." for kind in FRICTION_LAWS[run.model.friction.law] for joint in joints)
+    starts = tuple(f"{kind}@{joint}." for kind in FRICTION_LAW_EFFECT_KINDS[run.model.friction.law] for joint in joints)
     dampings = {f"{joint}.damping" for joint in joints}
     return [name for name in parameters.names if name in dampings or name.startswith(starts)]
 

@@ -14,11 +14,11 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis import joint_checks, point_checks
-from yid_ocp.analysis.discretisation import min_grasp_closure_errors
+from yid_ocp.analysis.discretisation import min_closure_error_by_grasp
 from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.channel_checks import median_point_pair_distances
+from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_at_gaps
 from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import Recording
@@ -28,9 +28,9 @@ from yid_ocp.model import System
 from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDefinition
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
-from yid_ocp.problem.recorded_inputs import recorded_servo_gain_factors
+from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
 from yid_ocp.sensors.base import declared_channel_kinds
-from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_measured_by_arm
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, free_parameter_names
 from yid_ocp.workflow.run_inputs import read_recordings, unknown_name_error
@@ -66,11 +66,11 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
     if build.arms_are_estimated_states(run):
         # what the encoders say is what counts of the arms, as it does where they are prescribed
         sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
-        for name in {group.name for group in groups if is_measured_by_arm(group)}:
+        for name in {group.name for group in groups if is_point_group_measured_by_arm(group)}:
             sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
     cable = clamped_cable_topology(run)
     own = build.marker_positions_from_reference_pose(run, system, recordings)
-    for name, factors in recorded_servo_gain_factors(system, recordings).items():
+    for name, factors in servo_gain_factors_by_recording(system, recordings).items():
         # what the settings say of a gain goes before what a recording states
         unsaid = {key: x for key, x in factors.items() if key not in chosen or chosen[key].initial is None}
         own[name] = own.get(name, {}) | unsaid
@@ -79,18 +79,18 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         for name, s in run.model.clamps.items()
     )
     if cable is not None and isinstance(run.model.object, ClampedObject):
-        clamps = cable.clamp_paths
+        clamps = cable.clamp_pose_definitions
         for name in {group.name for group in groups}:
             said = sensors.get(name, SensorOptions())
             sensors[name] = said if said.points is not None else replace(said, points=cable.free_vertex_names)
         for recording in recordings:
-            lengths = median_point_pair_distances(cable.edges, [recording], _START_FRAMES)
+            lengths = typical_point_pair_distances(cable.edges, [recording], _START_FRAMES)
             if values := run.model.object.recording_parameter_values(lengths):
                 own[recording.name] = values
     return replace(
         run.problem,
         sensors=sensors,
-        clamp_paths=clamps,
+        clamp_pose_definitions=clamps,
         local_parameters=tuple(name for name, said in chosen.items() if said.per_recording),
         prior_stds={name: said.prior_std for name, said in chosen.items() if said.prior_std is not None},
         parameters_by_recording=own,
@@ -135,7 +135,7 @@ def build_problem(
     return problem
 
 
-def initial_grasp_closure_errors(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
+def initial_closure_error_by_grasp(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
     """Least distance between the two frames of every grasp at a recording's first arm angles, by grasp name [m]."""
     system = problem.system
     if not system.grasps:
@@ -145,7 +145,7 @@ def initial_grasp_closure_errors(problem: EstimationProblem, episode: Episode) -
     theta = problem.theta.copy()
     for name, value in episode.known_parameters.items():
         theta[system.parameters.index(name)] = value
-    return min_grasp_closure_errors(system, posture, theta)
+    return min_closure_error_by_grasp(system, posture, theta)
 
 
 def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
@@ -153,7 +153,7 @@ def _check_grasps_close(run: RunSettings, problem: EstimationProblem) -> None:
     if issues := _gravest_first(problem.options.data_issues)[:_MAX_QUOTED_ISSUES]:
         hint = f"first look at what is in doubt: {'; '.join(f'{issue.where}: {issue.what}' for issue in issues)}"
     for episode in (*problem.episodes, *problem.held_out):
-        for name, gap in initial_grasp_closure_errors(problem, episode).items():
+        for name, gap in initial_closure_error_by_grasp(problem, episode).items():
             if gap > _MAX_GRASP_GAP:
                 where, allowed = run.describe_location("model", "grasp", name), f"at most {1e3 * _MAX_GRASP_GAP:g} mm"
                 what = f"grasp '{name}' cannot be closed at the first posture of '{episode.name}'"
@@ -309,7 +309,7 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
     lengths = ca.vertcat(ca.SX(0), *(length for segment in system.segment_layouts for length in segment.link_lengths))
     size = float(ca.Function("size", [system.parameters.symbols], [ca.sum1(lengths)])(problem.theta))
     wanted = any(samples.sensor.point_names for episode in problem.episodes for samples in episode.measurements)
-    if not size or not wanted or problem.options.clamp_paths:
+    if not size or not wanted or problem.options.clamp_pose_definitions:
         return []
     found: list[Issue] = []
     for i, episode in enumerate(problem.episodes):

@@ -24,11 +24,11 @@ from yid_ocp.report.animation import Animation, make_animation, recording_animat
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
-from yid_ocp.workflow.build_problem import build_problem, initial_grasp_closure_errors, issues_to_plain_data
+from yid_ocp.workflow.build_problem import build_problem, initial_closure_error_by_grasp, issues_to_plain_data
 from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, command_with_settings
-from yid_ocp.workflow.prediction_outputs import predicted_trajectory
+from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import input_files
+from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import discretisation_shift_results, measure_discretisation_shifts
 
 _FREQUENCY_TOLERANCE = 0.02  # fraction by which a frequency may move when links or steps are refined, without a warning
@@ -92,7 +92,7 @@ def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, 
     if run.model.robot is not None:
         # the file's own numbers, not those that settings or effects put in their place
         read = urdf_reader_options(run)
-        path, gravity = input_files(run)[run.model.robot], np.array(run.model.gravity, float)
+        path, gravity = input_files_by_name(run)[run.model.robot], np.array(run.model.gravity, float)
         try:
             found["file"] = compare_urdf_with_pinocchio(path, read_urdf(path, **read), gravity, **read)
         except ValueError as error:
@@ -139,7 +139,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         entry["equilibrium"] = {"found": rest.is_converged, "imbalance": rest.max_imbalance, "message": rest.message}
         if not rest.is_converged:
             warnings.append(f"{episode.name}: {rest.message} with the initial parameters")
-    entry["grasp_gaps"] = initial_grasp_closure_errors(problem, episode)
+    entry["grasp_gaps"] = initial_closure_error_by_grasp(problem, episode)
     return entry
 
 
@@ -174,7 +174,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
         shared = problem.split(problem.initial_unknowns, i)[0]
         if first.ok:
             prediction = first.episode_predictions[i]
-            told = predicted_trajectory("with the initial values", problem, episode, prediction, shared)
+            told = predicted_configuration_trajectory("with the initial values", problem, episode, prediction, shared)
             scenes.append(make_animation(episode.name, [told], episode.recording))
         else:
             theta = problem.predictor.theta_with_episode_values(episode, shared)
@@ -188,7 +188,7 @@ def _moves(
 ) -> dict[str, Any]:
     x = problem.initial_unknowns
     growth = discretisation.largest_alternating_error_growth(problem, x)
-    if growth is not None and not growth.is_stable:
+    if growth is not None and not growth.keeps_errors_below_resolution:
         warnings.append(f"with the initial parameters {growth.description}")
     if not at_x.ok:
         warnings.append(f"the model cannot be rolled out with the initial parameters: {at_x.message}")

@@ -122,7 +122,7 @@ def _format_iterate(entry: Iterate) -> str:
     return f"iteration {entry.iteration}, cost {entry.cost:.6g}, {entry.seconds:.1f} s{note}"
 
 
-class StderrLineProgress(Progress):
+class StderrLogLinesProgress(Progress):
     """Progress as lines on standard error: for every stage, iterate, tenth of a stage, and some seconds of silence."""
 
     def __init__(self) -> None:
@@ -185,7 +185,7 @@ def stderr_progress_display(arguments: argparse.Namespace) -> Iterator[Progress]
     if arguments.quiet or (arguments.json and not terminal):
         yield NULL_PROGRESS
     elif not terminal:
-        yield StderrLineProgress()
+        yield StderrLogLinesProgress()
     else:
         from rich.console import Console
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn

@@ -8,9 +8,9 @@ from typing import Any
 
 from yid_ocp.analysis import friction_ladder
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods, explain_paper_estimates
-from yid_ocp.analysis.friction_ladder import FrictionLawFit, mean_and_standard_error
+from yid_ocp.analysis.friction_ladder import FrictionLawFit, left_out_error_mean_and_std_error
 from yid_ocp.config.settings import FrictionSettings, RunSettings
-from yid_ocp.effects.friction import FRICTION_LAWS
+from yid_ocp.effects.friction import FRICTION_LAW_EFFECT_KINDS
 from yid_ocp.errors import DataError
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
@@ -100,11 +100,11 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         folder.record_run_start(run, "friction")
         fits: list[FrictionLawFit] = []
         solved: dict[str, tuple[RunSettings, EstimationProblem, Solution]] = {}
-        for law in FRICTION_LAWS:
+        for law in FRICTION_LAW_EFFECT_KINDS:
             progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
             settings = replace(run, model=replace(run.model, friction=FrictionSettings(law=law, joints=joints)))
-            problem = friction_ladder.without_held_out(build_problem(settings))
-            kinds = friction_ladder.motion_kinds(problem)
+            problem = friction_ladder.problem_estimating_on_held_out_too(build_problem(settings))
+            kinds = friction_ladder.recordings_by_motion_kind(problem)
             if len(kinds) < 2:
                 allowed = "two recordings or more in which the motors are on"
                 hint = "list more under recordings.estimate or recordings.held_out"
@@ -137,9 +137,9 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
 
 
 def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tuple[str, ...]]) -> dict[str, Any]:
-    mean, error = mean_and_standard_error(fit.left_out_errors, kinds)
+    mean, error = left_out_error_mean_and_std_error(fit.left_out_errors, kinds)
     beyond = {name: own - best.left_out_errors[name] for name, own in fit.left_out_errors.items()}
-    difference, paired = mean_and_standard_error(beyond, kinds)
+    difference, paired = left_out_error_mean_and_std_error(beyond, kinds)
     return {
         "mean_error": mean,
         "standard_error": error,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis.estimate_history import pool_estimates
-from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG, load_config
+from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
 from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
@@ -42,7 +42,7 @@ _STORE_FORMAT = "yid-refits/1"
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG)
+    settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)
         settings = replace(settings, diagnosis=replace(settings.diagnosis, baseline=said))
@@ -64,12 +64,12 @@ def run_diagnose(
             folder.log_event("message", level="WARNING", source="baseline", text=said)
         run = run_history.settings_with_baseline_effects(run, runs)
         problem = build_problem(run, reference_recordings=without)
-        run_history.require_distinct_recordings(run, problem, runs, without)
+        run_history.require_recordings_not_in_baseline(run, problem, runs, without)
         if runs:
             problem = with_baseline_prior(problem, pool_estimates(runs)[0])
         nominal: Solution | None = None
         try:
-            if run.diagnosis.noise_fraction < 1 and problem.held_out:
+            if run.diagnosis.noise_fraction_of_std < 1 and problem.held_out:
                 # in units of noise the solver would take any fit for a bad one and start again elsewhere
                 logged.begin_stage("solving the nominal model")
                 nominal = solve(problem, run.solver, callback=logged.report_iterate)
@@ -91,7 +91,7 @@ def run_diagnose(
         prediction_outputs.write_diagnosis_trajectories(folder.path / "trajectories.h5", finding, predicted)
         last, told = finding.final_model, finding.to_dict()
         system = last.problem.system
-        moving = not last.problem.options.clamp_paths and bool(system.driven or system.prescribed)
+        moving = not last.problem.options.clamp_pose_definitions and bool(system.driven or system.prescribed)
         x = last.problem.vector(last.values)
         own = {
             "model": final_model_to_dict(finding),
@@ -133,8 +133,8 @@ def _flags(run: RunSettings) -> list[str]:
 
 
 def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> EstimationProblem:
-    """The problem with all stated standard deviations scaled by `diagnosis.noise_fraction` to noise alone."""
-    share, options = run.diagnosis.noise_fraction, problem.options
+    """The problem with all stated standard deviations scaled by `diagnosis.noise_fraction_of_std` to noise alone."""
+    share, options = run.diagnosis.noise_fraction_of_std, problem.options
     if share == 1:
         return problem
     sensors = dict(options.sensors)
@@ -142,7 +142,7 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
         level = getattr(sensors[group], field) if group in sensors else None
         if level is None:
             what = f"the fraction of noise in the {field} of '{group}' is given, but not the {field}"
-            raise run.config_error(what, "diagnosis", "noise_fraction", hint=f"set sensors.{group}.{field}")
+            raise run.config_error(what, "diagnosis", "noise_fraction_of_std", hint=f"set sensors.{group}.{field}")
         by_name = isinstance(level, Mapping)
         smaller: Any = {name: share * std for name, std in level.items()} if by_name else share * level
         sensors[group] = replace(sensors[group], **{field: smaller})
@@ -201,7 +201,9 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]
         told = []
         for (name, fit), outcome in zip(fits.items(), outcomes, strict=False):
             theta = fit.problem.split(fit.problem.vector(fit.values), 0)[0]
-            told.append(prediction_outputs.predicted_trajectory(name, fit.problem, episode, outcome, theta))
+            told.append(
+                prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
+            )
         scenes.append(make_animation(f"{episode.name} (held out)", told, episode.recording))
     return scenes
 

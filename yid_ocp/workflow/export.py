@@ -155,7 +155,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
     if form == "mjcf":
         grasp = FormatSupport("native", "equality constraints between sites, or a tendon where it gives way")
     parameters = {}
-    for name, entry in models.parameter_format_support(full, supports, form).items():
+    for name, entry in models.format_support_by_parameter(full, supports, form).items():
         own, stds = full.parameters[name], calibrated.parameter_stds
         known = {"value": calibrated.parameter_values.get(name, own.value), "unit": own.unit}
         parameters[name] = known | {"estimated": name in stds, "std": stds.get(name), **vars(entry)}
@@ -186,7 +186,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
 
 def _expressible(calibrated: _CalibratedModel, full: System, form: str) -> tuple[System, dict[str, FormatSupport]]:
     """The system without the effects that a format cannot tell, and what it makes of each."""
-    said = models.effect_format_support(full, calibrated.values_for(full), form)
+    said = models.format_support_by_effect(full, calibrated.values_for(full), form)
     for _ in range(len(said) + 1):
         told = {label: entry for label, entry in said.items() if entry.status != "not representable"}
         kept = [label for label, entry in told.items() if not entry.how.startswith("neutral")]

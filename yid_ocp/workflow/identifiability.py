@@ -16,7 +16,11 @@ from yid_ocp.analysis import identifiability as fisher
 from yid_ocp.analysis import what_if
 from yid_ocp.analysis.compare import problem_without_cable_memory
 from yid_ocp.analysis.experiment_design import RecordedExperiment
-from yid_ocp.analysis.identifiability import GRASP_OFFSET_PRIOR_STD, IdentifiabilityResult, with_grasp_offset_effects
+from yid_ocp.analysis.identifiability import (
+    GRASP_OFFSET_PRIOR_STD,
+    IdentifiabilityResult,
+    system_with_grasp_offset_effects,
+)
 from yid_ocp.analysis.profile import ParameterProfileLikelihood, is_small_enough_for_profiles
 from yid_ocp.analysis.what_if import ChangedExperimentResult
 from yid_ocp.config.reader import load_config
@@ -30,8 +34,8 @@ from yid_ocp.workflow.build import build_step, build_system, system_with_second_
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandResult, command_with_settings, workers_from_arguments
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import input_files
-from yid_ocp.workflow.solve import solve_and_log
+from yid_ocp.workflow.run_inputs import input_files_by_name
+from yid_ocp.workflow.solve import solve_and_decide_cable_memory
 
 
 @dataclass(frozen=True)
@@ -94,18 +98,20 @@ def run_identifiability(
         folder.record_run_start(run, "identifiability", asked._command_line_flags())
         progress.begin_stage("building the model and its compiled step")
         system = build_system(run)
-        problem = whole = build_problem(run, build_step(run, with_grasp_offset_effects(system)))
+        problem = whole = build_problem(run, build_step(run, system_with_grasp_offset_effects(system)))
         limits = run.diagnosis.null_test_residual_limits
         solution = None
         if asked.evaluation_point == "solution":
-            safe = solve_and_log(run, problem, folder, progress)
+            safe = solve_and_decide_cable_memory(run, problem, folder, progress)
             problem, solution = safe.problem, safe.solution
         tasks = None
         if workers is not None:
             told = {
                 "config": folder.path / "config.yaml",
                 # what the results depend on beside it
-                "inputs": sorted({p.absolute() for name, p in input_files(run).items() if name != "configuration"}),
+                "inputs": sorted(
+                    {p.absolute() for name, p in input_files_by_name(run).items() if name != "configuration"}
+                ),
                 "x": None if solution is None else fisher.unknowns_from_solution(problem, solution).tolist(),
                 "remembers": problem is whole,
                 "start": asked.start_knowledge,
@@ -130,7 +136,7 @@ def run_identifiability(
             if asked.rank_changes:
                 other = system_with_second_arm(run, system)
                 known: dict[str, Any] = {"start": asked.start_knowledge, "grasp_std": asked.grasp_offset_std}
-                known["two_arm_system"] = None if other is None else with_grasp_offset_effects(other)
+                known["two_arm_system"] = None if other is None else system_with_grasp_offset_effects(other)
                 known["evaluate_changes"] = None if tasks is None else tasks.evaluate_change_sets
                 ranking = what_if.what_if(problem, solution, progress=progress, **known)
         result = _identifiability_result(problem, solution, information, unknown, ranking, asked)
@@ -251,7 +257,7 @@ def _change_set_outcomes(
     """Task: expected information of the experiment with each set of changes, as plain data."""
     run, problem = _problem(common)
     other = system_with_second_arm(run, build_system(run))
-    two_arms = None if other is None else with_grasp_offset_effects(other)
+    two_arms = None if other is None else system_with_grasp_offset_effects(other)
     x = fisher.unknowns_from_solution(problem, common["x"])
     setting = RecordedExperiment(problem, x, common["start"], common["grasp_std"], two_arms)
     return list(to_lossless_plain_data(what_if.evaluate_change_sets(setting, sets, inflation)))
@@ -259,5 +265,5 @@ def _change_set_outcomes(
 
 def _problem(common: Mapping[str, Any]) -> tuple[RunSettings, EstimationProblem]:
     run = load_config(common["config"])
-    problem = build_problem(run, build_step(run, with_grasp_offset_effects(build_system(run))))
+    problem = build_problem(run, build_step(run, system_with_grasp_offset_effects(build_system(run))))
     return run, problem if common["remembers"] else problem_without_cable_memory(problem)

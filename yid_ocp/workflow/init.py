@@ -16,7 +16,7 @@ from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_details
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import InitCommandObject, comma_separated_numbers, init_command_object_templates
+from yid_ocp.model.objects.base import InitObjectConfiguration, comma_separated_numbers, init_object_builders
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.progress import Progress
@@ -64,9 +64,9 @@ def run(arguments: argparse.Namespace) -> int:
 # -- what was asked ---------------------------------------------------------------------------------------------------
 
 
-def _object_from_arguments(arguments: argparse.Namespace) -> InitCommandObject:
+def _object_from_arguments(arguments: argparse.Namespace) -> InitObjectConfiguration:
     """The described object; `ConfigError` for a number that is missing or impossible, which names its option."""
-    templates, word = init_command_object_templates(), arguments.object
+    templates, word = init_object_builders(), arguments.object
     if word not in templates:
         said = unknown_name_details(word, templates)
         raise ConfigError(f"there is no choice of --object '{word}'", where="yid-ocp init", **said)
@@ -177,7 +177,7 @@ _ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
 def _config_lines(
     robot: str,
     noun: str,
-    item: InitCommandObject,
+    item: InitObjectConfiguration,
     proposal: ConfigProposal,
     recordings: Sequence[str],
     imports: Mapping[str, Any],
@@ -268,7 +268,7 @@ def _arms(proposal: ConfigProposal) -> Iterator[str]:
         yield _line("      ", "has_gravity_compensation", "false", carried)
 
 
-def _object(item: InitCommandObject, proposal: ConfigProposal) -> Iterator[str]:
+def _object(item: InitObjectConfiguration, proposal: ConfigProposal) -> Iterator[str]:
     holder, grasps = proposal.holder_frame, proposal.grasps
     yield "  object:"
     if item.stands_in_world:
@@ -361,7 +361,7 @@ def _sensors(proposal: ConfigProposal) -> Iterator[str]:
         yield f"  # {group} come at {clock}"
 
 
-def _parameters(item: InitCommandObject, proposal: ConfigProposal) -> Iterator[str]:
+def _parameters(item: InitObjectConfiguration, proposal: ConfigProposal) -> Iterator[str]:
     free = "{free: true}"
     yield _line("", "parameters", "", item.parameters_comment)
     for name, (value, comment) in item.start_values.items():

@@ -206,10 +206,10 @@ def _dependence(
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
     rows: StepEquationLinearizations,
-) -> tuple[step_diagnostics.ParameterEquationDependence, ...]:
+) -> tuple[step_diagnostics.ParameterRowsAndSensorResponse, ...]:
     """Where every parameter enters and who sees it; along the recordings where the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
-    found = step_diagnostics.parameter_dependences(step, symbols, episode, point.state, point.theta, rows)
+    found = step_diagnostics.parameter_rows_and_sensor_responses(step, symbols, episode, point.state, point.theta, rows)
     at_start = None if problem is None else problem.evaluate(problem.initial_unknowns)
     if problem is None or at_start is None or not at_start.ok or at_start.jacobian is None:
         return found

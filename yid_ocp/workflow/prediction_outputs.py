@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.issues import MAX_ISSUE_EVIDENCE, Issue
+from yid_ocp.data.issues import MAX_EVIDENCE_RATIO, Issue
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.localise import smoothed_unknown_units
@@ -21,7 +21,7 @@ from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem import EstimationProblem, predictions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.report.animation import ModelTrajectory
+from yid_ocp.report.animation import ConfigurationTrajectory
 from yid_ocp.report.terminal import channel_or_group_unit
 from yid_ocp.solvers import Solution
 
@@ -65,9 +65,7 @@ def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) 
     return (best, rms[best], error) if best is not None and error > _WORSE_RATIO * rms[best] else None
 
 
-def channels_worse_than_baseline(
-    entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
-) -> list[dict[str, Any]]:
+def entries_worse_than_baseline(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[dict[str, Any]]:
     """Channels of `prediction_error_entry` entries that a baseline without a model predicts clearly better."""
     worse = []
     for entry in entries:
@@ -82,7 +80,7 @@ def channels_worse_than_baseline(
 def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Issue]:
     """Issues for sensors that a model-free baseline predicts better than the model, over all their channels.
 
-    Single channels that say little of what the model is about may well be worse; see `channels_worse_than_baseline`.
+    Single channels that say little of what the model is about may well be worse; see `entries_worse_than_baseline`.
     """
     found = []
     for entry in entries:
@@ -95,7 +93,7 @@ def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapp
                 best, guess, error = better
                 unit = units[channels[0]]
                 what = f"the model is off by {error:.3g} {unit} (rms), the guess '{best}' without a model by"
-                evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_ISSUE_EVIDENCE
+                evidence = error / (_WORSE_RATIO * guess) if guess > 0 else MAX_EVIDENCE_RATIO
                 advice = "look at the residuals, and let `yid-ocp diagnose` say what the model lacks"
                 sensor, _, channel = group.partition(".")
                 at = (entry["recording"], sensor, channel)
@@ -128,7 +126,7 @@ def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | N
         recording, held, points = episode.recording, cable.clamped_vertex_names, sensor.point_names
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
-        parents, children = cable.parent_vertices, cable.child_vertices
+        parents, children = cable.parent_branch_points, cable.child_branch_points
         carried = predictions.interpolated_displacement_baseline
         arrays = {
             "stays": predictions.constant_position_baseline(recording, points, _START_FRAMES),
@@ -150,7 +148,7 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     """
     if all(whitening is None for whitening in problem.whitening_filters):
         return {}
-    known = list(zip(problem.episodes, whitening.estimate_recording_torque_biases(problem, x), strict=True))
+    known = list(zip(problem.episodes, whitening.torque_biases_and_stds_by_recording(problem, x), strict=True))
     apart = [e for e in problem.held_out if e.initial_state_shared_with is None and _has_torque_bias(e)]
     if apart:
         is_whitened = any(problem.held_out_whitening_filters)
@@ -176,13 +174,13 @@ def _has_torque_bias(episode: Episode) -> bool:
     return episode.input_errors is not None and bool(np.any(episode.input_errors.torque_bias_std > 0))
 
 
-def predicted_trajectory(
+def predicted_configuration_trajectory(
     name: str, problem: EstimationProblem, episode: Episode, prediction: EpisodePrediction, theta: Array
-) -> ModelTrajectory:
+) -> ConfigurationTrajectory:
     """Trajectory of a predicted recording, to be animated; `theta`: parameters of all recordings, shape (ntheta,)."""
     system, q = problem.system, prediction.rollout.state[:, : problem.system.n_coordinates]
     own = problem.predictor.theta_with_episode_values(episode, theta)
-    return ModelTrajectory(name, system, own, episode.grid.node_times, q)
+    return ConfigurationTrajectory(name, system, own, episode.grid.node_times, q)
 
 
 SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/1"

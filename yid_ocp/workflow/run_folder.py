@@ -27,7 +27,7 @@ from yid_ocp.progress import Progress
 from yid_ocp.report.html import write_report
 from yid_ocp.report.sections import ReportData
 from yid_ocp.version import installed_versions
-from yid_ocp.workflow.run_inputs import input_files, plugin_versions
+from yid_ocp.workflow.run_inputs import input_files_by_name, plugin_versions
 
 log = logging.getLogger(__name__)
 _UNFINISHED, _LOCK, _NAMES = ".partial", "yid-ocp.lock", 1000
@@ -47,9 +47,9 @@ class RunFolder:
     _begun: float = field(default_factory=time.perf_counter, repr=False)
 
     def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
-        """Write config.yaml, hash what the run reads and log the start of a command; errors as `input_files`."""
+        """Write config.yaml, hash what the run reads, log the start of a command; errors as `input_files_by_name`."""
         self.write_text_file("config.yaml", dump_config(run))
-        self.input_hashes |= {name: file_sha256(path) for name, path in input_files(run).items()}
+        self.input_hashes |= {name: file_sha256(path) for name, path in input_files_by_name(run).items()}
         origins = list(run.key_locations.values())
         said = [] if any(origin.startswith("embedded default") for origin in origins) else [run.config_file]
         if any(origin.startswith("--set") for origin in origins):

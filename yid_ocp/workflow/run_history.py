@@ -10,7 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from yid_ocp.analysis.estimate_history import EstimateHistory, RunEstimates, assess_drift, pool_estimates
+from yid_ocp.analysis.estimate_history import (
+    EstimateHistory,
+    RunEstimates,
+    assess_drift_and_outlier_runs,
+    pool_estimates,
+)
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettings
 from yid_ocp.data.recording import Recording
@@ -213,7 +218,7 @@ def load_reference_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], 
     return tuple(replace(recording, name=f"{recording.name} (without)") for recording in found), ""
 
 
-def require_distinct_recordings(
+def require_recordings_not_in_baseline(
     run: RunSettings, problem: EstimationProblem, runs: Sequence[RunEstimates], without: Sequence[Recording]
 ) -> None:
     """Raise `ConfigError` where a recording of the run is also a baseline or reference recording."""
@@ -245,7 +250,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     estimates = [read_estimates(path) for path in paths]
     require_same_model(paths)
     progress.begin_stage(f"comparing {len(paths)} runs")
-    found = assess_drift(estimates)
+    found = assess_drift_and_outlier_runs(estimates)
     settings = RunSettings(name="history", description="Runs of one model side by side.")
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in paths}
@@ -268,7 +273,7 @@ def estimate_history_result(found: EstimateHistory) -> dict[str, Any]:
         **attributes_to_json(found, "level=significance_level chi2 degrees=degrees_of_freedom p_value"),
         "runs": [
             attributes_to_json(entry, f"{names} explains=is_fit_adequate distrusted=is_outlier")
-            for entry in found.run_consistencies
+            for entry in found.run_outlier_tests
         ],
         "parameters": parameters,
     }

@@ -124,7 +124,7 @@ def unknown_name_error(run: RunSettings, noun: str, name: str, known: Iterable[s
     return run.config_error(f"there is no {noun} '{name}'", *path, hint=nearest_name_hint(name, known))
 
 
-def input_files(run: RunSettings) -> dict[str, Path]:
+def input_files_by_name(run: RunSettings) -> dict[str, Path]:
     """Every file that a run reads, by its name in the settings: configuration, plug-ins, robot, recordings.
 
     `ConfigError` where one does not exist, which names the setting and the nearest file that does.

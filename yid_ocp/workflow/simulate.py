@@ -19,7 +19,7 @@ from yid_ocp.report.animation import Animation, make_animation, recording_animat
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import problem_options
 from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
-from yid_ocp.workflow.prediction_outputs import predicted_trajectory
+from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import read_recordings
 
@@ -96,5 +96,5 @@ def _predicted(run: RunSettings, system: System, progress: Progress, seed: int |
     if isinstance(outcome, str):
         return outcome, []
     made = recording_from_prediction(problem.predictor, episode, outcome, theta, seed, run.description)
-    told = predicted_trajectory("simulated", problem, episode, outcome, theta)
+    told = predicted_configuration_trajectory("simulated", problem, episode, outcome, theta)
     return made, [make_animation("simulated", [told], episode.recording)]

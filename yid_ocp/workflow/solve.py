@@ -10,10 +10,10 @@ from typing import Any, Literal
 import numpy as np
 
 from yid_ocp.analysis import discretisation
-from yid_ocp.analysis.clock_checks import check_fit_residuals
+from yid_ocp.analysis.clock_checks import check_fit_for_drift_and_noise
 from yid_ocp.analysis.compare import CableMemoryDecision, decide_cable_memory
 from yid_ocp.analysis.discretisation import AlternatingErrorGrowth, DiscretisationEstimateShift
-from yid_ocp.analysis.profile import with_profile_intervals
+from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
@@ -24,7 +24,7 @@ from yid_ocp.integrator.step import step_with_time_step
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
-from yid_ocp.problem.predictions import rmse_by_channel
+from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow import prediction_outputs
@@ -50,10 +50,10 @@ def run_solve(
     with atomic_run_folder(run, out) as folder:
         folder.record_run_start(run, "solve")
         progress.begin_stage("building the model and its compiled step")
-        safe = solve_and_log(run, build_problem(run), folder, progress)
-        solution, stability = stability_checked_solution(safe.problem, safe.solution)
+        safe = solve_and_decide_cable_memory(run, build_problem(run), folder, progress)
+        solution, stability = solution_marked_if_step_unstable(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
-        solution = with_profile_intervals(problem, solution, progress)
+        solution = solution_with_profile_intervals(problem, solution, progress)
         shifts: dict[str, DiscretisationEstimateShift] = {}
         notes: list[str] = []
         if solution.evaluation is not None:
@@ -90,7 +90,7 @@ def run_solve(
 run = command_with_settings(run_solve)
 
 
-def solve_and_log(
+def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> CableMemoryDecision:
     """Solve by the run's solver, every iterate logged and shown; without cable memory where it is not supported."""
@@ -118,7 +118,7 @@ def solution_and_fit_issues(
     if solution.evaluation is None:
         return solution, problem.options.data_issues
     errors, units, _ = _prediction_errors(problem, solution, held_out, cable)
-    found = check_fit_residuals(problem, solution.x, solution.evaluation)
+    found = check_fit_for_drift_and_noise(problem, solution.x, solution.evaluation)
     found += prediction_outputs.worse_than_baseline_issues(errors, units)
     if any(doubt.weight != "warning" for doubt in found):
         believed = replace(solution.goodness_of_fit, believed=False)
@@ -143,7 +143,7 @@ def solve_result(
 ) -> dict[str, Any]:
     """Contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = _prediction_errors(problem, solution, held_out, cable)
-    worse = prediction_outputs.channels_worse_than_baseline(errors, units)
+    worse = prediction_outputs.entries_worse_than_baseline(errors, units)
     return {
         "format": _RESULT_FORMAT,
         "status": solution.status.value,
@@ -168,7 +168,7 @@ def _prediction_errors(
     if solution.evaluation is not None:
         fitted = list(zip(problem.episodes, solution.episode_predictions, strict=True))
         able = [(result, episode) for episode, result in fitted if not isinstance(result, str)]
-        residuals = rmse_by_channel([result for result, _ in able], [episode for _, episode in able])
+        residuals = rmse_unit_and_count_by_channel([result for result, _ in able], [episode for _, episode in able])
         pairs += fitted
     units = {channel: entry["unit"] for channel, entry in residuals.items()}
     return [prediction_outputs.prediction_error_entry(problem, *pair, cable) for pair in pairs], units, residuals
@@ -213,7 +213,7 @@ def measure_discretisation_shifts(
         progress.begin_stage(f"trying {words}")
         try:
             refined = _refined_problem(run, problem, key)
-            shifts = discretisation.discretisation_estimate_shifts
+            shifts = discretisation.parameter_shifts_in_finer_model
             own = shifts(refined, problem, x, at_x, model_difference_only=models_alone)
         except YidError as error:
             own = error.what
@@ -245,7 +245,7 @@ def _refined_problem(
     return discretisation.FinerDiscretisationProblem(made, factors, joints)
 
 
-def stability_checked_solution(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
+def solution_marked_if_step_unstable(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
     """The solution, marked as not converged where the step is unstable, and stability data for result.json.
 
     Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not
@@ -254,11 +254,11 @@ def stability_checked_solution(problem: EstimationProblem, solution: Solution) -
     growth = discretisation.largest_alternating_error_growth
     begin, end = growth(problem, problem.initial_unknowns), growth(problem, solution.x)
     found = {"start": _growth_result(begin), "estimate": _growth_result(end)}
-    if end is not None and not end.is_stable:
+    if end is not None and not end.keeps_errors_below_resolution:
         status = Status.STALLED if solution.status == Status.CONVERGED else solution.status
         message = f"at the estimate {end.description} ({solution.message})"
         return replace(solution, status=status, message=message), found
-    if solution.status == Status.FAILED and begin is not None and not begin.is_stable:
+    if solution.status == Status.FAILED and begin is not None and not begin.keeps_errors_below_resolution:
         return replace(solution, message=f"at the start {begin.description} ({solution.message})"), found
     return solution, found
 

@@ -32,7 +32,7 @@ from yid_ocp.files import (
 from yid_ocp.model.system import System
 from yid_ocp.parallel import InlineExecutor, Task, TaskResult, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import Progress
-from yid_ocp.report.animation import ModelTrajectory, make_animation
+from yid_ocp.report.animation import ConfigurationTrajectory, make_animation
 from yid_ocp.vision import camera_registration as registration
 from yid_ocp.vision import surface_meshes, track_result
 from yid_ocp.vision.calibration import CameraCalibration
@@ -80,7 +80,7 @@ def _run_track(
                 common = tasks.calibrate_sequence()
                 progress.begin_stage("tracking")
                 done = tasks.track_frames(tracker, common, workers or InlineExecutor(), progress)
-                frames, note = tracker.assign_root_and_mark_outliers(done)
+                frames, note = tracker.assign_root_and_drop_outliers(done)
                 try:
                     found = tracker.to_track_result(frames, note, common)
                 except DataError as error:
@@ -104,7 +104,7 @@ def _run_track(
                 own = single_recording_issues(run, system, tracked)
                 doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]
             theta = system.parameters.vector()
-            shape = ModelTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
+            shape = ConfigurationTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
             told = [make_animation("tracked", [shape], tracked)]
             result["truth_errors"] = {} if made is None else _truth_errors(system, found, made)
         result |= {"doubts": issues_to_plain_data(doubts), "refused": "" if refused is None else refused.what}
@@ -248,7 +248,7 @@ def simulate_recording_and_camera_frames(run: RunSettings, system: System) -> tu
         recording = record_simulation(system, None, experiment, truth)
         rate, latency = settings.frame_rate, (settings.latency, settings.latency_std)
         timing = surface_meshes.FrameTiming(rate, settings.dropped_fraction, *latency)
-        depth = surface_meshes.DepthCamera(outlier_probability=settings.outlier_fraction)
+        depth = surface_meshes.DepthSensorModel(outlier_probability=settings.outlier_fraction)
         pose = look_at_pose(settings.camera_position, settings.camera_target)
         camera = surface_meshes.VirtualCamera(pose, depth, timing, seed=seed)
         made = surface_meshes.render_virtual_frames(camera_scene(run, system), truth.t, truth.q, camera)
@@ -379,7 +379,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
     del inputs
     tracker = _tracker(read_input_text(config), config)
-    found = tracker.track_frame(index, dataclass_from_plain_data(SequenceCalibration, common))
+    found = tracker.process_frame(index, dataclass_from_plain_data(SequenceCalibration, common))
     return dict(to_lossless_plain_data(found))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, ClockKind, JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, RecordedOrNominalClock, Recording
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_number_count, file_sha256
 
@@ -46,7 +46,7 @@ class CsvOptions(base.SelectionAndUnitOptions):
     header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # leave out lines that are no rows of numbers, and count them in `notes`
     delimiter: str = ","  # one character between cells
-    clock: ClockKind = "recorded"  # whether the times were measured
+    clock: RecordedOrNominalClock = "recorded"  # whether the times were measured
     sensor: str = "unknown"  # what saw the points
     frame: str = "world"  # their frame of reference
     description: str = ""  # what was recorded

@@ -64,17 +64,20 @@ class ClampPoseDefinition:
 class CableTopology:
     """Vertices and branches of a cable with their undeformed positions; branches by the name of their segment."""
 
-    parent_vertices: tuple[str, ...]  # from one clamp to the other; the first two and the last two are held
-    child_vertices: Mapping[str, tuple[str, ...]]  # the first one is that of the parent at which the child leaves
+    parent_branch_points: tuple[str, ...]  # from one clamp to the other; the first two and the last two are held
+    child_branch_points: Mapping[str, tuple[str, ...]]  # the first one is that of the parent at which the child leaves
     undeformed_positions: Mapping[str, ArrayLike]  # of every vertex at rest without load, in any frame, shape (3,) [m]
     parent_segment: str = "parent"
 
     def __post_init__(self) -> None:
-        free = self.parent_vertices[2:-2]
+        free = self.parent_branch_points[2:-2]
         if not free:
-            what, allowed = f"the parent has {len(self.parent_vertices)} vertices", "5 or more: two held at each end"
+            what, allowed = (
+                f"the parent has {len(self.parent_branch_points)} vertices",
+                "5 or more: two held at each end",
+            )
             raise ModelError(what, where="cable", allowed=allowed)
-        for name, vertices in self.child_vertices.items():
+        for name, vertices in self.child_branch_points.items():
             if len(vertices) < 2 or vertices[0] not in free:
                 what = f"child '{name}' does not leave the parent at one of its free vertices"
                 raise ModelError(what, where="cable", allowed=", ".join(free))
@@ -88,12 +91,15 @@ class CableTopology:
     @property
     def vertices(self) -> tuple[str, ...]:
         """Names of all vertices, the parent's first."""
-        return (*self.parent_vertices, *(vertex for chain in self.child_vertices.values() for vertex in chain[1:]))
+        return (
+            *self.parent_branch_points,
+            *(vertex for chain in self.child_branch_points.values() for vertex in chain[1:]),
+        )
 
     @property
     def clamped_vertex_names(self) -> tuple[str, ...]:
         """Names of the four vertices held by the clamps."""
-        return (*self.parent_vertices[:2], *self.parent_vertices[-2:])
+        return (*self.parent_branch_points[:2], *self.parent_branch_points[-2:])
 
     @property
     def free_vertex_names(self) -> tuple[str, ...]:
@@ -101,19 +107,19 @@ class CableTopology:
         return tuple(vertex for vertex in self.vertices if vertex not in self.clamped_vertex_names)
 
     @property
-    def branch_vertex_names(self) -> dict[str, tuple[str, ...]]:
+    def vertex_names_by_branch(self) -> dict[str, tuple[str, ...]]:
         """Names of the vertices of every branch, by segment, the parent first."""
-        return {self.parent_segment: self.parent_vertices, **self.child_vertices}
+        return {self.parent_segment: self.parent_branch_points, **self.child_branch_points}
 
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
         """Names of the two vertices of every edge, branch by branch."""
-        return tuple(pair for chain in self.branch_vertex_names.values() for pair in pairwise(chain))
+        return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
     @property
-    def clamp_paths(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
+    def clamp_pose_definitions(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
         """Points that define the poses of the two clamps, start and end."""
-        a, b, *_, y, z = self.parent_vertices
+        a, b, *_, y, z = self.parent_branch_points
         start = ClampPoseDefinition(START_CLAMP, a, b, "transported")
         return start, ClampPoseDefinition(END_CLAMP, y, z, "transported")
 
@@ -126,7 +132,7 @@ class CableTopology:
 
 
 @dataclass(frozen=True)
-class InitCommandObject:
+class InitObjectConfiguration:
     """An object described on the command line of `init`."""
 
     settings: ObjectKind  # without its mount
@@ -137,7 +143,7 @@ class InitCommandObject:
 
 
 @dataclass(frozen=True)
-class InitCommandObjectTemplate:
+class InitObjectBuilder:
     """What one word of `init --object` stands for: how the object is built and which numbers it needs.
 
     `build` makes it of what was given by name (flags of `init`, and `--number`) and the number of links per segment;
@@ -145,7 +151,7 @@ class InitCommandObjectTemplate:
     """
 
     default_links: int  # per segment
-    build: Callable[[Mapping[str, Any], int], InitCommandObject]
+    build: Callable[[Mapping[str, Any], int], InitObjectConfiguration]
     # names beside length, mass and radius that `--number NAME=VALUE` takes, with their meanings
     further_numbers: Mapping[str, str] = field(default_factory=dict)
     has_branches: bool = False
@@ -192,7 +198,7 @@ class ObjectKind:
 
     # whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition
     default_link_refinement: ClassVar[bool] = False
-    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {}  # words of `init --object`
+    init_templates: ClassVar[Mapping[str, InitObjectBuilder]] = {}  # words of `init --object`
     settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
     kind: Annotated[str, OptionInfo("what the object is")]
@@ -280,6 +286,6 @@ class MountedObject(ObjectKind):
 OBJECT_KINDS: Registry[type[ObjectKind]] = Registry("kind")
 
 
-def init_command_object_templates() -> dict[str, InitCommandObjectTemplate]:
+def init_object_builders() -> dict[str, InitObjectBuilder]:
     """Templates of all kinds of objects, by the word of `init --object` that selects them."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}

@@ -35,7 +35,7 @@ from yid_ocp.model.flexible import (
     FlexibleObject,
     Segment,
     flexible_object,
-    parallel_transport_rotations,
+    relative_parallel_transport_rotations,
 )
 from yid_ocp.model.mechanism import Frame, LinkChain, Mechanism, Placement
 from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectKind
@@ -45,7 +45,7 @@ from yid_ocp.model.system import Grasp, System, SystemOptions, floating_clamp
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
-START_SPEED_SCALE_PARAMETER_NAME = "start.speed_scale"
+MEMORY_HALVING_SPEED_PARAMETER_NAME = "start.speed_scale"
 _MIN_STIFFNESS = 1e-9  # keeps load/stiffness finite where a stiffness is zero [N m/rad]
 _START_EDGE_FRAME, _LAST_EDGE_FRAME = f"{START_CLAMP}_edge", "last_edge"
 # Parameters of a joint whose rest angle is told from the start: its angle there [rad] and the torque it bears [N m].
@@ -83,7 +83,7 @@ class CableOptions:
     radius: Annotated[float, Gt(0), Le(1), OptionInfo("of the solid cylinders that give the links' inertia", "m")] = (
         0.005
     )
-    end_clamp: Annotated[
+    end_clamp_kind: Annotated[
         Literal["axis", "weld"],
         OptionInfo("whether the end clamp leaves the roll free or holds it at the parameter clamp_end.roll"),
     ] = "axis"
@@ -121,8 +121,8 @@ def read_vertex_positions(path: str | Path) -> dict[str, Array]:
 
 def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of the edge length parameters by name, from the edges' lengths [m]."""
-    values = {f"{START_CLAMP}.length": lengths[cable.parent_vertices[0], cable.parent_vertices[1]]}
-    for name, chain in cable.branch_vertex_names.items():
+    values = {f"{START_CLAMP}.length": lengths[cable.parent_branch_points[0], cable.parent_branch_points[1]]}
+    for name, chain in cable.vertex_names_by_branch.items():
         first = 1 if name == cable.parent_segment else 0
         for i, edge in enumerate(pairwise(chain[first:])):
             values[f"{name}.length_{i}"] = lengths[edge]
@@ -144,16 +144,16 @@ def cable_system(
         item = _with_rest_angles(item)
     if options.shape_memory is not None:
         item = _with_memory(item, options.shape_memory)
-    clamps = _start_clamp(lengths[cable.parent_vertices[0], cable.parent_vertices[1]], cable)
+    clamps = _start_clamp(lengths[cable.parent_branch_points[0], cable.parent_branch_points[1]], cable)
     clamps = clamps.with_attached_mechanism(floating_clamp(END_CLAMP))
     rotation = ca.SX(ca.DM.eye(3))
-    if options.end_clamp == "weld":
+    if options.end_clamp_kind == "weld":
         text = "roll of the end clamp about the last edge"
         end_roll = Parameter(f"{END_CLAMP}.roll", 0.0, "rad", -np.pi, np.pi, text)
         clamps = replace(clamps, parameters=clamps.parameters.with_added([end_roll]))
         rotation = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], end_roll.symbol)
     hung = (_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None)
-    held = Grasp(END_CLAMP, END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp, rotation)
+    held = Grasp(END_CLAMP, END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp_kind, rotation)
     known: SystemOptions = {"objects": [hung], "grasps": [held], "prescribed": clamps.joint_names, "damping": {}}
     known |= {"gravity": options.gravity, "point_frames": cable.vertices}
     return System.build(clamps, **known)
@@ -181,7 +181,7 @@ def _with_memory(item: FlexibleObject, memory: float) -> FlexibleObject:
     text = "speed of the vertices at the recording's start"
     speed = Parameter(START_SPEED_PARAMETER_NAME, 0.0, "m/s", 0.0, np.inf, text)
     text = "start speed at which the memory counts half"
-    scale = Parameter(START_SPEED_SCALE_PARAMETER_NAME, 0.3, "m/s", 1e-3, np.inf, text)
+    scale = Parameter(MEMORY_HALVING_SPEED_PARAMETER_NAME, 0.3, "m/s", 1e-3, np.inf, text)
     trust = 1 / (1 + (speed.symbol / scale.symbol) ** 2)
     entries, elastic = [*shares.values(), speed, scale], []
     told = (("rad", "angle at the recording's start"), ("N m", "torque borne at the recording's start"))
@@ -203,7 +203,7 @@ def _with_vertices(
     """The object with its vertices as frames, the parent's arc length measured from clamp to clamp."""
     tree = item.mechanism
     frames = dict(tree.frames)
-    for name, chain in cable.branch_vertex_names.items():
+    for name, chain in cable.vertex_names_by_branch.items():
         first = 2 if name == cable.parent_segment else 1
         frames |= {vertex: frames[f"{name}_{i}_tip"] for i, vertex in enumerate(chain[first:])}
         if name != cable.parent_segment:
@@ -211,8 +211,8 @@ def _with_vertices(
     last = tree.joint_index(item.segment_layouts[0].link_joints[-1][-1])
     frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
     parent = tree.link_chains[cable.parent_segment]
-    edges = np.array([lengths[edge] for edge in pairwise(cable.parent_vertices)])
-    whole = LinkChain((cable.parent_vertices[1], *parent.tip_frames), tuple(map(float, edges / edges.sum())))
+    edges = np.array([lengths[edge] for edge in pairwise(cable.parent_branch_points)])
+    whole = LinkChain((cable.parent_branch_points[1], *parent.tip_frames), tuple(map(float, edges / edges.sum())))
     lines = {**tree.link_chains, cable.parent_segment: whole}
     return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
 
@@ -225,25 +225,33 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     carrier = clamp.frame(START_CLAMP)
     turn = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], roll.symbol)
     tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
-    frames = {**clamp.frames, cable.parent_vertices[0]: carrier, cable.parent_vertices[1]: tip, _START_EDGE_FRAME: tip}
+    frames = {
+        **clamp.frames,
+        cable.parent_branch_points[0]: carrier,
+        cable.parent_branch_points[1]: tip,
+        _START_EDGE_FRAME: tip,
+    }
     return Mechanism(START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
 
 
 def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
-    parent = cable.parent_vertices
-    turns = parallel_transport_rotations(cable.undeformed_polyline(parent))
+    parent = cable.parent_branch_points
+    turns = relative_parallel_transport_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
     carried = [turns[0]]
     for turn in turns[1:]:
         carried.append(carried[-1] @ turn)
     segments = []
-    for name, chain in cable.branch_vertex_names.items():
+    for name, chain in cable.vertex_names_by_branch.items():
         branch = options.branches.get(name, options.default_branch)
         if name == cable.parent_segment:
             chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
         else:
             junction = parent.index(chain[0])
-            own, before = parallel_transport_rotations(cable.undeformed_polyline(chain), carried[junction - 1]), None
+            own, before = (
+                relative_parallel_transport_rotations(cable.undeformed_polyline(chain), carried[junction - 1]),
+                None,
+            )
             at = junction - 2
         if not options.undeformed_rest_shape:
             own = [own[0] if at is not None else np.eye(3), *[np.eye(3)] * (len(own) - 1)]
@@ -277,26 +285,28 @@ class Cable(CableOptions, ObjectKind):
 model:
   object:
     kind: cable
-    parent_vertices: [p0, p1, p2, p3, p4, p5]
-    child_vertices: {side: [p2, s1, s2]}
+    parent_branch_points: [p0, p1, p2, p3, p4, p5]
+    child_branch_points: {side: [p2, s1, s2]}
     undeformed_shape_file: undeformed.csv
-    end_clamp: axis
+    end_clamp_kind: axis
 """,
         "model.object.branches.NAME": """\
 model:
   object:
     kind: cable
-    parent_vertices: [p0, p1, p2, p3, p4, p5]
+    parent_branch_points: [p0, p1, p2, p3, p4, p5]
     undeformed_shape_file: undeformed.csv
-    child_vertices: {side: [p2, s1, s2]}
+    child_branch_points: {side: [p2, s1, s2]}
     branches:
       side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
 """,
     }
 
     kind: Annotated[Literal["cable"], OptionInfo("what the object is")] = "cable"
-    parent_vertices: Annotated[tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")]
-    child_vertices: Annotated[
+    parent_branch_points: Annotated[
+        tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")
+    ]
+    child_branch_points: Annotated[
         Mapping[str, tuple[str, ...]],
         OptionInfo("points of every branch, the first one the parent's at which it leaves"),
     ] = field(default_factory=dict)
@@ -308,10 +318,10 @@ model:
 
     def topology(self) -> CableTopology:
         undeformed = read_vertex_positions(self.undeformed_shape_file)
-        found = CableTopology(self.parent_vertices, dict(self.child_vertices), undeformed)
+        found = CableTopology(self.parent_branch_points, dict(self.child_branch_points), undeformed)
         for name in self.branches:
-            if name not in found.branch_vertex_names:
-                hint = nearest_name_hint(name, found.branch_vertex_names)
+            if name not in found.vertex_names_by_branch:
+                hint = nearest_name_hint(name, found.vertex_names_by_branch)
                 raise ModelError(f"there is no branch '{name}'", where=f"branches.{name}", hint=hint)
         return found
 

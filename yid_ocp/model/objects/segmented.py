@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObject
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectBuilder, InitObjectConfiguration, MountedObject
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
@@ -30,7 +30,7 @@ class SegmentSettings:
     radius: Annotated[
         float | None, Gt(0), Le(5), OptionInfo("radius of the solid cylinder; or give a section", "m")
     ] = None
-    cross_section: Annotated[
+    cross_section_size: Annotated[
         tuple[Annotated[float, Gt(0)], Annotated[float, Gt(0)]] | None,
         OptionInfo("extents of a rectangular cross section along the links' x and y axes", "m"),
     ] = None
@@ -58,7 +58,15 @@ class SegmentSettings:
         # a rigidity does not depend on the number of links, a stiffness per joint does
         factor = 1 if self.stiffness_per_curvature else n
         lengths, index = self.link_lengths, self.parent_link_index
-        same = ("mass", "radius", "parent", "stiffness_per_curvature", "clamped_at_base", "joint_axes", "cross_section")
+        same = (
+            "mass",
+            "radius",
+            "parent",
+            "stiffness_per_curvature",
+            "clamped_at_base",
+            "joint_axes",
+            "cross_section_size",
+        )
         options: dict[str, Any] = {key: getattr(self, key) for key in (*same, "link_length_parameters")}
         return Segment(
             name,
@@ -80,25 +88,25 @@ class SegmentSettings:
 
 def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> SegmentSettings:
     """A segment as `init` writes it; a flat one bends across its thinner side alone, about the other axis."""
-    section = more.get("cross_section")
+    section = more.get("cross_section_size")
     axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
     more |= {"length": length, "mass": mass, "radius": radius, "links": links, "joint_axes": axes}
     return SegmentSettings(stiffness_per_curvature=True, clamped_at_base=more.get("parent") is None, **more)
 
 
-def _init_object(word: str, segments: Mapping[str, SegmentSettings]) -> InitCommandObject:
+def _init_object(word: str, segments: Mapping[str, SegmentSettings]) -> InitObjectConfiguration:
     item = SegmentedObject(segments=segments)
-    return InitCommandObject(item, base.bending_start_values(item.model_segments(), _RIGIDITY_RATIO[word]))
+    return InitObjectConfiguration(item, base.bending_start_values(item.model_segments(), _RIGIDITY_RATIO[word]))
 
 
-def _cable(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+def _cable(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
     length, mass, radius = base.required_object_numbers("a cable", numbers, base.SIZE_DESCRIPTIONS)
     section = _section(numbers)
-    segment = _init_segment(links, length, mass, None if section else radius, cross_section=section)
+    segment = _init_segment(links, length, mass, None if section else radius, cross_section_size=section)
     return _init_object("cable", {"cable": segment})
 
 
-def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+def _beam(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
     sizes = {name: base.SIZE_DESCRIPTIONS[name] for name in ("length", "mass")}
     length, mass = base.required_object_numbers("a beam", numbers, sizes)
     section = _section(numbers)
@@ -106,10 +114,10 @@ def _beam(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
         what, hint = "a beam needs a radius or a section", "add --radius NUMBER, or --section WIDTH,HEIGHT"
         raise ConfigError(what, where="--radius", allowed=base.SIZE_DESCRIPTIONS["radius"], hint=hint)
     radius = None if section else float(numbers["radius"])
-    return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section=section)})
+    return _init_object("beam", {"beam": _init_segment(links, length, mass, radius, cross_section_size=section)})
 
 
-def _tree(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+def _tree(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
     if numbers.get("branch"):
         return _init_object("tree", _grown([_branch(text, links) for text in numbers["branch"]]))
     if not numbers.get("branches"):
@@ -165,10 +173,10 @@ class SegmentedObject(MountedObject):
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
-        "cable": InitCommandObjectTemplate(8, _cable),
-        "beam": InitCommandObjectTemplate(6, _beam),
-        "tree": InitCommandObjectTemplate(4, _tree, has_branches=True),
+    init_templates: ClassVar[Mapping[str, InitObjectBuilder]] = {
+        "cable": InitObjectBuilder(8, _cable),
+        "beam": InitObjectBuilder(6, _beam),
+        "tree": InitObjectBuilder(4, _tree, has_branches=True),
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: segments": """\
@@ -185,7 +193,7 @@ model:
   object:
     kind: segments
     segments:
-      beam: {length: 0.52, mass: 0.33, cross_section: [0.001, 0.08], links: 8, joint_axes: y, \
+      beam: {length: 0.52, mass: 0.33, cross_section_size: [0.001, 0.08], links: 8, joint_axes: y, \
 stiffness_per_curvature: true, clamped_at_base: true}
 """,
     }

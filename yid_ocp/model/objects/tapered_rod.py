@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.model.flexible import FlexibleObject, Segment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitCommandObject, InitCommandObjectTemplate, MountedObject
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectBuilder, InitObjectConfiguration, MountedObject
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
@@ -21,12 +21,12 @@ _SEGMENT = "rod"
 _FURTHER_NUMBERS = {"tip_radius": "the radius of its tip [m]"}
 
 
-def _init_object(numbers: Mapping[str, Any], links: int) -> InitCommandObject:
+def _init_object(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
     length, mass, radius, tip = base.required_object_numbers(
         "a tapered rod", numbers, base.SIZE_DESCRIPTIONS | _FURTHER_NUMBERS
     )
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return InitCommandObject(item, base.bending_start_values(item.model_segments(), 1.0))
+    return InitObjectConfiguration(item, base.bending_start_values(item.model_segments(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
@@ -39,8 +39,8 @@ class TaperedRod(MountedObject):
     """
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitCommandObjectTemplate]] = {
-        "tapered_rod": InitCommandObjectTemplate(8, _init_object, _FURTHER_NUMBERS)
+    init_templates: ClassVar[Mapping[str, InitObjectBuilder]] = {
+        "tapered_rod": InitObjectBuilder(8, _init_object, _FURTHER_NUMBERS)
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: tapered_rod": """\
