@@ -86,7 +86,9 @@ class JointSpringSettings:
 
     stiffness: Annotated[float, Ge(0), OptionInfo("stiffness", "N m/rad or N/m")]
     rest_position: Annotated[float, OptionInfo("coordinate at which it is relaxed", "rad or m")] = 0.0
-    damping: Annotated[float | None, Ge(0), OptionInfo("viscous; or model.damping", "N m s/rad or N s/m")] = None
+    damping: Annotated[float | None, Ge(0), OptionInfo("viscous; model.damping when absent", "N m s/rad or N s/m")] = (
+        None
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,10 +113,16 @@ class JointActuationSettings:
             "encoders correct"
         ),
     ] = "driven"
-    servo: Annotated[PositionServoOptions, OptionInfo("of mode servo")] = field(default_factory=PositionServoOptions)
+    servo: Annotated[PositionServoOptions, OptionInfo("of the mode servo")] = field(
+        default_factory=PositionServoOptions
+    )
     passive_joints: Annotated[_Names, OptionInfo("joints among them that nothing drives, whatever the mode")] = ()
-    locked_joints: Annotated[Mapping[str, float], OptionInfo("fixed values", "rad or m")] = field(default_factory=dict)
-    exclude_links: Annotated[_Names, OptionInfo("links of the URDF left out with all that hangs on them")] = ()
+    locked_joints: Annotated[Mapping[str, float], OptionInfo("value of joints that do not move", "rad or m")] = field(
+        default_factory=dict
+    )
+    exclude_links: Annotated[
+        _Names, OptionInfo("links of the URDF left out with all that hangs on them, such as a hand not mounted")
+    ] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +145,10 @@ class ModelSettings:
 
     robot: Annotated[
         _FilePath | None,
-        OptionInfo("URDF file, package:NAME of example-robot-data, default:NAME.urdf of this package; null for none"),
+        OptionInfo(
+            "URDF file, package:NAME of example-robot-data, or default:NAME.urdf of this package; "
+            "null for an object held by the world or by clamps"
+        ),
     ] = None
     clamps: Annotated[
         Mapping[str, ClampSettings],
@@ -146,20 +157,34 @@ class ModelSettings:
     arms: Annotated[JointActuationSettings, OptionInfo("the robot's joints")] = JointActuationSettings()
     frames: Annotated[
         Mapping[str, FrameSettings],
-        OptionInfo("more frames, by name, on robot, object or world: a tool's tip, a hand's middle, a marker"),
+        OptionInfo(
+            "more frames, by name, on robot, object or world: a tool's tip, the middle of what a hand holds, a marker"
+        ),
     ] = field(default_factory=dict)
     object: Annotated[
         ObjectKind | None, RegistryChoice(OBJECT_KINDS, selector_key="kind"), OptionInfo("the flexible object")
     ] = None
-    grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("by name: left, right")] = field(default_factory=dict)
-    springs: Annotated[Mapping[str, JointSpringSettings], OptionInfo("by robot joint")] = field(default_factory=dict)
+    grasp: Annotated[Mapping[str, GraspSettings], OptionInfo("by name: left, right, gripper")] = field(
+        default_factory=dict
+    )
+    springs: Annotated[Mapping[str, JointSpringSettings], OptionInfo("by joint of the robot")] = field(
+        default_factory=dict
+    )
     damping: Annotated[
         Annotated[float, Ge(0)] | Mapping[str, Annotated[float, Ge(0)]],
-        OptionInfo("viscous, of every coordinate; or by joint (0.05 for those not named) and `object`", "N m s/rad"),
+        OptionInfo(
+            "viscous damping of every coordinate; or by joint of the robot (0.05 for those not "
+            "named) and by the name `object`",
+            "N m s/rad",
+        ),
     ] = 0.05
-    friction: Annotated[FrictionSettings | None, OptionInfo("of the joints, its amplitudes and damping free")] = None
+    friction: Annotated[
+        FrictionSettings | None, OptionInfo("ordinary friction of the joints, its amplitudes and damping free")
+    ] = None
     gravity: Annotated[_Vector3, OptionInfo("acceleration of free fall in the world", "m/s^2")] = (0.0, 0.0, -9.81)
-    points: Annotated[_Names | None, OptionInfo("frames that sensors may see, such as T1:40%; or the tips")] = None
+    points: Annotated[_Names | None, OptionInfo("frames that sensors may see, such as T1:40%; the segments' tips")] = (
+        None
+    )
     extra_meshes: Annotated[
         tuple[ExtraMesh, ...],
         OptionInfo("what a camera sees and the URDF does not have: a gripper's body, a table; `track` leaves it out"),
@@ -177,26 +202,43 @@ class RecordingSettings:
         _Recordings,
         OptionInfo("made without what a diagnosis finds, which it then predicts; those of its baseline when absent"),
     ] = ()
-    strict: Annotated[bool, OptionInfo("whether any doubt about a recording stops the run, as by --strict")] = False
+    strict: Annotated[
+        bool, OptionInfo("whether any doubt about a recording stops the run; --strict on the command line")
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
     """How `import` converts a file of another tool; a command-line flag overrides its key here."""
 
-    joint_topics: Annotated[_Names | None, OptionInfo("of a bag: of joint states, put on one clock; or all")] = None
-    command_topic: Annotated[str | None, OptionInfo("of a bag: topic of joint states with commanded positions")] = None
-    joints: Annotated[_Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; or all")] = None
+    joint_topics: Annotated[
+        _Names | None, OptionInfo("of a bag: topics of joint states, put on one clock; all when absent")
+    ] = None
+    command_topic: Annotated[
+        str | None, OptionInfo("of a bag: topic of joint states whose positions were asked for, not measured")
+    ] = None
+    joints: Annotated[
+        _Names | None, OptionInfo("joints to keep, NAME or RECORDED=NAME, in this order; all when absent")
+    ] = None
     points: Annotated[
         _Texts,
-        OptionInfo("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point it is, such as cable:40%"),
+        OptionInfo("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point that it is, such as cable:40%"),
     ] = None
-    pose_axes: Annotated[float | None, Gt(0), Le(10), OptionInfo("from a pose to points NAME_x, _y, _z", "m")] = None
+    pose_axes: Annotated[
+        float | None,
+        Gt(0),
+        Le(10),
+        OptionInfo("how far along a pose's axes points NAME_x, NAME_y, NAME_z are made", "m"),
+    ] = None
     columns: Annotated[
         _Texts, OptionInfo("of a table: column, or pattern such as *_pos, and t, CHANNEL:JOINT, AXIS:POINT or skip")
     ] = None
-    header: Annotated[bool | None, OptionInfo("of a table: whether its first row has names, else 1, 2, ...")] = None
-    skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether to leave out lines without numbers")] = None
+    header: Annotated[bool | None, OptionInfo("of a table: whether its first row has names, else 1, 2 and so on")] = (
+        None
+    )
+    skip_bad_lines: Annotated[bool | None, OptionInfo("of a table: whether lines that are no numbers are left out")] = (
+        None
+    )
     delimiter: Annotated[str | None, OptionInfo("of a table: one character between cells; a comma when absent")] = None
     units: Annotated[
         _Texts,
@@ -205,8 +247,12 @@ class ImportSettings:
             "points (m, cm, mm) and so on, where they are not SI"
         ),
     ] = None
-    torque_constants: Annotated[_Numbers, OptionInfo("by joint or pattern, where efforts are currents", "N m/A")] = None
-    gears: Annotated[_Numbers, OptionInfo("turns of the motor per turn of the joint, by joint or pattern; or 1")] = None
+    torque_constants: Annotated[
+        _Numbers, OptionInfo("by joint or pattern, where effort is a motor's current", "N m/A")
+    ] = None
+    gears: Annotated[
+        _Numbers, OptionInfo("turns of the motor per turn of the joint, by joint or pattern; 1 when absent")
+    ] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
     clock: Annotated[RecordedOrNominalClock | None, OptionInfo("of a table: whether its times were measured")] = None
     sensor: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
@@ -220,7 +266,9 @@ class ParameterSettings:
     initial: Annotated[float | None, OptionInfo("value, or where the search starts", "that of the parameter")] = None
     bounds: Annotated[tuple[float, float] | None, OptionInfo("lower and upper bound", "that of the parameter")] = None
     free: Annotated[bool | None, OptionInfo("whether it is estimated")] = None
-    prior_std: Annotated[float | None, Gt(0), OptionInfo("std of a Gaussian prior", "that of the parameter")] = None
+    prior_std: Annotated[
+        float | None, Gt(0), OptionInfo("standard deviation of a Gaussian prior", "that of the parameter")
+    ] = None
     per_recording: Annotated[bool | None, OptionInfo("whether it has a value of its own in every recording")] = None
 
 
@@ -230,7 +278,9 @@ class ProblemSettings(ProblemOptions):
 
     time_step: Annotated[float, Gt(0), Le(0.1), OptionInfo("of the integrator", "s")] = 0.01
     force_split: Annotated[ForceSplit, OptionInfo("rule for forces; left is the paper's")] = "symmetric"
-    constraint_force: Annotated[ConstraintForcePlacement, OptionInfo("where grasps pull; node: paper")] = "midpoint"
+    constraint_force: Annotated[ConstraintForcePlacement, OptionInfo("where grasps pull; node is the paper's")] = (
+        "midpoint"
+    )
     use_compiler: Annotated[bool, OptionInfo("whether to compile the step where a C compiler is found")] = True
 
 
@@ -238,12 +288,22 @@ class ProblemSettings(ProblemOptions):
 class DiagnosisSettings(Thresholds):
     """Candidates and thresholds of the diagnosis of the sim-to-real gap."""
 
-    candidates: Annotated[Literal["all"] | _Names, OptionInfo("effects to try: all, kind or kind@location")] = "all"
+    candidates: Annotated[
+        Literal["all"] | _Names, OptionInfo("effects to try: all, or a list of kind or kind@location")
+    ] = "all"
     exclude: Annotated[_Names, OptionInfo("candidates not to try, by kind or kind@location")] = ()
     noise_fraction_of_std: Annotated[
-        float, Gt(0), Le(1), OptionInfo("part of stated std that is noise, not model error")
+        float,
+        Gt(0),
+        Le(1),
+        OptionInfo(
+            "part of all stated std, torques' included, that is noise, where the rest stands for the model's error"
+        ),
     ] = 1.0
-    baseline: Annotated[tuple[_FilePath, ...], OptionInfo("earlier runs of this model, to ask what differs")] = ()
+    baseline: Annotated[
+        tuple[_FilePath, ...],
+        OptionInfo("run folders of `solve` or `diagnose`, of the same model: what differs since is asked"),
+    ] = ()
 
     @property
     def null_test_residual_limits(self) -> ExcessResidualCriteria:
@@ -269,7 +329,9 @@ class CompareSettings:
     methods: Annotated[
         Mapping[str, Annotated[Solver, RegistryChoice(SOLVERS)]], OptionInfo("settings of each method, by name")
     ] = field(default_factory=_compared)
-    paper_experiment: Annotated[str | None, OptionInfo("of the source paper whose answer stands beside")] = None
+    paper_experiment: Annotated[str | None, OptionInfo("experiment of the source paper whose answer stands beside")] = (
+        None
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -278,7 +340,9 @@ class VirtualFramesSettings:
 
     seed: Annotated[int, Ge(0), OptionInfo("of motion, noise and camera")] = 0
     duration: Annotated[float, Gt(0), Le(600), OptionInfo("of the experiment", "s")] = 5.0
-    max_gripper_travel: Annotated[float, Gt(0), Le(1), OptionInfo("largest, from its start", "m")] = 0.11
+    max_gripper_travel: Annotated[
+        float, Gt(0), Le(1), OptionInfo("largest distance of a gripper from its start", "m")
+    ] = 0.11
     grasp_start_offsets: Annotated[
         Mapping[str, _Vector3], OptionInfo("by grasp: where it starts beside the end of the undeformed object", "m")
     ] = field(default_factory=dict)
@@ -297,9 +361,13 @@ class TrackSettings:
 
     frames_path: Annotated[
         _FilePath | None,
-        OptionInfo("folder of clouds or depth images, bag, MCAP or RealSense file; virtual frames when absent"),
+        OptionInfo(
+            "folder of clouds or depth images, bag, MCAP or RealSense file; a virtual frame sequence when absent"
+        ),
     ] = None
-    frame_topic: Annotated[str | None, OptionInfo("of clouds or depth images in a bag that has several")] = None
+    frame_topic: Annotated[str | None, OptionInfo("of the clouds or depth images in a bag, where it has several")] = (
+        None
+    )
     camera_pose: Annotated[
         tuple[_Vector4, _Vector4, _Vector4, _Vector4] | None,
         OptionInfo("camera (x right, y down, z ahead) in the world, row by row, instead of the folder's", "m"),
@@ -307,12 +375,20 @@ class TrackSettings:
     length_unit: Annotated[Literal["m", "mm"] | None, OptionInfo("of the clouds, instead of the folder's")] = None
     background_frames: Annotated[
         _FilePath | None,
-        OptionInfo("frames of the scene without robot and object, by the same camera: left out of the others"),
+        OptionInfo(
+            "frames of the scene without robot and object, by the same camera in the same place: left out of the others"
+        ),
     ] = None
-    virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("filmed without frames")] = VirtualFramesSettings()
-    keep_frames: Annotated[bool, OptionInfo("whether virtual frames are written to the run folder")] = False
+    virtual_frames: Annotated[VirtualFramesSettings, OptionInfo("what is filmed without frames")] = (
+        VirtualFramesSettings()
+    )
+    keep_frames: Annotated[
+        bool, OptionInfo("whether a virtual frame sequence's frames are written to the run folder")
+    ] = False
     n_drawn_frames: Annotated[int, Ge(0), Le(1000), OptionInfo("frames of which every stage is drawn")] = 2
-    options: Annotated[TrackOptions, OptionInfo("filters, fit and quality")] = field(default_factory=TrackOptions)
+    options: Annotated[TrackOptions, OptionInfo("filters, skeleton, fit, clock and what counts as good")] = field(
+        default_factory=TrackOptions
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -332,7 +408,9 @@ class PlanSettings(PlanOptions):
 class OutputSettings:
     """Output: run folders, the report and the discretisation check."""
 
-    runs_folder: Annotated[_FilePath | None, OptionInfo("for run folders; `runs` in the working folder")] = None
+    runs_folder: Annotated[
+        _FilePath | None, OptionInfo("in which run folders are made; `runs` in the working folder")
+    ] = None
     write_report: Annotated[bool, OptionInfo("whether report.html is written")] = True
     discretisation_check: Annotated[
         Literal["none", "time_step", "both"] | None,
@@ -348,14 +426,18 @@ class RunSettings:
     """Resolved settings of one run: all sections of its configuration file."""
 
     description: Annotated[str, OptionInfo("one sentence for the report")] = ""
-    plugins: Annotated[tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors")] = ()
+    plugins: Annotated[
+        tuple[_FilePath, ...], OptionInfo("Python files that register effects or sensors; they are run")
+    ] = ()
     model: Annotated[ModelSettings, OptionInfo("what the world is made of")] = ModelSettings()
     recordings: Annotated[RecordingSettings, OptionInfo("the data")] = RecordingSettings()
     import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = ImportSettings()
     sensors: Annotated[
         Mapping[str, SensorOptions], OptionInfo("by group of the recordings: points, joints.effort, motors.current")
     ] = field(default_factory=dict)
-    parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("name or pattern")] = field(default_factory=dict)
+    parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("by name or pattern")] = field(
+        default_factory=dict
+    )
     problem: Annotated[ProblemSettings, OptionInfo("what is compared with the recordings and how")] = ProblemSettings()
     solver: Annotated[Solver, RegistryChoice(SOLVERS, "gauss_newton"), OptionInfo("how the cost is lowered")] = field(
         default_factory=GaussNewton

@@ -48,15 +48,25 @@ _TIME_TOLERANCE = 1e-9  # a nominal clock is a sum of rounded periods, so its en
 class JointGroup(ReprMixin):
     """Joint measurements of a robot: N samples of nj joints on one clock; arrays are copied and read-only.
 
-    The channels have shape (N, nj): `position`, `velocity` and `effort` as measured [rad], [rad/s], [N m], the two
-    commands as the controller asked for them, `external_effort` what is left when the robot's own model is taken away
-    [N m], `torque_enable` one where a servo's motor is on and zero where it is off. What is stated once is a number, or
-    (nj,): standard deviations of noise, white from sample to sample, and of a constant error of the effort, where known
-    [rad], [rad/s], [N m]; the step of the encoder, `position_resolution` [rad]; the `proportional_gain` of a servo's
-    firmware, in a unit of its own. `names` are those of the URDF, `t` is strictly increasing, shape (N,) [s].
-
     Attributes
     ----------
+    names : tuple of str, length nj
+        As in the URDF.
+    t : ndarray, shape (N,)
+        Strictly increasing time [s].
+    position, velocity, effort : ndarray, shape (N, nj)
+        Measured [rad], [rad/s], [N m].
+    position_command, velocity_command : ndarray, shape (N, nj), or None
+        What the controller asked for [rad], [rad/s].
+    external_effort : ndarray, shape (N, nj), or None
+        Effort left when the robot's own model is taken away [N m].
+    position_std, velocity_std, effort_std, effort_bias_std : float or ndarray, shape (nj,), or None
+        Standard deviations of noise, white from sample to sample, and of a constant error of a joint's effort, where
+        known [rad], [rad/s], [N m].
+    torque_enable : ndarray, shape (N, nj), or None
+        One where a servo's motor is on, zero where it is off.
+    position_resolution, proportional_gain : float or ndarray, shape (nj,), or None
+        Step of the encoder [rad]; proportional gain of a servo's firmware, in a unit of its own.
     effort_kind : {'sample', 'mean', 'command'} or None
         What `effort[k]` is of the true one: its value at t_k, its mean from t_k to t_{k+1}, or held until then.
     clock : {'recorded', 'nominal'}
@@ -114,10 +124,21 @@ class JointGroup(ReprMixin):
 class PointGroup(ReprMixin):
     """Positions of np named points over M frames of one sensor, on its own clock; arrays are copied and read-only.
 
-    The group's `name` is `points`, or `points_` and a word of one's own (`points_camera`). Positions, shape
-    (M, np, 3), are in `frame` at strictly increasing times `t` (M,) [s], and NaN (all three coordinates) where a point
-    was not seen; `std` is the standard deviation of their noise, the same shape or one number [m]. `sensor` saw them,
-    from the `pose` (4, 4) of a camera in the world.
+    Attributes
+    ----------
+    name : str
+        `points`, or `points_` and a word of one's own (`points_camera`, `points_arm`).
+    t : ndarray, shape (M,)
+        Strictly increasing time [s].
+    position : ndarray, shape (M, np, 3)
+        Position in `frame` [m], NaN (all three coordinates) where a point was not seen.
+    std : ndarray, shape (M, np, 3), or None
+        Standard deviation of the noise [m]; a number given for it is spread over the shape.
+    sensor, frame : str
+        What saw the points, and their frame of reference.
+    pose : ndarray, shape (4, 4), or None
+        Of a camera: the transform from camera to world coordinates [m].
+    clock : {'recorded', 'nominal'}
     """
 
     name: str
@@ -150,11 +171,23 @@ class PointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChannelGroup(ReprMixin):
-    """Values of channels that sensors declare (`sensors.ChannelKind`), on one clock; arrays are copied and read-only.
+    """Values of channels that sensors declare (`sensors.ChannelKind`), on one clock.
 
-    The group's `name` is a declared one, `motors` for example, or that, `_` and a word of one's own. `values` are by
-    quantity, shape (M, k) or (M, k, components) for k `names`, at strictly increasing times `t` (M,) [s]; `stds` are by
-    attribute (`QUANTITY_std`, `QUANTITY_bias_std`), a number or (k,), where known; both are in the channel's unit.
+    Arrays are copied, made float64 and read-only.
+
+    Attributes
+    ----------
+    name : str
+        Declared group, `motors` for example, or that, `_` and a word of one's own.
+    names : tuple of str, length k
+        Of joints, or whatever the columns are.
+    t : ndarray, shape (M,)
+        Strictly increasing time [s].
+    values : mapping of quantity to ndarray, shape (M, k) or (M, k, components)
+        In the channel's unit.
+    stds : mapping of str to float or ndarray, shape (k,)
+        Noise by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), where known, in the channel's unit.
+    clock : {'recorded', 'nominal'}
     """
 
     name: str

@@ -59,13 +59,20 @@ class CameraClockOptions:
     """Settings of the comparison of the camera's clock with the joints' clock."""
 
     initial_offset: Annotated[float, OptionInfo("stamp minus joint time, as far as known", "s")] = 0.0
-    search_half_width: Annotated[float, Ge(0), OptionInfo("how far from there to look; 0 takes it as it is", "s")] = 0.5
-    drift_prior_std: Annotated[PositiveFloat, OptionInfo("of the camera clock's drift, in seconds per second")] = 1e-3
-    max_offset_std: Annotated[PositiveFloat, OptionInfo("a less certain offset is not used", "s")] = 0.02
+    search_half_width: Annotated[
+        float, Ge(0), OptionInfo("how far from there the offset is looked for; 0 to take it as it is", "s")
+    ] = 0.5
+    drift_prior_std: Annotated[
+        PositiveFloat, OptionInfo("standard deviation of the drift of the camera's clock, in seconds per second")
+    ] = 1e-3
+    max_offset_std: Annotated[PositiveFloat, OptionInfo("an offset of larger standard deviation is not used", "s")] = (
+        0.02
+    )
     max_stamp_delay: Annotated[
         PositiveFloat,
         OptionInfo(
-            "a frame is dropped whose offset differs from the common one by more, and by four of its stds",
+            "a frame whose own offset differs from the common one by more, and by more than four "
+            "standard deviations, is dropped",
             "s",
         ),
     ] = 0.03
@@ -169,18 +176,32 @@ class CameraCalibrationOptions:
 
     fix_pose: Annotated[
         bool,
-        OptionInfo("whether the told pose and depth are kept; the arm then finds the clock and checks the rest"),
+        OptionInfo(
+            "whether the told pose and depth are kept, those of a hand-eye calibration for "
+            "example; the arm then finds the clock and checks the rest"
+        ),
     ] = False
-    n_frames: Annotated[int, Ge(_LEAST_FRAMES), OptionInfo("so many, evenly spread, are compared with the arm")] = 24
-    rotation_prior_std: Annotated[PositiveFloat, OptionInfo("of the told directions, about each axis", "rad")] = 0.06
-    translation_prior_std: Annotated[PositiveFloat, OptionInfo("of the told place, along each axis", "m")] = 0.04
-    depth_scale_prior_std: Annotated[PositiveFloat, OptionInfo("of the scale of its depth")] = 0.03
-    depth_offset_prior_std: Annotated[PositiveFloat, OptionInfo("of an offset of its depth", "m")] = 0.01
+    n_frames: Annotated[
+        int, Ge(_LEAST_FRAMES), OptionInfo("so many, spread over the sequence, are compared with the arm")
+    ] = 24
+    rotation_prior_std: Annotated[
+        PositiveFloat, OptionInfo("standard deviation of the told directions, about each axis", "rad")
+    ] = 0.06
+    translation_prior_std: Annotated[
+        PositiveFloat, OptionInfo("standard deviation of the told place, along each axis", "m")
+    ] = 0.04
+    depth_scale_prior_std: Annotated[PositiveFloat, OptionInfo("standard deviation of the scale of its depth")] = 0.03
+    depth_offset_prior_std: Annotated[
+        PositiveFloat, OptionInfo("standard deviation of an offset of its depth", "m")
+    ] = 0.01
     min_visible_fraction: Annotated[
         float,
         Gt(0),
         Le(1),
-        OptionInfo("of the arm's surface that nothing hides, so much must be in the clouds where it should be"),
+        OptionInfo(
+            "of the arm's surface that the camera should see and nothing hides, at least this "
+            "share must be in the clouds where the calibration has it"
+        ),
     ] = 0.6
 
     def __post_init__(self) -> None:

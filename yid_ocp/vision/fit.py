@@ -58,25 +58,31 @@ class ShapeFitOptions:
     node_loss_scales: Annotated[
         tuple[PositiveFloat, ...],
         OptionInfo(
-            "scale of the robust loss on the nodes, pass by pass: wide first, to catch a start far off",
+            "scale of the robust loss on the nodes, pass after pass: wide first, to catch a start some decimetres off",
             "m",
         ),
     ] = (0.15, 0.05)
     surface_loss_scales: Annotated[
         tuple[PositiveFloat, ...],
-        OptionInfo("the same on the cloud's points; empty for a fit to the nodes alone, as in the source paper", "m"),
+        OptionInfo(
+            "the same on the points of the cloud; empty for a fit to the nodes alone, as in the source paper", "m"
+        ),
     ] = (0.03, 0.015)
-    surface_noise_std: Annotated[PositiveFloat, OptionInfo("of an averaged point from the surface", "m")] = 0.006
-    correlated_points: Annotated[PositiveFloat, OptionInfo("points that err alike; divides the weight of all")] = 8.0
-    grasp_position_std: Annotated[PositiveFloat, OptionInfo("of a gripper by its joints from what it holds", "m")] = (
-        0.004
-    )
-    grasp_direction_std: Annotated[PositiveFloat, OptionInfo("the same of axes that grasps make coincide", "rad")] = (
-        0.05
-    )
+    surface_noise_std: Annotated[
+        PositiveFloat, OptionInfo("standard deviation of one averaged point's distance from the surface", "m")
+    ] = 0.006
+    correlated_points: Annotated[
+        PositiveFloat, OptionInfo("of how many points the errors are alike; divides the weight of all points together")
+    ] = 8.0
+    grasp_position_std: Annotated[
+        PositiveFloat, OptionInfo("standard deviation between a gripper, by its joint angles, and what it holds", "m")
+    ] = 0.004
+    grasp_direction_std: Annotated[
+        PositiveFloat, OptionInfo("the same of the axes that grasps of kind axis and weld make coincide", "rad")
+    ] = 0.05
     bend_prior_std: Annotated[
         PositiveFloat,
-        OptionInfo("bend of a joint of mean stiffness that costs one standard deviation", "rad"),
+        OptionInfo("bend of a joint of mean stiffness that costs as much as one standard deviation", "rad"),
     ] = 0.3
     max_iterations: Annotated[int, Ge(1), OptionInfo("at most so many in a pass")] = 25
     max_point_weight: Annotated[PositiveFloat, OptionInfo("a point counts at most for so many of the camera's")] = 6.0

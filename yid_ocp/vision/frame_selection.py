@@ -35,10 +35,12 @@ _RootPlacement = Literal["model", "fixed", "free"]
 class TrackOptions:
     """Settings that turn a frame sequence into measured points and select its good frames."""
 
-    filters: Annotated[CloudFilterOptions, OptionInfo("what is the object")] = field(default_factory=CloudFilterOptions)
+    filters: Annotated[CloudFilterOptions, OptionInfo("what counts as the object")] = field(
+        default_factory=CloudFilterOptions
+    )
     skeleton: Annotated[SkeletonOptions, OptionInfo("how a cloud is thinned")] = field(default_factory=SkeletonOptions)
     shape_fit: Annotated[ShapeFitOptions, OptionInfo("how a shape is fitted")] = field(default_factory=ShapeFitOptions)
-    clock: Annotated[CameraClockOptions, OptionInfo("how its clock is compared with the joints'")] = field(
+    clock: Annotated[CameraClockOptions, OptionInfo("how the camera's clock is compared with the joints'")] = field(
         default_factory=CameraClockOptions
     )
     calibration: Annotated[
@@ -47,22 +49,35 @@ class TrackOptions:
     ] = field(default_factory=CameraCalibrationOptions)
     background_estimation: Annotated[
         Literal["none", "frames"],
-        OptionInfo("frames: what stands still in most of them, away from every fitted shape, is left out as well"),
+        OptionInfo(
+            "frames: what stands still in most frames, away from every shape that was fitted, is "
+            "left out; beside it track.background_frames"
+        ),
     ] = "none"
     estimated_dimensions: Annotated[
         tuple[TubeDimensionKind, ...],
-        OptionInfo("sizes of the tubes to estimate from the clouds, where these tell them; all are checked anyway"),
+        OptionInfo(
+            "sizes of the tubes that are estimated from the clouds, where these tell them; all are checked anyway"
+        ),
     ] = ()
     max_distance_in_radii: Annotated[
         PositiveFloat,
-        OptionInfo("a frame whose points are further from the shape on average, beyond noise, is dropped; in radii"),
+        OptionInfo(
+            "a frame whose points are further from the fitted shape on average, beyond their "
+            "noise, is dropped; in radii of the tubes"
+        ),
     ] = 0.5
-    max_bend_angle: Annotated[PositiveFloat, OptionInfo("a frame with a joint bent further is dropped", "rad")] = 1.2
-    max_distance_ratio: Annotated[PositiveFloat, OptionInfo("beyond so many times the median a frame is dropped")] = 1.7
+    max_bend_angle: Annotated[
+        PositiveFloat, OptionInfo("a frame whose shape has a joint that is bent further is dropped", "rad")
+    ] = 1.2
+    max_distance_ratio: Annotated[
+        PositiveFloat, OptionInfo("a frame whose distance is so many times the median of all good frames is dropped")
+    ] = 1.7
     max_grasp_gap_change: Annotated[
         PositiveFloat,
         OptionInfo(
-            "a frame with an end further from its gripper than usual by more is dropped: its stamp is wrong",
+            "a frame in which an end is further from the gripper that holds it than usual by more "
+            "is dropped: its time is not what its stamp says",
             "m",
         ),
     ] = 0.008
@@ -70,12 +85,16 @@ class TrackOptions:
         UnitIntervalFloat,
         OptionInfo("a frame with points on a smaller share of the object's visible length is dropped"),
     ] = 0.6
-    max_point_std: Annotated[PositiveFloat, OptionInfo("a point known less well does not count as seen", "m")] = 0.02
+    max_point_std: Annotated[
+        PositiveFloat, OptionInfo("a point that is known less well in a frame counts as not seen there", "m")
+    ] = 0.02
     min_point_std: Annotated[
         PositiveFloat,
         OptionInfo("standard deviation that no fit is better than, of straight links in place of a curve", "m"),
     ] = 0.002
-    stamp_std: Annotated[float, Ge(0), OptionInfo("of a frame's time stamp, beyond the common offset", "s")] = 0.003
+    stamp_std: Annotated[
+        float, Ge(0), OptionInfo("standard deviation of a frame's time stamp, beyond the common offset", "s")
+    ] = 0.003
     exposure_time: Annotated[
         float,
         Ge(0),

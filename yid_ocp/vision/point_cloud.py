@@ -51,46 +51,65 @@ class CloudFilterOptions:
     voxel_size: Annotated[PositiveFloat, OptionInfo("edge of the cubes in which points are averaged", "m")] = 0.008
     robot_padding: Annotated[
         PositiveFloat,
-        OptionInfo("points this near to the robot's surface are its own; about five standard deviations of depth", "m"),
+        OptionInfo(
+            "points this near to the robot's surface belong to it; about five standard deviations of the depth", "m"
+        ),
     ] = 0.03
-    box_lower: Annotated[XyzCoordinates | None, OptionInfo("corner of the box in which points are kept", "m")] = None
+    box_lower: Annotated[
+        XyzCoordinates | None, OptionInfo("corner of a box in the world outside of which points are left out", "m")
+    ] = None
     box_upper: Annotated[XyzCoordinates | None, OptionInfo("the opposite corner", "m")] = None
     floor_height: Annotated[
         float | None,
         OptionInfo(
-            "points below it are left out; when absent, those below floor_margin above a standing object's foot",
+            "points below this height are left out; when absent, those below floor_margin above "
+            "the foot of an object that stands on one",
             "m",
         ),
     ] = None
     floor_margin: Annotated[float, OptionInfo("height above the foot of an object", "m")] = 0.05
     reach_margin: Annotated[
         PositiveFloat,
-        OptionInfo("points further from the object's root than its longest branch plus this are left out", "m"),
+        OptionInfo(
+            "points further from the object's root than its longest branch reaches, plus this, are left out", "m"
+        ),
     ] = 0.1
     max_depth_behind_base: Annotated[
         float | None,
         OptionInfo(
-            "points further from the camera than the robot's base by more are left out; null keeps them",
+            "points that are further from the camera than the robot's base by more than this, "
+            "seen in the horizontal, are behind the robot and left out; null to keep them",
             "m",
         ),
     ] = 0.0
     object_colours: Annotated[
         tuple[_RgbColour, ...],
-        OptionInfo("of the object: red, green, blue, 0 to 255; points of other colours are left out; empty keeps all"),
+        OptionInfo(
+            "of the object: red, green and blue, 0 to 255; points of other colours are left out, "
+            "where the clouds have colours; all are kept when empty"
+        ),
     ] = ()
     max_colour_angle: Annotated[
         float,
         Gt(0),
         Le(math.pi / 2),
-        OptionInfo("between a point's and the object's colour as directions, which brightness does not change", "rad"),
+        OptionInfo(
+            "between a point's and the object's colour as directions, by which light and shade change nothing", "rad"
+        ),
     ] = 0.2
-    outlier_neighbours: Annotated[int, Ge(1), OptionInfo("of a point, whose mean distance tells if it is alone")] = 12
+    outlier_neighbours: Annotated[
+        int, Ge(1), OptionInfo("of every point, whose mean distance tells whether it is alone")
+    ] = 12
     outlier_z_max: Annotated[
         PositiveFloat,
-        OptionInfo("a point is an outlier if that distance exceeds the median by so many robust standard deviations"),
+        OptionInfo(
+            "a point is an outlier where that distance exceeds the median by so many (robust) standard deviations"
+        ),
     ] = 4.0
     min_points: Annotated[int, Ge(0), OptionInfo("a frame with fewer points left is of no use")] = 150
-    max_points: Annotated[int, Ge(1), OptionInfo("of more points, so many are drawn, to bound a frame's time")] = 6000
+    max_points: Annotated[
+        int, Ge(1), OptionInfo("of more points left, so many are drawn at random, to bound the time that a frame takes")
+    ] = 6000
 
     def __post_init__(self) -> None:
         check_option_bounds(self, "filter options")
