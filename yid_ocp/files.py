@@ -202,10 +202,15 @@ def to_lossless_plain_data(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def attributes_to_json(value: Any, names: str) -> dict[str, Any]:
-    """Some attributes of an object as JSON data, by name or as `key=name`, separated by blanks."""
+def named_attributes(value: Any, names: str) -> dict[str, Any]:
+    """Some attributes of an object, by name or as `key=name`, separated by blanks."""
     pairs = [name.partition("=") for name in names.split()]
-    return {key: to_json_types(getattr(value, name or key)) for key, _, name in pairs}
+    return {key: getattr(value, name or key) for key, _, name in pairs}
+
+
+def attributes_to_json(value: Any, names: str) -> dict[str, Any]:
+    """Some attributes of an object as JSON data, named as in `named_attributes`."""
+    return dict(to_json_types(named_attributes(value, names)))
 
 
 def dataclass_from_plain_data(kind: type[_DataclassType], data: Mapping[str, Any]) -> _DataclassType:

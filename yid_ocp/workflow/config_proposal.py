@@ -15,7 +15,7 @@ from yid_ocp.data.channel_checks import quantization_step, white_noise_std
 from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, nearest_name_hint
-from yid_ocp.files import attributes_to_json
+from yid_ocp.files import named_attributes
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
@@ -90,13 +90,13 @@ class ConfigProposal:
 
     def to_dict(self) -> dict[str, Any]:
         """The proposal as plain data, under the keys of `yid-init/1`."""
-        return attributes_to_json(self, f"{_KEYS} {_MORE_KEYS} {_LAST_KEYS}") | {
-            "arms": [attributes_to_json(arm, "joints frames=tool_frames") for arm in self.arms],
+        return named_attributes(self, f"{_KEYS} {_MORE_KEYS} {_LAST_KEYS}") | {
+            "arms": [named_attributes(arm, "joints frames=tool_frames") for arm in self.arms],
             "places": {
-                group: [attributes_to_json(place, "point frame why=reason") for place in places]
+                group: [named_attributes(place, "point frame why=reason") for place in places]
                 for group, places in self.point_placements.items()
             },
-            "noise": {key: attributes_to_json(own, "std unit why=reason") for key, own in self.noise_by_group.items()},
+            "noise": {key: named_attributes(own, "std unit why=reason") for key, own in self.noise_by_group.items()},
         }
 
     @property

@@ -21,7 +21,7 @@ from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.export import models
 from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FormatSupport
 from yid_ocp.export.signals import RosTopicTimeSeries, export_csv, export_mcap, ros_signals_from_recording
-from yid_ocp.files import attributes_to_json, file_sha256, to_json_types, write_json, write_text
+from yid_ocp.files import file_sha256, named_attributes, to_json_types, write_json, write_text
 from yid_ocp.model.system import System
 from yid_ocp.progress import Progress
 from yid_ocp.report.summaries import export_summary
@@ -222,7 +222,7 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
         return {"status": "not done", "reason": error.what}
     channels = {}
     for name, mismatch in after.items():
-        own = attributes_to_json(mismatch, "unit noise=noise_rms after=rmse")
+        own = named_attributes(mismatch, "unit noise=noise_rms after=rmse")
         channels[name] = own | {"before": before[name].rmse, "fall": _fall([(before[name], mismatch)])}
     return {
         "status": "done",

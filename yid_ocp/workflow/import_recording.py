@@ -14,7 +14,7 @@ from yid_ocp.config.settings import ImportSettings
 from yid_ocp.data import Recording, preview_file, read_any, write_recording
 from yid_ocp.data.readers.base import parse_quantity_units
 from yid_ocp.errors import ConfigError
-from yid_ocp.files import attributes_to_json
+from yid_ocp.files import named_attributes
 from yid_ocp.progress import Progress
 from yid_ocp.report.terminal import recording_summary_lines, third_party_file_summary_lines
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result, stderr_progress_display
@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
             contents = preview_file(file, progress)
         if arguments.json:
             keys = "name kind count=n_samples rate=mean_rate becomes=imported_as note"
-            sources = [attributes_to_json(own, keys) for own in contents.sources]
+            sources = [named_attributes(own, keys) for own in contents.sources]
             told = {"sources": sources, "options": contents.reader_options, "notes": contents.notes}
             print_json({"format": _RESULT_FORMAT, "recording": None, **told})
             return EXIT_DONE

@@ -18,7 +18,7 @@ from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
 from yid_ocp.errors import ModelError
 from yid_ocp.export.equations import export_step_functions, write_equation_sheet
-from yid_ocp.files import attributes_to_json
+from yid_ocp.files import named_attributes
 from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import StepEquationLinearizations
@@ -101,7 +101,7 @@ def _run_inspect(
             },
             "equations": step_diagnostics.step_size_summary(step),
             "blocks": {
-                kind: [attributes_to_json(block, "name meaning names=full_names") for block in own if block.labels]
+                kind: [named_attributes(block, "name meaning names=full_names") for block in own if block.labels]
                 for kind, own in blocks.items()
             },
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
@@ -231,7 +231,7 @@ def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]
 def _entry_result(entry: EquationEntry, symbols: StepSymbols, at: Array) -> dict[str, Any]:
     names = "title row=row_name column=column_name zero=is_identically_zero lines=text_lines"
     value = entry.numeric_value(symbols.column_symbols, at)
-    return attributes_to_json(entry, names) | {"operations": entry.formula.n_operations, "value": value}
+    return named_attributes(entry, names) | {"operations": entry.formula.n_operations, "value": value}
 
 
 def _write_matrices(path: Path, step: Step, arrays: Mapping[str, Any]) -> None:

@@ -21,7 +21,7 @@ from yid_ocp.config.settings import EffectSettings, ParameterSettings, RunSettin
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError, YidError
-from yid_ocp.files import attributes_to_json, file_sha256, is_file, read_input_json
+from yid_ocp.files import file_sha256, is_file, named_attributes, read_input_json
 from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
@@ -265,14 +265,14 @@ def estimate_history_result(found: EstimateHistory) -> dict[str, Any]:
     for entry in found.parameter_drifts:
         known = zip(entry.run_names, entry.values, entry.std, strict=True)
         values = {name: {"value": value, "std": std} for name, value, std in known}
-        own = attributes_to_json(entry, "unit mean mean_std chi2 p_value drifted=has_drifted")
+        own = named_attributes(entry, "unit mean mean_std chi2 p_value drifted=has_drifted")
         parameters[entry.name] = own | {"values": values}
     names = "name=run_name chi2 degrees=degrees_of_freedom p_value worst=worst_parameter"
     return {
         "format": "yid-history/1",
-        **attributes_to_json(found, "level=significance_level chi2 degrees=degrees_of_freedom p_value"),
+        **named_attributes(found, "level=significance_level chi2 degrees=degrees_of_freedom p_value"),
         "runs": [
-            attributes_to_json(entry, f"{names} explains=is_fit_adequate distrusted=is_outlier")
+            named_attributes(entry, f"{names} explains=is_fit_adequate distrusted=is_outlier")
             for entry in found.run_outlier_tests
         ],
         "parameters": parameters,

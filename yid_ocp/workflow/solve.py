@@ -18,7 +18,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.issues import Issue
 from yid_ocp.errors import YidError
-from yid_ocp.files import attributes_to_json
+from yid_ocp.files import named_attributes
 from yid_ocp.inference.uncertainty import covariance_to_dict, estimates_marked_not_trusted, typical_parameter_magnitudes
 from yid_ocp.integrator.step import step_with_time_step
 from yid_ocp.model.objects.base import CableTopology
@@ -265,4 +265,4 @@ def solution_marked_if_step_unstable(problem: EstimationProblem, solution: Solut
 
 def _growth_result(growth: AlternatingErrorGrowth | None) -> dict[str, Any] | None:
     names = "recording=recording_name decades=growth_decades factor=max_step_factor time=max_growth_time time_step"
-    return None if growth is None else attributes_to_json(growth, names)
+    return None if growth is None else named_attributes(growth, names)

@@ -20,11 +20,11 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, YidError
 from yid_ocp.files import (
-    attributes_to_json,
     dataclass_from_plain_data,
     file_sha256,
     json_sha256,
     make_folder,
+    named_attributes,
     read_input_text,
     to_lossless_plain_data,
     write_text,
@@ -158,7 +158,7 @@ def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, An
     names = "name stamp t=joint_time reason=drop_reason raw_points=n_raw_points object_points=n_filtered_points"
     known = {"distance": "mean_distance", "covered": "visible_length_coverage", "contested": "contested_fraction"}
     found = {key: fit and getattr(fit, name) for key, name in known.items()}
-    return found | attributes_to_json(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
+    return found | named_attributes(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
 
 
 def _sizes_result(sizes: TubeDimensionCheck) -> dict[str, Any]:
@@ -183,7 +183,7 @@ def _camera_result(calibration: CameraCalibration) -> dict[str, Any]:
     state, told = calibration.camera_state, calibration.prior_state
     change, std = state.difference_from(told), np.sqrt(np.diag(calibration.state_covariance))
     names = "pose depth_factor=depth_scale depth_offset clock_offset clock_about=clock_reference_stamp clock_drift"
-    return attributes_to_json(state, names) | {
+    return named_attributes(state, names) | {
         "message": calibration.message,
         "estimated": calibration.n_frames > 0,
         "frames": calibration.n_frames,
@@ -373,7 +373,7 @@ def _calibrate_sequence_task(config: Path, inputs: Mapping[str, str]) -> dict[st
     try:
         return dict(to_lossless_plain_data(_tracker(read_input_text(config), config).calibrate_sequence()))
     except DataError as error:
-        return {"refused": attributes_to_json(error, "what where allowed hint")}
+        return {"refused": named_attributes(error, "what where allowed hint")}
 
 
 def _track_frame_task(config: Path, inputs: Mapping[str, str], common: Mapping[str, Any], index: int) -> dict[str, Any]:
