@@ -15,15 +15,7 @@ import pytest
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.readers import preview_file, read_any
 from yid_ocp.errors import ConfigError, DataError, ModelError, OutputError
-from yid_ocp.files import (
-    atomic_write,
-    file_sha256,
-    is_file,
-    json_sha256,
-    read_input_json,
-    to_json_types,
-    write_json,
-)
+from yid_ocp.files import atomic_write, file_sha256, is_file, json_sha256, read_input_json, to_json_types, write_json
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences, source_hash
 

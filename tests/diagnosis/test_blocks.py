@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
 import pytest
+from factories import cases
 from small_problems import swinging_pendulum
 
 from yid_ocp.diagnosis import diagnose, hypotheses
@@ -24,6 +25,7 @@ def swinging(urdf_folder):
 def test_the_held_out_blocks_begin_where_the_others_do(swinging):
     finding = diagnose(swinging, ["joint_coulomb", "joint_viscous"])
     assert finding.is_split_in_blocks
+    assert "blocks" in finding.summary
     assert finding.nominal_held_out_test.chi2_per_dof == pytest.approx(finding.nominal_test.chi2_per_dof, rel=0.3)
     assert finding.verdict == "effect"
     assert finding.accepted_effects[0].label == "joint_coulomb@elbow"
@@ -73,36 +75,30 @@ def followed(monkeypatch):
     ).truncate_held_out_recordings({}, margin)
 
 
-def test_what_is_followed_to_its_end_stays(followed):
-    composed, cuts = followed(Held("a", 500))
-    assert (cuts, composed.problem.held_out) == ((), (Held("a", 500),))
+WHOLE, NOTHING_OF_IT = Held("a", 500), TruncatedHeldOutRecording("b", 0.0, 5.0)
+
+
+@cases(
+    "held, margin, kept, cuts",
+    {
+        "followed to its end": ([WHOLE], 0.9, (WHOLE,), ()),
+        "too short a beginning": ([WHOLE, Held("b", 500, until=100)], 0.9, (WHOLE,), (NOTHING_OF_IT,)),
+        "no margin": ([WHOLE, Held("b", 500, until=450)], 0.0, (WHOLE,), (NOTHING_OF_IT,)),
+        "nothing is left but blocks of others": ([Held("b", 500, until=50)], 0.9, ("blocks",), (NOTHING_OF_IT,)),
+    },
+)
+def test_what_is_followed_stays_and_too_little_is_left_out(followed, held, margin, kept, cuts):
+    composed, found = followed(*held, margin=margin)
+    assert (composed.problem.held_out, found) == (kept, cuts)
+    assert composed.is_split_in_blocks is (kept == ("blocks",))
 
 
 def test_what_is_lost_on_the_way_is_compared_until_shortly_before(followed):
-    whole, lost = Held("a", 500), Held("b", 500, until=300)
-    composed, [cut] = followed(whole, lost)
+    composed, [cut] = followed(WHOLE, Held("b", 500, until=300))
     kept, cut_short = composed.problem.held_out
-    assert kept == whole
+    assert kept == WHOLE
     # found to a sixty-fourth of 500 steps, less a tenth
     assert 0.9 * (300 - 8) - 1 <= cut_short.steps <= 0.9 * 300
     assert cut == TruncatedHeldOutRecording("b", cut_short.steps * 0.01, 5.0)
-    assert not composed.is_split_in_blocks
-
-
-def test_too_short_a_beginning_is_left_out(followed):
-    composed, cuts = followed(Held("a", 500), Held("b", 500, until=100))
-    assert composed.problem.held_out == (Held("a", 500),)
-    assert cuts == (TruncatedHeldOutRecording("b", 0.0, 5.0),)
-    barely, _ = followed(Held("a", 500), Held("b", 500, until=130))
+    barely, _ = followed(WHOLE, Held("b", 500, until=130))
     assert len(barely.problem.held_out) == 2
-
-
-def test_where_nothing_is_left_the_other_recordings_are_split(followed):
-    composed, cuts = followed(Held("b", 500, until=50))
-    assert (composed.is_split_in_blocks, composed.problem.held_out) == (True, ("blocks",))
-    assert cuts == (TruncatedHeldOutRecording("b", 0.0, 5.0),)
-
-
-def test_with_no_margin_nothing_of_it_is_kept(followed):
-    composed, [cut] = followed(Held("a", 500), Held("b", 500, until=450), margin=0.0)
-    assert (composed.problem.held_out, cut.kept_duration) == ((Held("a", 500),), 0.0)

@@ -70,7 +70,7 @@ def case(category: str, verdict: str, *effects: InjectedEffect, multiple: float 
 
 def calibrated(*cases: Any) -> dict[str, Any]:
     labels, marks, answers = zip(*cases, strict=True)
-    return json.loads(json.dumps(calibrate_thresholds(labels, marks, answers)))["rules"]
+    return json.loads(json.dumps(calibrate_thresholds(labels, marks, answers)))
 
 
 def test_clean_recordings_set_what_chance_may_reach() -> None:
@@ -87,8 +87,8 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
     ]
     strange = [case("left_out", "unknown", DAMPER, statistics={"evidence": 6.0})]
     lost = case("null", "unknown", statistics={"chi2_per_dof": None, "p_value": 0.0})
-    assert calibrated(*clean, lost)["gap"]["sample"].count(None) == 3, "beyond any number, or not significant"
-    found = calibrated(*clean, *effects, *strange)
+    assert calibrated(*clean, lost)["rules"]["gap"]["sample"].count(None) == 3, "beyond any number, or not significant"
+    found = calibrated(*clean, *effects, *strange)["rules"]
     evidence = found["evidence"]
     assert (evidence["quantile"], evidence["coverage"], evidence["cases"]) == (7.0, 0.8, 4)
     assert evidence["sample"] == [None, None, 2.0, 7.0]
@@ -105,12 +105,11 @@ def test_clean_recordings_set_what_chance_may_reach() -> None:
 def test_a_candidate_is_surer_than_any_of_clean_recordings() -> None:
     clean = [case("null", "no_gap", open=STATISTICS | {"candidate": p}) for p in (0.4, 2.345e-5, 3e-3)]
     effects = [case("single", "effect", DAMPER, multiple=3.0, statistics={"candidate": p}) for p in (1e-9, 1e-8, 1e-3)]
-    labels, marks, answers = zip(*clean, *effects, strict=True)
-    found = calibrate_thresholds(labels, marks, answers)
+    found = calibrated(*clean, *effects)
     assert found["rules"]["candidate"]["quantile"] == 2.345e-5
     assert found["rules"]["candidate"]["effects_beyond"]["3"]["count"] == 2
     assert found["settings"]["candidate_significance_level"] == 2.3e-5
-    few = calibrate_thresholds(labels[:1], marks[:1], answers[:1])
+    few = calibrated(clean[0])
     assert few["settings"]["candidate_significance_level"] == 1e-4, "no less sure than odds that convince"
 
 
@@ -134,7 +133,7 @@ def test_a_tie_is_what_the_truth_may_be_behind_beyond_chance() -> None:
         # a search that ended elsewhere says nothing of rivals
         behind(0.1, a_at_b=0.0, kelvin_voigt_at_T1=55.0),
     ]
-    found = calibrated(*cases)["tie"]
+    found = calibrated(*cases)["rules"]["tie"]
     assert found["sample"] == [0.0, 0.0, pytest.approx(0.02), pytest.approx(0.03)], "also where it was not named"
 
 
@@ -151,8 +150,7 @@ def test_a_tie_is_what_the_truth_may_be_behind_beyond_chance() -> None:
 def test_settings_are_quantiles_within_what_is_of_use(evidence, explained, worth, asked) -> None:
     clean = case("null", "no_gap", open=STATISTICS | {"evidence": evidence})
     named = case("single", "effect", DAMPER, multiple=3.0, statistics={"explained": explained})
-    labels, marks, answers = zip(clean, named, strict=True)
-    settings = calibrate_thresholds(labels, marks, answers)["settings"]
+    settings = calibrated(clean, named)["settings"]
     assert (settings["min_log_bayes_factor"], settings["min_explained_fraction"]) == (worth, asked)
 
 
@@ -161,14 +159,13 @@ def test_of_two_rules_for_one_setting_the_wider_counts() -> None:
     same = {"left": 1.0, "chi2_per_dof": 0.0, "error": 0.0}
     behind = {"a@b": same | {"squares": -4.0}, "kelvin_voigt@T1": same | {"squares": 14.0}}
     true = case("single", "effect", DAMPER, multiple=3.0, statistics={"behind": behind})
-    labels, marks, answers = zip(clean, true, strict=True)
-    assert calibrate_thresholds(labels, marks, answers)["settings"]["min_log_bayes_factor"] == 9.0
+    assert calibrated(clean, true)["settings"]["min_log_bayes_factor"] == 9.0
 
 
 def test_cases_that_could_not_be_fitted_do_not_count() -> None:
     label, told, answer = case("null", "insufficient_data")
     del answer["result"]["statistics"]
-    found = calibrated((label, told, answer))
+    found = calibrated((label, told, answer))["rules"]
     assert {entry["cases"] for entry in found.values()} == {0}
     assert {entry["quantile"] for entry in found.values()} == {None}
 

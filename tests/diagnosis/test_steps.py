@@ -19,7 +19,6 @@ from yid_ocp.diagnosis.screening import (
     make_joint_score_model,
     score_candidates,
 )
-from yid_ocp.diagnosis.select import _near_best_models
 from yid_ocp.effects import make_effect
 from yid_ocp.inference.null_test import residual_channel_samples
 from yid_ocp.problem import EstimationProblem
@@ -76,7 +75,7 @@ def test_the_promised_decrease_is_that_of_a_refit_where_the_model_is_linear(scre
         assert 2 * (nominal.cost - fit.cost) == pytest.approx(ranked[label].predicted_chi2_decrease, rel=1e-3, abs=1e-3)
 
 
-def test_what_the_fit_has_explained_is_projected_off(screened):
+def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_the_rest(screened):
     _, nominal, point = screened
     jacobian = nominal.evaluation.jacobian[: len(point.projected_residual)]
     size = np.linalg.norm(jacobian, axis=0)
@@ -84,10 +83,7 @@ def test_what_the_fit_has_explained_is_projected_off(screened):
     for signature in point.signatures:
         leak = np.abs(jacobian.T @ signature.projected_sensitivity / size[:, None]).max()
         assert leak < 1e-8 * max(np.abs(signature.projected_sensitivity).max(), 1e-300) * len(jacobian)
-
-
-def test_a_candidate_explains_itself_and_nothing_explains_more(screened):
-    _, _, point = screened
+    # a candidate explains itself, and nothing explains more
     table = confusability_matrix(make_joint_score_model(point))
     assert np.diag(table.overlap_fractions) == pytest.approx(1.0)
     assert np.all((table.overlap_fractions >= 0) & (table.overlap_fractions <= 1))
@@ -116,13 +112,3 @@ def test_of_shape_values_that_make_no_difference_the_first_counts(bench, lean, c
     point = AllCandidatesLinearization(residual[:, 0], signatures)
     best = score_candidates(point, [series(range(200))], candidate_detectability(point))[0]
     assert best.predicted_values["joint_stribeck@elbow.v_stribeck"] == grid[chosen]["joint_stribeck@elbow.v_stribeck"]
-
-
-def test_the_simplest_within_one_standard_error_wins(screened):
-    composed, nominal, _ = screened
-    effects = {e.label: e for e in composed.candidate_effects}
-    one = refit_with_effects(composed, (effects["joint_coulomb@elbow"],), nominal.values)
-    both = (effects["joint_coulomb@elbow"], effects["effort_offset@shoulder"])
-    two = refit_with_effects(composed, both, nominal.values)
-    assert _near_best_models([two, one])[0] is one
-    assert nominal not in _near_best_models([nominal, one])

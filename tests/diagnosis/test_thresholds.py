@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-import numpy as np
 import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.localise import localise_gap, smoothed_unknown_z_scores
 from yid_ocp.options import dataclass_options
 
 KIND = "joint_coulomb@elbow"
@@ -21,19 +19,14 @@ def found(bench, **limits):
     )
 
 
-@pytest.fixture(scope="module")
-def usual(bench):
-    return found(bench)
-
-
 def test_every_threshold_is_a_setting():
     assert set(dataclass_options(Thresholds)) == {entry.name for entry in fields(Thresholds)}
 
 
-def test_the_whole_diagnosis_goes_by_what_it_is_given(bench, usual):
+def test_the_whole_diagnosis_goes_by_what_it_is_given(bench):
     few = {"shape_grid_size": 2, "n_refit_per_round": 1, "signature_overlap": 1.0, "n_refit_lowest_p": 0}
     sizes = {"detection_z": 2 * 3.858, "force_prior_std": 0.2, "detectable_chi2": 40.0}
-    other = found(bench, residual_window=1.0, min_log_bayes_factor=6.0, **sizes, **few)
+    usual, other = found(bench), found(bench, residual_window=1.0, min_log_bayes_factor=6.0, **sizes, **few)
     assert usual.verdict == other.verdict == "effect"
     longest = [max(round(w.end_time - w.start_time, 6) for w in f.nominal_test.windows) for f in (usual, other)]
     assert longest == [0.5, 1.0]
@@ -59,11 +52,3 @@ def test_the_whole_diagnosis_goes_by_what_it_is_given(bench, usual):
 )
 def test_a_verdict_goes_by_its_thresholds(bench, limits, verdict):
     assert found(bench, **limits).verdict == verdict
-
-
-def test_a_gap_is_there_by_so_many_standard_deviations(usual):
-    loose, strict = (localise_gap(usual.smoother_result, sure)[0].time_windows for sure in (0.5, 20.0))
-    assert sum(b - a for a, b in loose) > sum(b - a for a, b in strict)
-    informed = (smoothed_unknown_z_scores(usual.smoother_result, 0, mapped)[2] for mapped in (0.1, 0.999))
-    more, fewer = (np.isfinite(z).sum() for z in informed)
-    assert more > fewer

@@ -11,19 +11,17 @@ import pytest
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.diagnosis.verdict import is_chance_excess
 from yid_ocp.effects import make_effect
 from yid_ocp.errors import YidError
-from yid_ocp.inference.smoother import select_and_smooth_unknowns
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
 FRICTION = ("joint_coulomb", "link_mass@elbow", "effort_offset@elbow")
 
 
-def found(bench, effects, candidates, *, held_out=True, **how):
+def found(bench, effects, candidates, **how):
     recordings = [bench.recording(effects, seed, **how) for seed in (1, 2)]
     problem = bench.problem(recordings[:1])
-    finding = diagnose(problem, candidates, recordings[1:] if held_out else (), thresholds=Thresholds(max_effects=2))
+    finding = diagnose(problem, candidates, recordings[1:], thresholds=Thresholds(max_effects=2))
     result = json.loads(json.dumps(finding.to_dict()))
     located = result["verdict"] in ("effect", "confusable", "unknown")
     assert sum(place["share"] for place in result["where"]) == pytest.approx(1.0 if located else 0.0)
@@ -67,27 +65,14 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     assert "joint_coulomb@elbow with tau_c" in result["summary"]
 
 
-@pytest.fixture(scope="module")
-def clean(bench):
-    return found(bench, {}, FRICTION)
-
-
-def test_a_model_that_is_right_has_no_gap(clean):
-    _, result = clean
+def test_a_model_that_is_right_has_no_gap(bench):
+    _, result = found(bench, {}, FRICTION)
     assert result["verdict"] == "no_gap"
     assert result["gap"]["closure"] is None
     assert result["gap"]["before"] == result["gap"]["after"]
     told = result["statistics"]
     assert told["p_value"] > 0.01
     assert {told[name] for name in ("closure", "fall", "explained", "carried", "evidence")} == {None}
-
-
-def test_one_recording_is_split_in_blocks_and_the_report_says_so(bench):
-    _, result = found(bench, {"joint_coulomb@elbow": {"tau_c": 0.1}}, FRICTION, held_out=False)
-    assert result["verdict"] == "effect"
-    assert result["effects"] == [{"kind": "joint_coulomb", "location": "elbow"}]
-    assert result["held_out_in_blocks"]
-    assert "blocks" in result["summary"]
 
 
 def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
@@ -159,11 +144,6 @@ def short(bench):
     return bench.recording({}, 1, duration=0.5)
 
 
-def test_held_out_data_must_be_other_data(bench, short):
-    copy = replace(short, name="another_name")
-    refused(lambda: diagnose(bench.problem([short]), FRICTION, [copy]), "both estimated on and held out")
-
-
 @pytest.mark.parametrize(
     ("candidates", "words"),
     [
@@ -185,21 +165,8 @@ def test_a_noise_level_that_is_zero_or_absent_is_refused(bench, short, std):
     refused(lambda: diagnose(bench.problem([silent]), FRICTION), "noise level")
 
 
-def test_the_papers_weighting_cannot_be_diagnosed(bench, short):
+def test_held_out_data_must_be_other_data_and_the_papers_weighting_cannot_be_diagnosed(bench, short):
+    copy = replace(short, name="another_name")
+    refused(lambda: diagnose(bench.problem([short]), FRICTION, [copy]), "both estimated on and held out")
     options = ProblemOptions(weighting="paper", path_cutoff=np.inf, sensors={"joints.effort": SensorOptions(std=0.02)})
     refused(lambda: diagnose(bench.problem([short], options=options), FRICTION), "whitened")
-
-
-def test_a_barely_significant_excess_without_shape_is_chance(clean):
-    finding, _ = clean
-    nominal, limits = finding.nominal_model, Thresholds()
-    smoothed = select_and_smooth_unknowns(nominal.problem, nominal.problem.vector(nominal.values), nominal.evaluation)
-
-    def tested(p):
-        return replace(finding.nominal_test, p_value=p)
-
-    assert smoothed.gap_origin == "none"
-    assert is_chance_excess(smoothed, finding.candidate_scores, tested(3e-3), tested(0.5), limits)
-    assert not is_chance_excess(smoothed, finding.candidate_scores, tested(3e-6), tested(0.5), limits)
-    sure = [replace(score, p_value=1e-9) for score in finding.candidate_scores]
-    assert not is_chance_excess(smoothed, sure, tested(3e-3), tested(0.5), limits)
