@@ -312,7 +312,7 @@ COMMANDS = tuple(
         ("solve", "estimate the free parameters from recordings", "solve.run", partial(_doubting, optional=True)),
         ("compare", "run several methods on one problem and say whether they agree", "compare.run", _doubting),
         ("identifiability", _SAID_IDENTIFIABILITY, "identifiability.run", _identifiability),
-        ("friction", "say which law of friction the recordings warrant", "compare.friction", _doubting),
+        ("friction", "say which law of friction the recordings warrant", "friction.run", _doubting),
         ("diagnose", "find the gap between model and recordings, and what makes it", "diagnose.run", _diagnose),
         ("blind", _SAID_BLIND, "blind.run", _blind),
         ("batch", "solve or diagnose many recordings or robots, one table and report of all", "batch.run", _batch),

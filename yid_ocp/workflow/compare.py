@@ -1,22 +1,17 @@
-"""The commands `compare` and `friction`: several methods on one problem, several laws of friction in one model."""
+"""The command `compare`: several methods on one problem, and the answer of the source paper beside them."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.analysis import friction_ladder
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, MethodComparison, compare_methods, explain_paper_estimates
-from yid_ocp.analysis.friction_ladder import FrictionLawFit, left_out_error_mean_and_std_error
-from yid_ocp.config.settings import FrictionSettings, RunSettings
-from yid_ocp.effects.friction import FRICTION_LAW_EFFECT_KINDS
-from yid_ocp.errors import DataError
+from yid_ocp.config.settings import RunSettings
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_method_convergence
-from yid_ocp.solvers import SOLVERS, Iterate, Solution, Status, solve
-from yid_ocp.workflow.build import friction_joints, friction_parameter_names
+from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -84,71 +79,3 @@ def _compare_result(problem: EstimationProblem, comparison: MethodComparison) ->
 
 
 run = command_with_settings(_run_compare)
-
-
-# -- friction ---------------------------------------------------------------------------------------------------------
-
-
-def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResult[None]:
-    """Fit every friction law to all recordings but one kind of motion in turn, and write the run folder.
-
-    Successful where the warranted law's fit to all recordings converged. `DataError` for fewer than two motions that
-    could be left out.
-    """
-    joints = None if run.model.friction is None else run.model.friction.joints
-    with atomic_run_folder(run, out, "friction") as folder:
-        folder.record_run_start(run, "friction")
-        fits: list[FrictionLawFit] = []
-        solved: dict[str, tuple[RunSettings, EstimationProblem, Solution]] = {}
-        for law in FRICTION_LAW_EFFECT_KINDS:
-            progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
-            settings = replace(run, model=replace(run.model, friction=FrictionSettings(law=law, joints=joints)))
-            problem = friction_ladder.problem_estimating_on_held_out_too(build_problem(settings))
-            kinds = friction_ladder.recordings_by_motion_kind(problem)
-            if len(kinds) < 2:
-                allowed = "two recordings or more in which the motors are on"
-                hint = "list more under recordings.estimate or recordings.held_out"
-                what = "a law is judged by motions it was not fitted to, and there is one"
-                raise DataError(what, allowed=allowed, hint=hint)
-            solution = solve(problem, run.solver, restarts=False)
-            if solution.status == Status.FAILED:
-                progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
-                continue
-            fits.append(friction_ladder.fit_friction_law(law, problem, solution, kinds))
-            solved[law] = (settings, problem, solution)
-        if not fits:
-            raise DataError("no friction law could be fitted", hint="look at `yid-ocp check` of this configuration")
-        best = friction_ladder.warranted_law(fits, kinds)
-        settings, problem, solution = solved[best.law]
-        names = friction_parameter_names(settings, problem.system.parameters)
-        more = {"friction_clouds": friction_ladder.friction_torque_clouds(problem, solution, names)}
-        result: dict[str, Any] = {
-            "format": "yid-friction/1",
-            "kinds": {kind: list(own) for kind, own in kinds.items()},
-            "joints": list(friction_joints(settings, problem.system)),
-            "unit": best.unit,
-            "laws": {fit.law: _law_result(fit, best, kinds) for fit in fits},
-            "warranted": best.law,
-        }
-        folder.log_event("end", warranted=best.law)
-        known = {"problem": problem, "solution": solution, "section_data": more}
-        written = folder.write_result_and_report(run, progress, result, **known)
-    return CommandResult(folder.path, written, None, best.is_converged)
-
-
-def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tuple[str, ...]]) -> dict[str, Any]:
-    mean, error = left_out_error_mean_and_std_error(fit.left_out_errors, kinds)
-    beyond = {name: own - best.left_out_errors[name] for name, own in fit.left_out_errors.items()}
-    difference, paired = left_out_error_mean_and_std_error(beyond, kinds)
-    return {
-        "mean_error": mean,
-        "standard_error": error,
-        "left_out_errors": dict(fit.left_out_errors),
-        "beyond_warranted": difference,
-        "beyond_warranted_standard_error": paired,
-        "converged": fit.is_converged,
-        "parameters": {name: asdict(entry) for name, entry in fit.parameters.items()},
-    }
-
-
-friction = command_with_settings(_run_friction)
