@@ -93,15 +93,11 @@ def test_a_task_that_ends_every_worker_fails_alone(scheduler, tmp_path):
         scheduler.cluster.wait_for_workers(2, timeout=60)
 
 
+OLD = {"yid-ocp": "99.0", "code": "b" * 64}, r"version: yid-ocp \S+ instead of 99.0, code \w+ instead of bbb"
+
+
 @pytest.mark.parametrize(
-    ("other", "words"),
-    [
-        (
-            {"yid-ocp": "99.0", "code": "b" * 64},
-            r"of another version: yid-ocp \S+ instead of 99.0, code \w+ instead of bbb",
-        ),
-        ({"python": "2.7"}, r"python 3\.\S+ instead of 2.7"),
-    ],
+    ("other", "words"), [OLD, ({"python": "2.7"}, r"of another version: python 3\.\S+ instead of 2.7")]
 )
 def test_a_worker_of_another_version_is_refused(scheduler, monkeypatch, other, words):
     here = software_fingerprint() | other
@@ -111,10 +107,8 @@ def test_a_worker_of_another_version_is_refused(scheduler, monkeypatch, other, w
 
 
 def test_what_a_worker_cannot_import_or_see_is_said(scheduler, tmp_path, monkeypatch):
-    elsewhere, missing = (
-        SimpleNamespace(__module__="nowhere.to_be_found"),
-        "ModuleNotFoundError: No module named 'nowhere'",
-    )
+    elsewhere = SimpleNamespace(__module__="nowhere.to_be_found")
+    missing = "ModuleNotFoundError: No module named 'nowhere'"
     with pytest.raises(WorkerError, match=missing), connected(scheduler.address, elsewhere, tmp_path):
         pass
     unseen = nullcontext(SimpleNamespace(name=str(tmp_path / "unseen")))

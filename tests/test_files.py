@@ -110,20 +110,9 @@ def test_where_two_processes_differ_is_said():
 
 # -- files from outside -----------------------------------------------------------------------------------------------
 
-OPENERS = {
-    "open",
-    "read_text",
-    "read_bytes",
-    "load",
-    "loadtxt",
-    "genfromtxt",
-    "fromfile",
-    "memmap",
-    "read_csv",
-    "imread",
-}
+OPENERS = {"open", "read_text", "read_bytes", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "read_csv"}
 OPENERS |= {"parse", "iterparse", "from_xml_path", "File", "ParquetFile", "read_table", "c3d", "AnyReader", "Reader"}
-OPENERS |= {"read_image", "read_point_cloud", "read_triangle_mesh"}
+OPENERS |= {"imread", "read_image", "read_point_cloud", "read_triangle_mesh"}
 """Functions that open a file: Python's own, and those of the libraries that the package uses."""
 GUARDS = {"check_input_file", "check_readable_in_fork", "read_input_text"}
 OPENED_ELSEWHERE = {
@@ -187,10 +176,9 @@ def test_an_input_that_is_no_regular_file_is_refused_at_once(tmp_path, name, kin
     else:
         path.symlink_to("/dev/zero")
     readers = {".yaml": [load_config], ".urdf": [read_urdf]}.get(path.suffix, [read_any, preview_file])
+    words = "" if name == "a.urdf" else "a pipe or a device"
     for read in readers:
-        with pytest.raises(
-            (DataError, ConfigError, ModelError), match="" if name == "a.urdf" else "a pipe or a device"
-        ):
+        with pytest.raises((DataError, ConfigError, ModelError), match=words):
             read(path)
 
 

@@ -144,14 +144,11 @@ def test_the_check_itself(module: str, source: str, wrong: bool) -> None:
 @pytest.mark.parametrize(
     ("sources", "found"),
     [
-        ({"a.x": "from yid_ocp.a.y import f", "a.y": "from yid_ocp.a.x import g"}, {"a.x", "a.y"}),
-        ({"a.x": "def f():\n    import yid_ocp.a.y", "a.y": "import yid_ocp.a.x"}, set()),
-        ({"a": "from yid_ocp.a.x import f", "a.x": "from yid_ocp.a import g"}, {"a", "a.x"}),
-        (
-            {"a.x": "import yid_ocp.a.y", "a.y": "import yid_ocp.a.z", "a.z": "import yid_ocp.a.x"},
-            {"a.x", "a.y", "a.z"},
-        ),
+        ({"a.x": "from yid_ocp.a.y import f", "a.y": "from yid_ocp.a.x import g"}, "a.x a.y"),
+        ({"a.x": "def f():\n    import yid_ocp.a.y", "a.y": "import yid_ocp.a.x"}, ""),
+        ({"a": "from yid_ocp.a.x import f", "a.x": "from yid_ocp.a import g"}, "a a.x"),
+        ({"a.x": "import yid_ocp.a.y", "a.y": "import yid_ocp.a.z", "a.z": "import yid_ocp.a.x"}, "a.x a.y a.z"),
     ],
 )
-def test_the_check_for_circles_itself(sources: dict[str, str], found: set[str]) -> None:
-    assert set(circle(sources)) == found
+def test_the_check_for_circles_itself(sources: dict[str, str], found: str) -> None:
+    assert set(circle(sources)) == set(found.split())

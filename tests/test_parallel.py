@@ -284,10 +284,11 @@ def test_one_process_and_two_find_the_same(tmp_path):
     assert len(one) == 4
 
 
-def test_processes_share_the_threads_of_the_machine(tmp_path, monkeypatch):
+def test_processes_share_the_threads_of_the_machine_and_threads_keep_the_order(tmp_path, monkeypatch):
     monkeypatch.setenv("YID_OCP_THREADS", "4")
     found = run_tasks(thread_count, tasks_of(2), tmp_path, WorkerConfig(n_processes=2))
     assert [entry.value for entry in found] == [2, 2]
+    assert map_in_threads(lambda x: x * x, range(7)) == [x * x for x in range(7)]
 
 
 @pytest.mark.parametrize("said", ["0", "-1", "two", "1.5"])
@@ -362,10 +363,6 @@ def test_an_interrupted_or_killed_run_leaves_its_results_and_no_process(tmp_path
     assert wait_until(lambda: not any(Path(f"/proc/{worker}").exists() for worker in workers), 20)
     names = [json.loads(path.read_text())["name"] for path in (tmp_path / "results").glob("*.json")]
     assert names == ["0.0"]
-
-
-def test_threads_keep_the_order():
-    assert map_in_threads(lambda x: x * x, range(7)) == [x * x for x in range(7)]
 
 
 # -- items at work side by side, whose questions are answered together -------------------------------------------------

@@ -28,6 +28,7 @@ from yid_ocp.model.objects.cable import START_SPEED_PARAMETER_NAME
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, SingleShooting, Status, SteepestDescent
 
+CONVERGED, LIMIT = Status.CONVERGED, Status.ITERATION_LIMIT
 TRUTH = {"elbow.stiffness": 4.0, "elbow.damping": 0.15, "elbow.rest": 0.3, "shoulder.damping": 0.1}
 
 
@@ -77,12 +78,9 @@ def test_nothing_to_agree_on(repository, tmp_path, capsys):
 
 def test_command(repository, clean, tmp_path, capsys):
     config = repository / "configs" / "single_arm_no_vision.yaml"
-    settings = [
-        "problem.duration=0.3",
-        "problem.use_compiler=false",
-        "model.object.links=1",
+    settings = ["problem.duration=0.3", "problem.use_compiler=false", "model.object.links=1", "parameters={}"]
+    settings += [
         "compare.methods={gauss_newton: {}, single_shooting: {}}",
-        "parameters={}",
         "parameters={T1.bend: {free: true, initial: 15}, T1.twist: {initial: 13.6}, T2.bend: {initial: 10.7}, "
         "T2.twist: {initial: 8.2}, T3.bend: {initial: 11.5}, T3.twist: {initial: 9.7}}",
         *(f"recordings.{purpose}=[{clean}/single_arm_no_vision_{purpose}.h5]" for purpose in ("estimate", "held_out")),
@@ -190,10 +188,10 @@ def test_estimates_agree_within_two_standard_deviations_or_half_a_percent(compar
 @pytest.mark.parametrize(
     ("status", "cost", "why"),
     [
-        (Status.ITERATION_LIMIT, 1.0, "it ended with 'iteration_limit' before reaching the optimum"),
+        (LIMIT, 1.0, "it ended with 'iteration_limit' before reaching the optimum"),
         (Status.STALLED, 99.0, "it ended with 'stalled' before reaching the optimum"),
-        (Status.CONVERGED, 3.1, "it stopped in another valley of the cost"),
-        (Status.CONVERGED, 3.0, "its cost weighs the measurements otherwise"),
+        (CONVERGED, 3.1, "it stopped in another valley of the cost"),
+        (CONVERGED, 3.0, "its cost weighs the measurements otherwise"),
     ],
 )
 def test_a_difference_has_a_likely_reason(compared, status, cost, why):
@@ -211,20 +209,10 @@ def test_a_difference_has_a_likely_reason(compared, status, cost, why):
 @pytest.mark.parametrize(
     ("a", "b", "status", "said"),
     [
-        (10.9, 2.19, Status.CONVERGED, ["steepest_descent ended within 10 % of the truth everywhere"]),
+        (10.9, 2.19, CONVERGED, ["steepest_descent ended within 10 % of the truth everywhere"]),
         (10.0, 3.0, Status.STALLED, ["b (3 for 2, cannot be found); these are exactly the parameters that are not"]),
-        (
-            8.9,
-            3.0,
-            Status.ITERATION_LIMIT,
-            ["a (8.9 for 10, found), b (3 for 2,", "found: the method stopped short (it"],
-        ),
-        (
-            11.1,
-            2.0,
-            Status.CONVERGED,
-            ["a could be found: its cost weighs", "b (cannot be found) came out near the truth"],
-        ),
+        (8.9, 3.0, LIMIT, ["a (8.9 for 10, found), b (3 for 2,", "found: the method stopped short (it"]),
+        (11.1, 2.0, CONVERGED, ["a could be found: its cost weighs", "b (cannot be found) came out near the truth"]),
     ],
 )
 def test_where_the_papers_method_ended_far_from_the_truth(compared, a, b, status, said):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from small_problems import pendulum_step
 
 from yid_ocp.analysis.discretisation import min_closure_error_by_grasp, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
@@ -217,17 +218,8 @@ def test_words(changes, words):
 
 
 @pytest.fixture(scope="module")
-def swing(urdf_folder):
-    """A double pendulum whose shoulder is driven, its elbow springy."""
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    springs = {"elbow": RobotJointSpring(3.0)}
-    system = System.build(robot, driven=["shoulder"], springs=springs, damping=0.2, point_frames=["tip"])
-    return compile_step(system, 0.01, use_compiler=False)
-
-
-@pytest.fixture(scope="module")
 def held_pendulum(urdf_folder):
-    """The same, its tip tied to a rod that hangs from the ceiling: constraints beside coordinates."""
+    """A double pendulum whose joints are moved, its tip tied to a rod that hangs from the ceiling."""
     robot = read_urdf(urdf_folder / "double_pendulum.urdf")
     rod = flexible_object([Segment("T1", 0.6, 0.1, 0.02, links=2, bend=4.0, twist=3.0)])
     held = {"grasps": [Grasp("hand", "tip", "w_T1")], "prescribed": ["shoulder", "elbow"]}
@@ -235,7 +227,8 @@ def held_pendulum(urdf_folder):
     return compile_step(system, 0.01, use_compiler=False)
 
 
-def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(swing, held_pendulum):
+def test_a_step_is_counted_its_unknowns_without_what_is_prescribed(urdf_folder, held_pendulum):
+    swing = pendulum_step(urdf_folder, driven=("shoulder",))
     found = step_size_summary(swing)
     assert found["sizes"] == swing.sizes
     assert found["sizes"] | {"n": 2, "nu": 1, "nz": 0, "m": 0, "nc": 0, "nx": 4} == found["sizes"]

@@ -116,15 +116,12 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     assert none is None
 
 
+ONE, BOTH = math.hypot(0.1, 0.6), math.hypot(0.1, 0.6, 0.8)
+
+
 @pytest.mark.parametrize(
     ("links", "time_step", "std"),
-    [
-        (None, None, 0.1),
-        (0.1, -0.1, 0.1),
-        (-0.3, 0.05, math.hypot(0.1, 0.6)),
-        (0.05, 0.3, math.hypot(0.1, 0.6)),
-        (0.3, -0.4, math.hypot(0.1, 0.6, 0.8)),
-    ],
+    [(None, None, 0.1), (0.1, -0.1, 0.1), (-0.3, 0.05, ONE), (0.05, 0.3, ONE), (0.3, -0.4, BOTH)],
     ids=["not tried", "within it", "links", "time step", "both"],
 )
 def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_is(links, time_step, std):

@@ -13,7 +13,6 @@ from heard import Heard
 from made_recordings import chain_of_motors, group, holding_pendulum, places, setting
 
 from yid_ocp.analysis import experiment_design
-from yid_ocp.analysis import experiment_design as module
 from yid_ocp.analysis import torque_error_propagation as propagation
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
@@ -41,11 +40,6 @@ from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.workflow.build_problem import load_problem
 
 MARKER_DISTANCE = 0.03
-
-
-@pytest.fixture(scope="module")
-def holding(urdf_folder):
-    return holding_pendulum(urdf_folder)
 
 
 @pytest.mark.parametrize(
@@ -153,7 +147,8 @@ def test_a_segment_has_a_tip_a_middle_and_a_marker(links, middle):
     assert marker.description == "a marker 3 cm off the axis at the end of T1"
 
 
-def test_a_marker_is_off_the_axis_and_felt_at_a_held_end(holding):
+def test_a_marker_is_off_the_axis_and_felt_at_a_held_end(urdf_folder):
+    holding = holding_pendulum(urdf_folder)
     found = observable_frames(holding)
     assert {sight.name for sight in found if sight.is_arm_measurable} == {"T1_marker"}
     tip, beside = places(holding, ["w_T1", found[-1].added_frame], np.zeros(holding.n_coordinates))
@@ -302,8 +297,9 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
 
 
 @pytest.fixture(scope="module")
-def driven(holding):
+def driven(urdf_folder):
     """The pendulum's motors at work for a second, with narrow limits; the rod's middle seen."""
+    holding = holding_pendulum(urdf_folder)
     joints = list(holding.mechanism.joints)
     for i, (lower, upper, effort) in enumerate([(-1.0, 0.35, 0.1), (-0.65, 2.0, 0.05)]):
         joints[i] = replace(joints[i], lower_limit=lower, upper_limit=upper, effort_limit=effort)
@@ -343,8 +339,8 @@ def test_another_motion_starts_where_the_recording_does(driven, monkeypatch, nam
         whole = np.hstack([angles, np.zeros((51, system.n_coordinates - 2))])
         return SimpleNamespace(t=t, q=whole, effort=np.tile(effort, (51, 1)))
 
-    monkeypatch.setattr(module, "random_multisine_motion", draw)
-    monkeypatch.setattr(module, "simulate_in_mujoco", simulate)
+    monkeypatch.setattr(experiment_design, "random_multisine_motion", draw)
+    monkeypatch.setattr(experiment_design, "simulate_in_mujoco", simulate)
     _, made = built(driven, name)
     assert made.feasibility_notes == note
     episode = driven.episodes[0]
@@ -425,14 +421,9 @@ def test_few_unknowns_have_the_covariance_of_all(drawn_motion, size):
 @pytest.fixture(scope="module")
 def noisy(repository):
     """One arm on a coarse Y, for a second; its torques have white noise and offsets."""
-    coarse = (
-        "model.object.links=1",
-        "problem.duration=1.0",
-        "problem.use_compiler=false",
-        "recordings.held_out=[]",
-        "parameters={}",
-        "parameters={T1.bend: {free: true, initial: 20}, T2.bend: {free: true, initial: 10}, T2.twist: {initial: 10}}",
-    )
+    coarse = ["model.object.links=1", "problem.duration=1.0", "problem.use_compiler=false", "recordings.held_out=[]"]
+    free = "{T1.bend: {free: true, initial: 20}, T2.bend: {free: true, initial: 10}, T2.twist: {initial: 10}}"
+    coarse += ["parameters={}", f"parameters={free}"]
     return load_problem(repository / "configs" / "single_arm_vision.yaml", coarse)
 
 

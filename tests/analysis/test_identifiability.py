@@ -157,9 +157,8 @@ def test_a_combination_that_a_nuisance_hides_is_said_so():
         return [30 * (a + b) + 5 * s, 30 * (a - b)]
 
     said = identifiability(Formula(rows, {**START, SLOPE: 0.0}, bounds=FREE)).directions[0].words
-    assert said.startswith(
-        "this: a and b are seen only together: a +10 % with b +10 % changes nothing that is measured"
-    )
+    trade = "a +10 % with b +10 % changes nothing that is measured"
+    assert said.startswith(f"this: a and b are seen only together: {trade}")
     assert said.endswith("cannot be told apart from the unknown start")
 
 

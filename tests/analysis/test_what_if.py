@@ -33,13 +33,9 @@ TRUTH = {"T1.bend": 22.0, "T1.twist": 13.6, "T2.bend": 10.7, "T2.twist": 8.2, "T
 @pytest.fixture(scope="module")
 def short_run(repository):
     """One arm on a coarse Y, half a second."""
-    settings = (
-        "model.object.links=1",
-        "problem.duration=0.5",
-        "problem.use_compiler=false",
-        "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {free: true, initial: 10}}",
-    )
-    return load_problem(repository / "configs" / "single_arm_vision.yaml", settings)
+    coarse = ("model.object.links=1", "problem.duration=0.5", "problem.use_compiler=false")
+    free = "parameters={T*.bend: {free: true, initial: 15}, T*.twist: {free: true, initial: 10}}"
+    return load_problem(repository / "configs" / "single_arm_vision.yaml", (*coarse, free))
 
 
 LETTERS = {"weld": "w", "motion": "m", "travel": "t", "camera:T1_marker": "c", "arm:T2_marker": "a"}

@@ -77,6 +77,7 @@ def test_a_pulse_that_stays_at_its_size_is_flat():
         pytest.param(0.4 * (T > 4.02), id="a step"),
         pytest.param(0.4 * np.sign(np.sin(2 * np.pi * T / 1.3)), id="friction that nobody modelled"),
         pytest.param(0.4 * np.sin(2 * np.pi * T / 0.9), id="an oscillation"),
+        pytest.param(bell(2.0, 5.0, 0.5), id="what lasts longer than the longest event"),
     ],
 )
 @pytest.mark.parametrize("seed", range(2))
@@ -96,10 +97,6 @@ def test_friction_that_holds_may_change_by_twice_itself_wherever_a_joint_stands_
     assert sure(history(values, friction_limit=at_rest)) == []
     assert len(sure(history(values, friction_limit=at_rest / 4))) == 1
     assert len(sure(history(values, friction_limit=np.where(T > 6, 0.2, 0.0)))) == 1
-
-
-def test_what_lasts_longer_than_the_longest_event_is_the_models():
-    assert sure(history(bell(2.0, 5.0, 0.5))) == []
 
 
 def test_a_filter_widens_what_is_seen_and_not_what_is_told():

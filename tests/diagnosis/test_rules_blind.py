@@ -290,9 +290,6 @@ def test_only_kinds_that_the_other_engine_can_do_are_injected(drawn):
     assert kinds == {"kelvin_voigt"}
 
 
-# -- outside the library ----------------------------------------------------------------------------------------------
-
-
 def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
     ensemble = drawn()
     found = [ensemble._outside(np.random.default_rng(seed)) for seed in range(600)]
@@ -308,9 +305,6 @@ def test_effects_outside_the_library_have_the_size_of_what_they_act_on(drawn):
         assert low <= min(ratios) < max(ratios) <= high
         assert {f.location for f in by_kind[kind]} == {"T1", "T2"}
     assert all(0.05 <= f.values["size"] <= 0.15 for f in by_kind["gusts"])
-
-
-# -- finer chains -----------------------------------------------------------------------------------------------------
 
 
 def chain(links, **values):

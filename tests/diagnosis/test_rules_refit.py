@@ -131,9 +131,6 @@ def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monk
     assert len(solved.runs) == runs
 
 
-# -- is a refit half done ---------------------------------------------------------------------------------------------
-
-
 @cases(
     "before, after, half",
     {

@@ -30,9 +30,6 @@ from yid_ocp.diagnosis.verdict import UnknownVerdictReason
 FRICTION, OFFSET = effect("friction@elbow"), effect("offset@wrist", amplitude(lower=-9.0))
 
 
-# -- yid-diagnosis/2 --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("verdict", ["effect", "confusable", "unknown", "no_gap", "insufficient_data"])
 def test_effects_count_only_where_the_verdict_names_them(verdict):
     made = finding(verdict, selected_effects=(added(FRICTION, [OFFSET]),))
@@ -122,9 +119,7 @@ def test_candidates_are_listed_with_what_was_added_first():
     assert [entry["closure"] for entry in listed] == [pytest.approx(0.95), pytest.approx(0.65), None]
     assert listed[1]["closure_ci"] == [pytest.approx(0.6), pytest.approx(0.7)]
     assert listed[2]["closure_ci"] is None
-
-
-def test_an_unknown_gap_lists_refits_before_scores():
+    # of an unknown gap, refits before scores
     made = finding("unknown", single_effect_models=(fit([OFFSET]),), candidate_scores=(score(FRICTION), score(OFFSET)))
     assert [entry["kind"] for entry in _ranked_candidates(made)] == ["offset", "friction"]
 

@@ -35,9 +35,6 @@ def only(of, columns, residual, noise=None, **shapes):
     return found
 
 
-# -- shapes -----------------------------------------------------------------------------------------------------------
-
-
 @cases(
     "expected, count, values",
     {

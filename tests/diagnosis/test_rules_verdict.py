@@ -260,11 +260,7 @@ def test_the_part_of_a_gap_that_can_be_explained_at_all(chi2, degrees, part):
 # -- whether effects come out the same on other recordings -------------------------------------------------------------
 
 SPRING = effect("spring@elbow", amplitude("k", lower=-9.0, expected=(0.0, 10.0)), shape("s"))
-SHIFT = effect(
-    "shift@grasp",
-    amplitude("x", lower=-9.0, expected=(-1.0, 1.0), unit="m"),
-    amplitude("y", lower=-9.0, expected=(-1.0, 1.0), unit="m"),
-)
+SHIFT = effect("shift@grasp", *(amplitude(n, lower=-9.0, expected=(-1.0, 1.0), unit="m") for n in "xy"))
 
 
 def of(label, values, stds, effects=(SPRING,)):

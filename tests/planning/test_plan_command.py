@@ -149,9 +149,10 @@ def test_wrong_input_leaves_nothing(config, refused, settings, words):
     refused(config, settings, words)
 
 
-def test_a_run_that_failed_is_refused(config, tmp_path, refused):
-    failed = solved(tmp_path / "failed", 4.0, 0.1, status="failed")
+def test_a_run_that_failed_and_one_of_another_command_are_refused(config, tmp_path, refused):
+    failed, other = solved(tmp_path / "failed", 4.0, 0.1, status="failed"), diagnosed(tmp_path / "diagnosed", 4.0)
     refused(config, [f"plan.parameter_run={failed}"], ("failed: made up",))
+    refused(config, [f"plan.parameter_run={other}"], ("run folder of another command (yid-diagnosis/2)",))
 
 
 def test_a_run_with_effects_that_the_model_lacks_is_refused(config, tmp_path, capsys):
@@ -216,8 +217,3 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
 )
 def test_wrong_input_of_information_leaves_nothing(informing, refused, settings, words):
     refused(informing, settings, words)
-
-
-def test_other_goals_do_not_take_a_diagnosis(config, tmp_path, refused):
-    folder = diagnosed(tmp_path / "diagnosed", 4.0)
-    refused(config, [f"plan.parameter_run={folder}"], ("run folder of another command (yid-diagnosis/2)",))
