@@ -20,6 +20,7 @@ from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 
 GRAVITY = np.array([0.3, -0.2, -9.81])
+KEPT = ["extend", "hinge", "spin", "swing"]
 
 
 def branched(urdf_folder) -> System:
@@ -86,8 +87,8 @@ def test_differences_and_files_that_pinocchio_does_not_read_are_said(tmp_path, u
     [
         ("double_pendulum.urdf", None, {}),
         ("mixed_joints.urdf", None, {}),
-        ("mixed_joints.urdf", ["extend", "hinge", "spin", "swing"], {"nod": 0.7, "slide": -0.15}),
-        ("mixed_joints.urdf", ["extend", "hinge", "spin", "swing"], {}),
+        ("mixed_joints.urdf", KEPT, {"nod": 0.7, "slide": -0.15}),
+        ("mixed_joints.urdf", KEPT, {}),
         ("turntable.urdf", None, {}),
         ("package:ur5", None, {}),
         ("package:baxter", ["left_s0", "left_s1", "left_e0", "left_e1", "left_w0", "left_w1", "left_w2"], {}),
@@ -102,7 +103,7 @@ def test_a_file_is_read_as_pinocchio_reads_it(urdf_folder, file, joints, locked)
     assert found.words.startswith(f"{path.name} as read: ")
 
 
-def test_a_file_read_wrongly_is_said(urdf_folder):
+def test_a_file_read_wrongly_or_a_lock_at_another_value_is_said(urdf_folder):
     path = urdf_folder / "mixed_joints.urdf"
     robot = read_urdf(path)
     joint = robot.joints[-1]
@@ -111,14 +112,9 @@ def test_a_file_read_wrongly_is_said(urdf_folder):
     found = compare_urdf_with_pinocchio(path, wrong, GRAVITY)
     assert not found.agrees_within_rounding
     assert found.words.startswith("mixed_joints.urdf as read differs from Pinocchio's: ")
-
-
-def test_a_lock_at_another_value_is_noticed(urdf_folder):
-    path = urdf_folder / "mixed_joints.urdf"
-    kept = ["extend", "hinge", "spin", "swing"]
-    robot = read_urdf(path, joints=kept, locked={"nod": 0.7})
-    assert compare_urdf_with_pinocchio(path, robot, GRAVITY, kept, {"nod": 0.7}).agrees_within_rounding
-    assert not compare_urdf_with_pinocchio(path, robot, GRAVITY, kept, {"nod": 0.6}).agrees_within_rounding
+    robot = read_urdf(path, joints=KEPT, locked={"nod": 0.7})
+    assert compare_urdf_with_pinocchio(path, robot, GRAVITY, KEPT, {"nod": 0.7}).agrees_within_rounding
+    assert not compare_urdf_with_pinocchio(path, robot, GRAVITY, KEPT, {"nod": 0.6}).agrees_within_rounding
 
 
 @pytest.mark.parametrize(

@@ -68,9 +68,6 @@ def effect(label="friction@elbow", *quantities: ParameterDefinition, alone=False
     return (Local if alone else EffectBase)(kind, location, Parameters(entries), definitions=tuple(chosen))
 
 
-# -- null test --------------------------------------------------------------------------------------------------------
-
-
 def outcome(p=0.5, chi2=1.0, degrees=100.0, channels=None, windows=()) -> NullTestResult:
     """The outcome of a null test."""
     channels = {"points.tip": chi2} if channels is None else channels
@@ -226,9 +223,6 @@ def finding(verdict="effect", **changed) -> DiagnosisResult:
         "unknown_reason": "none" if verdict == "unknown" else "",
     }
     return DiagnosisResult(**(usual | changed))
-
-
-# -- recordings on nodes ----------------------------------------------------------------------------------------------
 
 
 def measurements(channels, node, fraction, value, weight, span=(0, 100), **sensor) -> Measurements:

@@ -20,6 +20,7 @@ from yid_ocp.inference.smoother_model import SmoothedUnknownGroup
 
 TWIST = SmoothedUnknownGroup("T1", "bias")
 NONE = {FORCE: 0.0, OTHER_FORCE: 0.0}
+THREE_TO_ONE = [("T1", 0.75, True), ("T2", 0.25, True)]
 
 
 def described(places):
@@ -29,12 +30,8 @@ def described(places):
 @cases(
     "weight, detectable, expected",
     {
-        "by evidence": ({FORCE: 3.0, OTHER_FORCE: 1.0}, {}, [("T1", 0.75, True), ("T2", 0.25, True)]),
-        "unknowns of one place add": (
-            {FORCE: 1.0, TWIST: 2.0, OTHER_FORCE: 1.0},
-            {},
-            [("T1", 0.75, True), ("T2", 0.25, True)],
-        ),
+        "by evidence": ({FORCE: 3.0, OTHER_FORCE: 1.0}, {}, THREE_TO_ONE),
+        "unknowns of one place add": ({FORCE: 1.0, TWIST: 2.0, OTHER_FORCE: 1.0}, {}, THREE_TO_ONE),
         "none, one would have shown": (NONE, {FORCE: 0.5, OTHER_FORCE: 2.0}, [("T1", 0.0, True), ("T2", 0.0, False)]),
         "reference size does not show": (NONE, {FORCE: 1.0, OTHER_FORCE: 0.9}, [("T2", 0.0, True), ("T1", 0.0, False)]),
         "one of two would have shown": ({FORCE: 0.0, TWIST: 0.0}, {FORCE: 0.5, TWIST: 2.0}, [("T1", 0.0, True)]),

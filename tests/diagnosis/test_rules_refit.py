@@ -313,12 +313,7 @@ def episode(name="other", steps=100, time_step=0.01, of=()):
 
 @cases(
     "seconds, length",
-    {
-        "short": ((10.0,), 0.5),
-        "forty seconds": ((40.0,), 1.0),
-        "two recordings": ((30.0, 30.0), 1.5),
-        "long": ((200.0,), 2.0),
-    },
+    {"short": ((10.0,), 0.5), "forty seconds": ((40.0,), 1.0), "two": ((30.0, 30.0), 1.5), "long": ((200.0,), 2.0)},
 )
 def test_held_out_time_is_cut_in_some_forty_blocks(seconds, length):
     assert _block_duration([episode(steps=round(s / 0.01)) for s in seconds]) == pytest.approx(length)

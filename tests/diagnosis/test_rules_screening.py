@@ -178,11 +178,7 @@ def test_an_amplitude_of_the_wrong_sign_explains_nothing(size):
 
 @cases(
     "wanted, step, decrease",
-    {
-        "free": (1.0, 1.0, 4 * 1.0),
-        "stopped above": (2.0, 1.5, 4 * (4.0 - 0.25)),
-        "stopped below": (-2.0, -0.5, 4 * (4.0 - 2.25)),
-    },
+    {"free": (1.0, 1.0, 4 * 1.0), "above": (2.0, 1.5, 4 * (4.0 - 0.25)), "below": (-2.0, -0.5, 4 * (4.0 - 2.25))},
 )
 def test_a_step_stops_at_its_bounds_and_promises_less(wanted, step, decrease):
     of = effect("offset@elbow", amplitude(neutral=1.0, lower=0.5, upper=2.5))
@@ -235,10 +231,7 @@ def test_a_signature_explained_by_another():
     found = confusability_matrix(make_joint_score_model(at))
     assert found.labels == ("a@x", "b@x")
     np.testing.assert_allclose(found.overlap_fractions, [[1.0, 0.75], [0.75, 1.0]], atol=1e-12)
-
-
-def test_nothing_is_like_what_moves_nothing():
-    a, b = effect("a@x", amplitude()), effect("b@x", amplitude())
+    # nothing is like what moves nothing
     at = point([0.0] * 2, signature(a, [0.0, 0.0]), signature(b, [1.0, 0.0]))
     found = confusability_matrix(make_joint_score_model(at))
     np.testing.assert_array_equal(found.overlap_fractions, [[0.0, 0.0], [0.0, 1.0]])

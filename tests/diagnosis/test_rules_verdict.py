@@ -110,8 +110,6 @@ def test_an_offset_beyond_what_was_stated_needs_no_channel_above_noise(label, p,
     assert has_significant_gap(outcome(), outcome(), LIMITS, ranked, stated) is gap
 
 
-# -- is it chance -----------------------------------------------------------------------------------------------------
-
 SILENT = smoothed({FORCE: 0.0, BIAS: 0.0})
 SPEAKING = smoothed({FORCE: 9.0, BIAS: 0.0}, evidence={"plant": 9.0, "both": 9.0})
 

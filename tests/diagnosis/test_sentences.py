@@ -63,10 +63,8 @@ def gaps():
     ]:  # fmt: skip
         tests = {"nominal_test": outcome(p[0], chi2=1.123), "nominal_held_out_test": outcome(p[1], chi2=2.345)}
         yield f"{verdict}, p = {p[0]:g} and {p[1]:g}", finding(verdict, **tests, **NO_EFFECT)
-    yield (
-        "insufficient data",
-        finding("insufficient_data", message="4 samples.", next_experiment="Longer.", **NO_EFFECT),
-    )
+    short = {"message": "4 samples.", "next_experiment": "Longer."}
+    yield "insufficient data", finding("insufficient_data", **short, **NO_EFFECT)
     yield "no gap", finding("no_gap", next_experiment="None is needed.", **NO_EFFECT)
 
 

@@ -144,16 +144,11 @@ def test_what_may_be_said_of_a_parameter(said, known):
     assert parameter_verdict(value, std, scale=scale) == said
 
 
-@pytest.mark.parametrize(
-    ("std", "explains", "at_bound", "said"),
-    [
-        (0.5, False, False, "not_trusted"),
-        (0.5, False, True, "not_trusted"),
-        (0.5, True, True, "at_bound"),
-        (41.0, False, True, "not_identifiable"),
-        (math.inf, True, True, "not_identifiable"),
-    ],
-)
+JUDGED = [(0.5, False, False, "not_trusted"), (0.5, False, True, "not_trusted"), (0.5, True, True, "at_bound")]
+JUDGED += [(41.0, False, True, "not_identifiable"), (math.inf, True, True, "not_identifiable")]
+
+
+@pytest.mark.parametrize(("std", "explains", "at_bound", "said"), JUDGED)
 def test_misfit_comes_before_a_bound_and_after_what_nothing_informs(std, explains, at_bound, said):
     assert parameter_verdict(10.0, std, explains=explains, at_bound=at_bound) == said
     assert parameter_verdict(0.0, 0.1, scale=10.0, at_bound=True) == "at_bound"
@@ -207,10 +202,8 @@ def test_a_misfit_that_stays_for_long_counts_as_one_and_one_that_alternates_as_m
 
 
 def test_a_misfit_of_one_block_or_of_none_widens_nothing():
-    for problem in (
-        MadeUp(linear(np.ones((3, 1)), [5.0, 5.0, 5.0]), duration=0.2),
-        MadeUp(linear(np.zeros((3, 0))), ()),
-    ):
+    one = MadeUp(linear(np.ones((3, 1)), [5.0, 5.0, 5.0]), duration=0.2)
+    for problem in (one, MadeUp(linear(np.zeros((3, 0))), ())):
         found = problem.evaluate(np.zeros(len(problem.initial_unknowns)))
         covariance, _ = unknowns_covariance_and_reduced_chi2(problem, found)
         np.testing.assert_array_equal(_misfit_sandwich_covariance(problem, found, covariance), covariance)
@@ -270,12 +263,15 @@ def test_every_parameter_has_its_estimate_and_fixed_ones_are_said_to_be():
     assert (first.unit, first.lower, first.upper, first.interval) == ("N m/rad", 0.0, 99.0, None)
 
 
-def test_of_what_nothing_informs_no_standard_deviation_is_said():
+def test_of_what_nothing_informs_no_standard_deviation_is_said_and_rounding_below_zero_is_no_variance():
     problem = MadeUp(linear([[0.02]], [-0.02]), (1.0,))
     lost = estimated(problem, [1.0], [[2500.0]])["k0"]
     assert (lost.verdict, lost.std, lost.interval) == ("not_identifiable", math.inf, None)
     without = estimated(problem, [1.0], [[math.nan]])["k0"]
     assert (without.verdict, without.std) == ("not_identifiable", math.inf)
+    assert estimated(MadeUp(linear([[1.0]]), (1.0,)), [1.0], [[-1e-20]])["k0"].std == 0.0
+    none = MadeUp(linear(np.zeros((1, 0))), (), fixed=(3.0,))
+    assert estimated(none, np.zeros(0), np.zeros((0, 0)))["k0"].verdict == "fixed"
 
 
 def test_misfit_takes_the_trust_from_informed_parameters_and_no_fit_says_nothing_of_bounds():
@@ -316,13 +312,6 @@ def test_the_size_that_a_parameter_might_have():
 def test_a_standard_deviation_of_a_million_times_value_and_size_is_none(scale, expected):
     problem = MadeUp(linear([[1.0]]), (0.0,), lower=-np.inf, priors={"k0": 100.0}, scales=(scale,))
     assert estimated(problem, [0.0], [[0.5**2]])["k0"].verdict == expected
-
-
-def test_rounding_below_zero_is_no_variance_and_no_unknowns_need_none():
-    problem = MadeUp(linear([[1.0]]), (1.0,))
-    assert estimated(problem, [1.0], [[-1e-20]])["k0"].std == 0.0
-    none = MadeUp(linear(np.zeros((1, 0))), (), fixed=(3.0,))
-    assert estimated(none, np.zeros(0), np.zeros((0, 0)))["k0"].verdict == "fixed"
 
 
 @pytest.mark.parametrize(
