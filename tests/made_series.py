@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 
+from yid_ocp.data.recording import Recording
 from yid_ocp.inference.null_test import ResidualChannelSamples
 
 WHITE = (1.0,)
@@ -17,6 +19,13 @@ def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, pe
     rows = np.asarray(rows)
     t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
     return ResidualChannelSamples(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
+
+
+def without(recording: Recording, begin: float, end: float) -> Recording:
+    """A recording whose joints lost the samples of some time [s]."""
+    rows = (recording.joints.t < begin) | (recording.joints.t > end)
+    left = {name: values[rows] for name, values in recording.joints.channels.items()}
+    return replace(recording, joints=replace(recording.joints, t=recording.joints.t[rows], **left))
 
 
 def samples(channels: Sequence[str], std, unit="m", width=1, **more):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_series import without
 
 from yid_ocp.data.channel_checks import typical_point_pair_distances
 from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_at_gaps
@@ -28,16 +29,10 @@ def made(seed: int = 1, duration: float = 8.0, rate: float = 100.0, **more) -> R
     angle = 0.4 * np.sin(wave * t[:, None] + phase)
     rate_of = 0.4 * wave * np.cos(wave * t[:, None] + phase)
     effort = 5 * np.sin(0.7 * wave * t[:, None]) + 0.05 * rng.standard_normal(angle.shape)
-    joints = JointGroup(
-        NAMES,
-        t,
-        angle + STD * rng.standard_normal(angle.shape),
-        velocity=rate_of + 5e-3 * rng.standard_normal(angle.shape),
-        effort=effort,
-        position_std=STD,
-        effort_std=0.05,
-        **more,
-    )
+    position = angle + STD * rng.standard_normal(angle.shape)
+    velocity = rate_of + 5e-3 * rng.standard_normal(angle.shape)
+    stds = {"position_std": STD, "effort_std": 0.05}
+    joints = JointGroup(NAMES, t, position, velocity=velocity, effort=effort, **stds, **more)
     at = np.arange(0.2, duration, 0.3)
     seen = np.stack([np.sin(at), np.cos(at), 0 * at], axis=1)[:, None, :]
     camera = PointGroup("points_camera", ("p",), at, seen, np.full(seen.shape, 5e-3), "camera")
@@ -55,9 +50,8 @@ def column(values, j, change):
 
 
 def causes(recording, driving=True, **sensors) -> set[str]:
-    found = recording_quality_issues(
-        recording, lambda group: sensors.get(group.replace(".", "_"), SensorOptions()), driving
-    )
+    chosen = {name.replace("_", "."): options for name, options in sensors.items()}
+    found = recording_quality_issues(recording, lambda group: chosen.get(group, SensorOptions()), driving)
     assert all(doubt.recording == recording.name and doubt.advice and doubt.evidence >= 1 for doubt in found)
     return {doubt.cause for doubt in found}
 
@@ -98,44 +92,40 @@ def test_noise_from_a_clock_that_is_known_by_its_period_only_is_no_noise():
     assert causes(changed(recording, position=angle, clock="nominal")) == set()
 
 
-def shifted(recording, by, which=("joints", "points_camera")):
-    joints = replace(recording.joints, t=recording.joints.t + by) if "joints" in which else recording.joints
-    points = [replace(g, t=g.t + by) if g.name in which else g for g in recording.points]
-    return replace(recording, joints=joints, points=tuple(points))
-
-
-def timed(recording, factor):
-    points = [replace(g, t=g.t * factor) for g in recording.points]
-    return replace(recording, joints=replace(recording.joints, t=recording.joints.t * factor), points=tuple(points))
-
-
 RECORDING = made()
+
+
+def timed(joints, points):
+    """The recording with times that are computed from its own."""
+    group = RECORDING.points[0]
+    points = (replace(group, t=points(group.t)),)
+    return replace(changed(RECORDING, t=joints(RECORDING.joints.t)), points=points)
+
+
 POSITION, VELOCITY, EFFORT = RECORDING.joints.position, RECORDING.joints.velocity, RECORDING.joints.effort
+NOISE = np.random.default_rng(2).standard_normal(EFFORT.shape)
+
+
+def turned(j, change):
+    return changed(RECORDING, position=column(POSITION, j, change))
+
+
 FAULTS = {
-    "milliseconds": (timed(RECORDING, 1e3), {"time_unit"}),
-    "nanoseconds": (timed(RECORDING, 1e9), {"time_unit"}),
-    "ten times as fast": (timed(RECORDING, 0.1), {"time_scale"}),
-    "since 1970": (shifted(RECORDING, 1.7e9, ("joints",)), {"clock_base"}),
-    "a late camera": (shifted(RECORDING, 3.0, ("points_camera",)), {"clock_offset"}),
-    "an early camera": (shifted(RECORDING, -3.0, ("points_camera",)), {"clock_offset"}),
+    "milliseconds": (timed(lambda t: 1e3 * t, lambda t: 1e3 * t), {"time_unit"}),
+    "nanoseconds": (timed(lambda t: 1e9 * t, lambda t: 1e9 * t), {"time_unit"}),
+    "ten times as fast": (timed(lambda t: 0.1 * t, lambda t: 0.1 * t), {"time_scale"}),
+    "since 1970": (timed(lambda t: t + 1.7e9, lambda t: t), {"clock_base"}),
+    "a late camera": (timed(lambda t: t, lambda t: t + 3.0), {"clock_offset"}),
+    "an early camera": (timed(lambda t: t, lambda t: t - 3.0), {"clock_offset"}),
     "degrees": (changed(RECORDING, position=np.degrees(POSITION), position_std=np.degrees(STD)), {"degrees"}),
-    "one angle too large": (
-        changed(RECORDING, position=column(POSITION, 1, lambda x: 20 * x)),
-        {"angle_scale", "noise"},
-    ),
-    "one angle turned": (changed(RECORDING, position=column(POSITION, 1, lambda x: -x)), {"angle_sign"}),
+    "one angle too large": (turned(1, lambda x: 20 * x), {"angle_scale", "noise"}),
+    "one angle turned": (turned(1, lambda x: -x), {"angle_sign"}),
     "two angles exchanged": (changed(RECORDING, position=POSITION[:, [1, 0, 2]]), {"swapped_joints"}),
-    "a stuck encoder": (
-        changed(RECORDING, position=column(POSITION, 2, lambda x: np.where(np.arange(len(x)) > 300, x[300], x))),
-        {"stuck"},
-    ),
+    "a stuck encoder": (turned(2, lambda x: np.where(np.arange(len(x)) > 300, x[300], x)), {"stuck"}),
     "all repeat one sample": (changed(RECORDING, position=0 * POSITION + 0.1, velocity=None, effort=None), {"stuck"}),
     "coarse angles": (changed(RECORDING, position=0.01 * np.rint(POSITION / 0.01)), {"quantised"}),
     "coarse efforts": (changed(RECORDING, effort=np.rint(EFFORT)), {"quantised"}),
-    "noisy efforts": (
-        changed(RECORDING, effort=EFFORT + 0.5 * np.random.default_rng(2).standard_normal(EFFORT.shape)),
-        {"noise"},
-    ),
+    "noisy efforts": (changed(RECORDING, effort=EFFORT + 0.5 * NOISE), {"noise"}),
     "clipped efforts": (changed(RECORDING, effort=np.clip(EFFORT, -4, 3)), {"saturated"}),
 }
 
@@ -188,42 +178,32 @@ def test_what_a_sensor_smooths_is_computed_or_weighed_by_settings_is_not_oversta
 
 
 def test_a_camera_that_runs_longer_than_the_joints_at_both_ends_is_not_late():
-    recording = made()
-    group = recording.points[0]
     t = np.arange(-4.0, 12.0, 0.3)
-    longer = replace(group, t=t, position=np.ones((len(t), 1, 3)) * np.sin(t)[:, None, None], std=None)
-    assert causes(replace(recording, points=(longer,))) == set()
+    longer = replace(RECORDING.points[0], t=t, position=np.ones((len(t), 1, 3)) * np.sin(t)[:, None, None], std=None)
+    assert causes(replace(RECORDING, points=(longer,))) == set()
 
 
 def test_half_of_the_samples_missing_is_a_warning_where_joints_drive_the_model():
-    recording = made()
-    rows = np.random.default_rng(1).random(len(recording.joints.t)) > 0.5
-    thin = {name: values[rows] for name, values in recording.joints.channels.items()}
-    recording = changed(recording, t=recording.joints.t[rows], **thin)
+    rows = np.random.default_rng(1).random(len(RECORDING.joints.t)) > 0.5
+    thin = {name: values[rows] for name, values in RECORDING.joints.channels.items()}
+    recording = changed(RECORDING, t=RECORDING.joints.t[rows], **thin)
     assert causes(recording) == {"dropped_samples"}
     assert causes(recording, driving=False) == set()
 
 
 def test_nothing_moves():
-    recording = made()
-    rng = np.random.default_rng(1)
-    rest = {
-        "position": STD * rng.standard_normal(POSITION.shape),
-        "velocity": 5e-3 * rng.standard_normal(POSITION.shape),
-    }
-    still = [
-        replace(g, position=1 + 0 * g.position + 5e-3 * rng.standard_normal(g.position.shape)) for g in recording.points
-    ]
-    assert causes(replace(changed(recording, **rest), points=tuple(still))) == {"standstill"}
+    rng, group = np.random.default_rng(1), RECORDING.points[0]
+    position, velocity = STD * rng.standard_normal(POSITION.shape), 5e-3 * rng.standard_normal(POSITION.shape)
+    still = replace(group, position=1 + 5e-3 * rng.standard_normal(group.position.shape))
+    resting = changed(RECORDING, position=position, velocity=velocity)
+    assert causes(replace(resting, points=(still,))) == {"standstill"}
 
 
 def test_one_measurement_listed_twice_is_told_also_in_part():
-    recording = made()
-    assert duplicate_data_issue(recording, replace(recording, name="again")).cause == "same_data"
-    assert duplicate_data_issue(recording, replace(recording.time_slice(2.0, 6.0), name="part")).what.startswith(
-        "401 samples of part"
-    )
-    assert duplicate_data_issue(recording, made(2)) is None
+    assert duplicate_data_issue(RECORDING, replace(RECORDING, name="again")).cause == "same_data"
+    part = replace(RECORDING.time_slice(2.0, 6.0), name="part")
+    assert duplicate_data_issue(RECORDING, part).what.startswith("401 samples of part")
+    assert duplicate_data_issue(RECORDING, made(2)) is None
 
 
 def encoder_counts(seed: int, n: int = 3000) -> Recording:
@@ -257,12 +237,6 @@ def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():
 
 
 # -- gaps -------------------------------------------------------------------------------------------------------------
-
-
-def without(recording, begin, end):
-    rows = (recording.joints.t < begin) | (recording.joints.t > end)
-    left = {name: values[rows] for name, values in recording.joints.channels.items()}
-    return changed(recording, t=recording.joints.t[rows], **left)
 
 
 def test_a_recording_is_cut_at_a_gap_and_every_part_is_kept_where_it_may_start_in_motion():

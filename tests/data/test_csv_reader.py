@@ -122,12 +122,10 @@ def test_csv_errors(case: str, tmp_path: Path) -> None:
 def test_csv_that_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_bytes(b"t,q_a\n\xff\xfe\x00,1\n")
-    with pytest.raises(DataError, match="not a table of text"):
-        read_csv(path)
-    with pytest.raises(DataError, match="this is a folder"):
-        read_csv(tmp_path)
-    with pytest.raises(DataError, match="no such file"):
-        read_csv(tmp_path / "absent.csv")
+    absent = tmp_path / "absent.csv"
+    for file, message in ((path, "not a table of text"), (tmp_path, "this is a folder"), (absent, "no such file")):
+        with pytest.raises(DataError, match=message):
+            read_csv(file)
 
 
 def test_many_short_lines_are_refused_before_they_fill_the_memory(tmp_path, monkeypatch):
@@ -256,9 +254,6 @@ def test_telemetry_of_isaac_sims_identification(tmp_path: Path) -> None:
         read_csv(path)
 
 
-SHARED = Path(__file__).parents[2].parent / "shared" / "recordings"
-
-
 # ------------------------------------------------------------------------------------------------------- any format
 
 
@@ -295,9 +290,6 @@ def test_a_new_reader_is_one_registration(tmp_path: Path, monkeypatch: pytest.Mo
     assert joints_of(read_any(tmp_path / "run.one", value=2.0)).position[0, 0] == 2.0
 
 
-@pytest.mark.skipif(
-    not (SHARED / "deft").is_dir(), reason="the real recordings are not here (shared/recordings beside the project)"
-)
-def test_a_real_table_that_is_no_recording_is_refused() -> None:
+def test_a_real_table_that_is_no_recording_is_refused(shared: Path) -> None:
     with pytest.raises(DataError, match="meaning of column 'point'"):
-        read_any(SHARED / "deft" / "bdlo1_undeformed.csv")
+        read_any(shared / "recordings" / "deft" / "bdlo1_undeformed.csv")
