@@ -59,9 +59,9 @@ def motion(seed: int, steps: int = 120) -> Recording:
 def cli(capsys):
     """Run a command; returns exit code, standard output and standard error."""
 
-    def run(*arguments: object) -> SimpleNamespace:
+    def run(*arguments: object, settings: Sequence[str] = ()) -> SimpleNamespace:
         capsys.readouterr()
-        code = main([str(argument) for argument in arguments])
+        code = main([*map(str, arguments), *(part for entry in settings for part in ("--set", entry))])
         captured = capsys.readouterr()
         return SimpleNamespace(code=code, out=captured.out, err=captured.err)
 
@@ -72,9 +72,9 @@ def cli(capsys):
 def carried_out(cli, tmp_path):
     """Run a command that succeeds, into the folder `out`; what `cli` returns, with the folder and its result."""
 
-    def run(*arguments: object, settings: Sequence[str] = (), out: str = "run") -> SimpleNamespace:
-        done = cli(*arguments, "--out", tmp_path / out, *(part for entry in settings for part in ("--set", entry)))
-        assert done.code == 0, done.err
+    def run(*arguments: object, settings: Sequence[str] = (), out: str = "run", codes=(0,)) -> SimpleNamespace:
+        done = cli(*arguments, "--out", tmp_path / out, settings=settings)
+        assert done.code in codes, done.err
         done.folder = tmp_path / out
         done.result = json.loads((done.folder / "result.json").read_text(), parse_constant=pytest.fail)
         return done

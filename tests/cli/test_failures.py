@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import json
 import os
 import signal
 import subprocess
@@ -21,31 +20,28 @@ from yid_ocp.workflow import simulate as simulate_module
 from yid_ocp.workflow import solve as solve_module
 
 
-def test_a_solve_that_does_not_converge(cli, pendulum, tmp_path):
-    settings = ("--set", "solver.max_iterations=1", "--set", "solver.name=steepest_descent")
-    done = cli("solve", pendulum, "--out", "limit", *settings)
-    assert done.code == 1
-    result = json.loads((tmp_path / "limit" / "result.json").read_text())
-    assert result["status"] == "iteration_limit"
-    assert "iterations" in result["message"]
-    assert result["parameters"]["shoulder.stiffness"]["value"] > 0
-    assert (tmp_path / "limit" / "report.html").is_file()
-    assert "run folder: limit" in done.out
+def test_a_solve_that_does_not_converge(carried_out, pendulum):
+    settings = ("solver.max_iterations=1", "solver.name=steepest_descent")
+    done = carried_out("solve", pendulum, settings=settings, codes=(1,))
+    assert done.result["status"] == "iteration_limit"
+    assert "iterations" in done.result["message"]
+    assert done.result["parameters"]["shoulder.stiffness"]["value"] > 0
+    assert (done.folder / "report.html").is_file()
+    assert "run folder: run" in done.out
 
 
-def test_a_rollout_that_fails_leaves_reason_and_best_point(cli, pendulum, tmp_path, monkeypatch):
+def test_a_rollout_that_fails_leaves_reason_and_best_point(carried_out, pendulum, monkeypatch):
     told = "estimate: step 3: Newton did not converge"
     monkeypatch.setattr(EpisodePredictor, "predict_episodes", lambda predictor, asked, derivatives: [told] * len(asked))
-    done = cli("solve", pendulum, "--out", "failed")
-    assert done.code == 1
-    result = json.loads((tmp_path / "failed" / "result.json").read_text(), parse_constant=pytest.fail)
+    done = carried_out("solve", pendulum, codes=(1,))
+    result = done.result
     assert result["status"] == "failed"
     assert "step 3" in result["message"]
     assert result["parameters"]["shoulder.stiffness"]["std"] is None
     assert any("std" in note for note in result["notes"])
     assert "could not be predicted" in done.out
     assert "found" not in done.out.split("held-out")[0]
-    assert (tmp_path / "failed" / "report.html").is_file()
+    assert (done.folder / "report.html").is_file()
 
 
 def test_a_bug_is_told_from_wrong_input(cli, pendulum, left_nothing, monkeypatch):
@@ -96,12 +92,8 @@ sys.exit(main(sys.argv[1:]))
 @pytest.mark.skipif(os.name != "posix", reason="signals as on POSIX")
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_an_interrupted_or_killed_run_does_not_look_finished(pendulum, tmp_path, how):
-    process = subprocess.Popen(
-        [sys.executable, "-c", WAITING, "solve", str(pendulum)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "-c", WAITING, "solve", str(pendulum)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout.readline().strip() == "SOLVING"
     assert [path.name[0] for path in (tmp_path / "runs").iterdir()] == ["."]
     process.send_signal(how)

@@ -91,7 +91,7 @@ def test_names_that_are_not_there_are_refused(cli, repository, tmp_path, left_no
     left_nothing()
 
 
-def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, monkeypatch):
+def test_a_failed_solve_leaves_no_point_to_judge_at(carried_out, repository, monkeypatch):
     from yid_ocp.solvers import GaussNewton, Status, solve
     from yid_ocp.workflow import solve as solve_command
 
@@ -100,11 +100,10 @@ def test_a_failed_solve_leaves_no_point_to_judge_at(cli, repository, tmp_path, m
         return replace(done, status=Status.FAILED, message="the rollout failed", evaluation=None)
 
     monkeypatch.setattr(solve_command, "solve", failing)
-    done = cli("identifiability", repository / "configs" / "springs_series_ends.yaml", "--out", tmp_path / "run")
-    assert done.code == 1
+    done = carried_out("identifiability", repository / "configs" / "springs_series_ends.yaml", codes=(1,))
     assert "failed: the rollout failed; there is no point at which to judge" in done.out
-    assert json.loads((tmp_path / "run" / "result.json").read_text())["parameters"] == {}
-    assert "there is no point at which to judge" in (tmp_path / "run" / "report.html").read_text()
+    assert done.result["parameters"] == {}
+    assert "there is no point at which to judge" in (done.folder / "report.html").read_text()
 
 
 @pytest.mark.parametrize("named", ["pendulum", "springs_torsion", "springs_series_joint"])
@@ -148,8 +147,13 @@ def read(outcome):
     return {key: told[key] for key in KEYS}
 
 
-def test_workers_find_what_one_process_does(repository, tmp_path):
-    run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
+@pytest.fixture
+def run(repository):
+    """Two springs in series that can be told apart."""
+    return load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
+
+
+def test_workers_find_what_one_process_does(run, tmp_path):
     known = {"start_knowledge": "unknown", "grasp_offset_std": 0.01}
     asked = IdentifiabilityOptions(interval_parameters="all", rank_changes=True, **known)
     alone = run_identifiability(run, tmp_path / "alone", options=asked)
@@ -158,8 +162,7 @@ def test_workers_find_what_one_process_does(repository, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"alone", "shared"}
 
 
-def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
-    run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
+def test_an_interrupted_run_goes_on(run, tmp_path, monkeypatch):
     names, done = [], identifiability_command.profile_likelihood_task
 
     def twice(name, **arguments):
@@ -179,13 +182,12 @@ def test_an_interrupted_run_goes_on(repository, tmp_path, monkeypatch):
     assert not (tmp_path / "run.partial").exists()
 
 
-def test_a_part_that_fails_is_said(repository, tmp_path, monkeypatch):
+def test_a_part_that_fails_is_said(run, tmp_path, monkeypatch):
     def failing(name, **arguments):
         raise SolverError(f"no {name}", hint="mend it")
 
     failing.__module__, failing.__qualname__ = "yid_ocp.workflow.identifiability", "profiled"
     monkeypatch.setattr(identifiability_command, "profile_likelihood_task", failing)
-    run = load_config(repository / "configs" / "springs_series_joint.yaml", QUICK)
     words = r"2 of 2 tasks failed, spring_1.stiffness with SolverError: no spring_1.stiffness(.|\n)*mend it"
     with pytest.raises(WorkerError, match=words):
         run_identifiability(run, tmp_path / "run", options=EVERY, workers=InlineExecutor())
@@ -198,10 +200,8 @@ def test_the_other_arm_of_a_robot(repository):
     assert both is not None
     assert both.driven[:7] == system.driven
     assert both.driven[7:] == tuple(name.replace("left_", "right_") for name in system.driven)
-    assert [(grasp.name, grasp.holder_frame, grasp.held_frame) for grasp in both.grasps] == [
-        ("left", "left_gripper", "w_T2"),
-        ("right", "right_gripper", "w_T3"),
-    ]
+    found = {grasp.name: (grasp.holder_frame, grasp.held_frame) for grasp in both.grasps}
+    assert found == {"left": ("left_gripper", "w_T2"), "right": ("right_gripper", "w_T3")}
     assert system_with_second_arm(load_config(repository / "configs" / "dual_arm_vision.yaml"), both) is None
     moved = replace(run, model=replace(run.model, arms=replace(run.model.arms, mode="prescribed")))
     assert system_with_second_arm(moved, system) is None

@@ -32,7 +32,7 @@ track:
   n_drawn_frames: 1
   options: {{calibration: {{fix_pose: true}}, clock: {{search_half_width: 0}}}}
 """
-PLAIN = ("--set", "output.write_report=false")
+PLAIN, UNDRAWN = "output.write_report=false", "track.n_drawn_frames=0"
 
 
 @pytest.fixture(scope="module")
@@ -86,24 +86,21 @@ def test_track_makes_a_recording_that_solve_reads(whole, small, system):
     ],
 )
 def test_wrong_input_is_said_and_leaves_nothing(cli, config, tmp_path, settings, message):
-    arguments = [part for setting in settings for part in ("--set", setting)]
-    done = cli("track", config, "--out", tmp_path / "run", *arguments)
+    done = cli("track", config, "--out", tmp_path / "run", settings=settings)
     assert done.code == 2
     assert message in done.err
     assert "Traceback" not in done.err
     assert not (tmp_path / "run").exists()
 
 
-def test_without_a_good_frame_the_reasons_and_pictures_are_left(cli, config, tmp_path):
-    done = cli("track", config, "--out", tmp_path / "run", "--set", "track.length_unit=mm", *PLAIN)
-    assert done.code == 2
+def test_without_a_good_frame_the_reasons_and_pictures_are_left(carried_out, config, tmp_path):
+    done = carried_out("track", config, settings=("track.length_unit=mm", PLAIN), codes=(2,))
     assert "not one frame could be used" in done.err
-    assert str(tmp_path / "run") in done.err
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
-    assert "not one frame" in result["refused"]
-    assert all("no point lies where the object can be" in frame["reason"] for frame in result["frames"])
-    assert len(list((tmp_path / "run" / "pictures").glob("*_cloud.png"))) == 1
-    assert not (tmp_path / "run" / "recording.h5").exists()
+    assert str(done.folder) in done.err
+    assert "not one frame" in done.result["refused"]
+    assert all("no point lies where the object can be" in frame["reason"] for frame in done.result["frames"])
+    assert len(list((done.folder / "pictures").glob("*_cloud.png"))) == 1
+    assert not (done.folder / "recording.h5").exists()
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
 
 
@@ -117,7 +114,9 @@ def result_of(folder):
     return result
 
 
-def test_what_an_interrupted_run_did_is_used_and_several_workers_do_the_rest(cli, config, whole, tmp_path, monkeypatch):
+def test_what_an_interrupted_run_did_is_used_and_workers_do_the_rest(
+    cli, carried_out, config, whole, tmp_path, monkeypatch
+):
     """Killed after the first frame: the next run does the others alone, with the same result to the last bit."""
     worked, work = [], FrameTracker.process_frame
 
@@ -132,33 +131,28 @@ def test_what_an_interrupted_run_did_is_used_and_several_workers_do_the_rest(cli
     assert not (tmp_path / "run").exists()
     assert (tmp_path / "run.partial").is_dir()
     monkeypatch.setattr(FrameTracker, "calibrate_sequence", None)  # it is known
-    quick = (*PLAIN, "--set", "track.n_drawn_frames=0", "--workers", "2")
-    again = cli("track", config, "--out", tmp_path / "run", *quick)
-    assert again.code == 0, again.err
-    spent = [frame["seconds"] for frame in json.loads((tmp_path / "run" / "result.json").read_text())["frames"]]
-    assert spent[0] == worked[0].cpu_seconds
+    again = carried_out("track", config, "--workers", "2", settings=(PLAIN, UNDRAWN))
+    assert again.result["frames"][0]["seconds"] == worked[0].cpu_seconds
     assert not (tmp_path / "run.partial").exists()
-    assert result_of(tmp_path / "run") == result_of(whole.folder)
-    one, other = (read_recording(folder / "recording.h5").points[-1] for folder in (tmp_path / "run", whole.folder))
+    assert result_of(again.folder) == result_of(whole.folder)
+    one, other = (read_recording(folder / "recording.h5").points[-1] for folder in (again.folder, whole.folder))
     assert np.array_equal(one.position, other.position)
     assert np.array_equal(one.std, other.std)
 
 
 @pytest.mark.parametrize("name", ["track_single_arm", "track_dual_arm"])
-def test_the_examples_run(cli, repository, tmp_path, name):
+def test_the_examples_run(carried_out, repository, name):
     pytest.importorskip("mujoco", reason="virtual experiments need MuJoCo")
     file = repository / "configs" / f"{name}.yaml"
     short = ("virtual_frames.duration=1.0", "virtual_frames.frame_rate=4.0", "virtual_frames.dropped_fraction=0.0")
-    coarse = ("options.filters.voxel_size=0.014", "options.calibration.n_frames=3")
-    arguments = [part for setting in (*short, *coarse) for part in ("--set", f"track.{setting}")]
-    quick = ("--quiet", *PLAIN, "--set", "track.n_drawn_frames=0", "--set", "track.keep_frames=true")
-    done = cli("track", file, "--out", tmp_path / "run", *arguments, *quick)
-    assert done.code == 0, done.err
-    assert done.out.strip() == str(tmp_path / "run")
-    result = json.loads((tmp_path / "run" / "result.json").read_text())
+    coarse = ("options.filters.voxel_size=0.014", "options.calibration.n_frames=3", "keep_frames=true")
+    settings = [f"track.{setting}" for setting in (*short, *coarse)]
+    done = carried_out("track", file, "--quiet", settings=(*settings, PLAIN, UNDRAWN))
+    assert done.out.strip() == str(done.folder)
+    result = done.result
     assert all(entry["largest"] < 0.015 for entry in result["truth_errors"].values())
     assert set(result["truth_errors"]) == ({"w_T1", "w_T3"} if name == "track_single_arm" else {"w_T1"})
-    assert len(list((tmp_path / "run" / "frames").glob("*.ply"))) == len(result["frames"])
+    assert len(list((done.folder / "frames").glob("*.ply"))) == len(result["frames"])
 
 
 def test_a_flag_keeps_the_told_pose(repository):

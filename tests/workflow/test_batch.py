@@ -116,9 +116,8 @@ def test_what_cannot_be_a_batch_is_refused(pendulum, tmp_path):
 
 def test_the_command_runs_the_fleet_in_processes(cli, pendulum, fleet, tmp_path):
     (fleet / "spoiled.h5").unlink()
-    settings = [part for setting in QUICK for part in ("--set", setting)]
-    given = (pendulum, "--recordings", fleet / "*.h5", *settings, "--out", "fleet_runs")
-    done = cli("batch", *given, "--workers", 1)
+    given = (pendulum, "--recordings", fleet / "*.h5", "--out", "fleet_runs")
+    done = cli("batch", *given, "--workers", 1, settings=QUICK)
     assert done.code == 0, done.err
     assert "2 runs: 2 converged." in done.out
     assert "shoulder.stiffness" in done.out
@@ -191,8 +190,7 @@ def test_what_cannot_be_proved_is_refused(driven, pendulum, tmp_path, cli, monke
         run_blind([driven], tmp_path / "proof", 2, -1, workers=InlineExecutor())
     assert not (tmp_path / "proof").exists()
     monkeypatch.setattr("yid_ocp.parallel.resumable_tasks._CONNECT_TIMEOUT", 0.5)
-    options = [part for setting in SETTINGS for part in ("--set", setting)]
-    done = cli("blind", pendulum, *options, "--scheduler", "127.0.0.1:1", "--out", tmp_path / "proof")
+    done = cli("blind", pendulum, "--scheduler", "127.0.0.1:1", "--out", tmp_path / "proof", settings=SETTINGS)
     assert done.code == 2
     assert "no scheduler answers" in done.err
 
