@@ -45,31 +45,19 @@ def test_the_papers_systems(repository, paper_systems, name, size, constraints):
     assert system.parameters.vector({"T1.bend": 22.0})[system.parameters.index("T1.bend")] == 22.0
 
 
-def test_parameters_of_a_run(written):
-    run = load_config(
-        written(
-            "model: {object: {kind: foam_y}}\n"
-            "parameters:\n"
-            "  T*.bend: {initial: 5, free: true, bounds: [0, 50]}\n"
-            "  T2.bend: {initial: 7}\n"
-            "  T1.mass: {initial: 0.07}\n"
-        )
-    )
-    system = build_system(run)
-    assert [system.parameters[f"T{i}.bend"].value for i in (1, 2, 3)] == [5, 7, 5]
-    assert system.parameters["T3.bend"].upper == 50
-    assert system.parameters["T1.mass"].value == 0.07
+def test_parameters_of_a_run(built):
+    given = "T*.bend: {initial: 5, free: true, bounds: [0, 50]}, T2.bend: {initial: 7}, T1.mass: {initial: 0.07}"
+    parameters = built(f"model: {{object: {{kind: foam_y}}}}\nparameters: {{{given}}}\n").parameters
+    assert [parameters[f"T{i}.bend"].value for i in (1, 2, 3)] == [5, 7, 5]
+    assert parameters["T3.bend"].upper == 50
+    assert parameters["T1.mass"].value == 0.07
 
 
 def test_an_object_of_segments_on_a_robots_hand(built):
     text = (
-        "model:\n"
-        "  robot: package:panda\n"
-        "  arms:\n"
-        f"    joints: [{', '.join(f'panda_joint{i}' for i in range(1, 8))}]\n"
-        "    mode: prescribed\n"
-        "  object:\n"
-        "    kind: segments\n"
+        "model:\n  robot: package:panda\n"
+        f"  arms: {{mode: prescribed, joints: [{', '.join(f'panda_joint{i}' for i in range(1, 8))}]}}\n"
+        "  object:\n    kind: segments\n"
         "    mount: {parent_frame: panda_hand, xyz: [0, 0, 0.1], rpy: [0, 1.5708, 0]}\n"
         "    segments:\n"
         "      beam: {length: 0.5, mass: 0.3, radius: 0.01, links: 5, "
@@ -111,13 +99,10 @@ def test_springs_on_joints(built, urdf_folder):
 
 
 EFFECTS = (
-    "model:\n"
-    "  object: {kind: foam_y}\n"
-    "  effects:\n"
+    "model:\n  object: {kind: foam_y}\n  effects:\n"
     "    - {kind: kelvin_voigt, location: T3}\n"
     "    - {kind: density, location: T2, values: {scale: 1.1}}\n"
-    "parameters:\n"
-    "  kelvin_voigt@T3.tau: {free: true, initial: 0.02}\n"
+    "parameters:\n  kelvin_voigt@T3.tau: {free: true, initial: 0.02}\n"
 )
 
 
@@ -217,14 +202,12 @@ def test_damping_by_joint_says_that_of_the_object_too(built, urdf_folder):
 
 
 def test_a_problem_has_the_options_of_its_section(written):
-    run = load_config(
-        written(
-            "model: {object: {kind: foam_y}}\n"
-            "sensors: {points: {std: 0.1}}\n"
-            "problem: {weighting: paper, huber_threshold: 3, start_fit_parameters: [T1.mass], duration: 2}\n"
-            "parameters: {T1.bend: {prior_std: 2, per_recording: true}}\n"
-        )
+    text = (
+        "model: {object: {kind: foam_y}}\nsensors: {points: {std: 0.1}}\n"
+        "problem: {weighting: paper, huber_threshold: 3, start_fit_parameters: [T1.mass], duration: 2}\n"
+        "parameters: {T1.bend: {prior_std: 2, per_recording: true}}\n"
     )
+    run = load_config(written(text))
     options = problem_options(run, build_system(run))
     assert (options.weighting, options.huber_threshold, options.duration) == ("paper", 3.0, 2.0)
     assert (options.start_fit_parameters, options.local_parameters) == (("T1.mass",), ("T1.bend",))
@@ -316,17 +299,13 @@ def fitted() -> tuple[EstimationProblem, np.ndarray]:
 
 def test_a_real_geared_servo_is_predicted(fitted) -> None:
     problem, x = fitted
-    errors = [
-        float(np.sqrt(np.mean((found.predicted_outputs[0] - episode.measurements[0].value) ** 2)))
-        for episode, found in problem.predict_held_out(x)
-    ]
-    assert np.mean(errors) < 0.035  # [rad]
-    drops = [
-        float(np.sqrt(np.mean((found.predicted_outputs[0] - episode.measurements[0].value) ** 2)))
-        for episode, found in zip(problem.episodes, problem.evaluate(x, False).episode_predictions, strict=True)
-        if episode.name.startswith("drop")
-    ]
-    assert max(drops) < 0.030
+
+    def rmse(episode, found) -> float:
+        return float(np.sqrt(np.mean((found.predicted_outputs[0] - episode.measurements[0].value) ** 2)))
+
+    assert np.mean([rmse(*held_out) for held_out in problem.predict_held_out(x)]) < 0.035  # [rad]
+    told = zip(problem.episodes, problem.evaluate(x, False).episode_predictions, strict=True)
+    assert max(rmse(*drop) for drop in told if drop[0].name.startswith("drop")) < 0.030
     inertia = 0.49 * 0.1**2 + problem.named_values(x)["rotor_inertia@joint.armature"]
     assert 0.0064 < inertia < 0.0073
 

@@ -57,15 +57,16 @@ def settings(folder, recording=None, overrides=()):
     return load_config(folder / "beam.yaml", overrides)
 
 
-def test_a_marker_sits_where_straight_says_in_the_frame_that_carries_it(tmp_path):
-    system = build_system(settings(tmp_path))
+@pytest.fixture
+def run(tmp_path):
+    return settings(tmp_path)
+
+
+def test_every_recording_has_its_own_places_of_markers_in_the_frame_that_carries_them(run):
+    system = build_system(run)
     found = [system.parameters[f"mark.{axis}"].value for axis in "xyz"]
     # the link's z axis is the world's x, its x axis looks down
     assert found == pytest.approx([-0.02, 0.0, 0.0], abs=1e-9)
-
-
-def test_every_recording_has_its_own_places_of_markers(tmp_path):
-    run = settings(tmp_path)
     other = replace(blank(STRAIGHT + np.array([0.0, 0.005, 0.0])), name="other")
     problem = build_problem(run, reference_recordings=[other])
     assert problem.options.parameters_by_recording["beam"]["mark.y"] == pytest.approx(0.0, abs=1e-9)
@@ -121,23 +122,16 @@ def test_without_a_recording_nothing_moves_an_object_alone(tmp_path):
 def folder_of(path, values=(0.02, 5e-5), std=(2e-4, 1e-6), correlation=0.5, **more):
     """A run folder of `solve` as far as a baseline reads it."""
     path.mkdir()
-    c = correlation * std[0] * std[1]
-    result = {
-        "format": "yid-solve/1",
-        "status": "converged",
-        "fit": {"explains": True},
-        "parameters": {
-            name: {"value": v, "std": s, "unit": "", "free": True}
-            for name, v, s in zip(("beam.bend", "beam.damping"), values, std, strict=True)
-        },
-        "covariance": {"names": ["beam.bend", "beam.damping"], "matrix": [[std[0] ** 2, c], [c, std[1] ** 2]]},
-    }
+    c, names = correlation * std[0] * std[1], ["beam.bend", "beam.damping"]
+    covariance = {"names": names, "matrix": [[std[0] ** 2, c], [c, std[1] ** 2]]}
+    entries = [{"value": v, "std": s, "unit": "", "free": True} for v, s in zip(values, std, strict=True)]
+    result = {"format": "yid-solve/1", "status": "converged", "fit": {"explains": True}, "covariance": covariance}
+    result["parameters"] = dict(zip(names, entries, strict=True))
     (path / "result.json").write_text(json.dumps(result | more), encoding="utf-8")
     return path
 
 
-def test_a_baseline_is_a_joint_prior_about_its_values(tmp_path):
-    run = settings(tmp_path)
+def test_a_baseline_is_a_joint_prior_about_its_values(run, tmp_path):
     known = run_history.read_estimates(folder_of(tmp_path / "old", values=(0.018, 4e-5)))
     problem = with_baseline_prior(build_problem(run), known)
     at = [problem.unknown_names.index(name) for name in ("beam.bend", "beam.damping")]
@@ -150,12 +144,9 @@ def test_a_baseline_is_a_joint_prior_about_its_values(tmp_path):
     assert rows @ (moved - problem.initial_unknowns) == pytest.approx(residual, rel=1e-9)
 
 
-def test_the_baselines_effects_stay_in_the_model(tmp_path):
-    run = settings(tmp_path)
-    known = RunEstimates(
-        "old", ("kelvin_voigt@beam.tau",), np.array([0.01]), np.array([[1e-6]]),
-        effects={"kelvin_voigt@beam": {"tau": 0.01}},
-    )  # fmt: skip
+def test_the_baselines_effects_stay_in_the_model(run):
+    values = ("kelvin_voigt@beam.tau",), np.array([0.01]), np.array([[1e-6]])
+    known = RunEstimates("old", *values, effects={"kelvin_voigt@beam": {"tau": 0.01}})
     with pytest.raises(ConfigError, match="the effect kelvin_voigt@beam"):
         with_baseline_prior(build_problem(run), known)
     problem = with_baseline_prior(build_problem(run_history.settings_with_baseline_effects(run, (known,))), known)

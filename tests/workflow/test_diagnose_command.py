@@ -165,12 +165,7 @@ STATED = {
     "joints.position": SensorOptions(std=1e-3),
 }
 
-PRESCRIBED = {
-    "path_cutoff": float("inf"),
-    "initial_state": "estimated",
-    "weak_prior_factor": 7.0,
-    "huber_threshold": 1.5,
-}
+PRESCRIBED = {"path_cutoff": np.inf, "initial_state": "estimated", "weak_prior_factor": 7.0, "huber_threshold": 1.5}
 
 
 @pytest.fixture(scope="module")
@@ -196,36 +191,31 @@ def problem_of(urdf_folder):
     return build
 
 
-def settings(share=SHARE):
-    def refuse(what, *where, **more):
-        return ConfigError(what, where=".".join(where), **more)
-
-    return SimpleNamespace(diagnosis=SimpleNamespace(noise_fraction_of_std=share), config_error=refuse)
+SETTINGS = SimpleNamespace(
+    diagnosis=SimpleNamespace(noise_fraction_of_std=SHARE),
+    config_error=lambda what, *where, **more: ConfigError(what, where=".".join(where), **more),
+)
 
 
 @pytest.mark.parametrize("encoders", [False, True])
 def test_errors_of_torques_shrink_like_all_other_noise(problem_of, encoders):
     position = replace(STATED["joints.position"], use=True if encoders else None)
     problem = problem_of("driven", STATED | {"joints.position": position})
-    shrunk = _with_noise_only_stds(problem, settings())
+    shrunk = _with_noise_only_stds(problem, SETTINGS)
     x = problem.initial_unknowns * 1.1
-    one, other = (problem_whitened_at(made, x, rounds=2) for made in (problem, shrunk))
-    before, after = one.evaluate(x), other.evaluate(x)
-    assert one.whitening_filters[0] is not None
-    assert other.whitening_filters[0] is not None
+    both = [problem_whitened_at(made, x, rounds=2) for made in (problem, shrunk)]
+    before, after = (made.evaluate(x) for made in both)
+    assert all(made.whitening_filters[0] is not None for made in both)
     np.testing.assert_allclose(after.residual, before.residual / SHARE, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(after.jacobian, before.jacobian / SHARE, rtol=1e-6, atol=1e-6)
-    (value, std), (smaller_value, smaller_std) = (
-        torque_biases_and_stds_by_recording(one, x)[0],
-        torque_biases_and_stds_by_recording(other, x)[0],
-    )
+    (value, std), (smaller_value, smaller_std) = (torque_biases_and_stds_by_recording(made, x)[0] for made in both)
     np.testing.assert_allclose(smaller_value, value, rtol=1e-6)
     np.testing.assert_allclose(smaller_std, SHARE * std, rtol=1e-6)
 
 
 def test_every_row_is_so_many_times_larger_and_the_fit_the_same(problem_of):
     problem = problem_of("prescribed")
-    shrunk = _with_noise_only_stds(problem, settings())
+    shrunk = _with_noise_only_stds(problem, SETTINGS)
     rows = problem.residual_rows
     assert shrunk.residual_rows == rows
     assert [part.stop - part.start for part in (rows.stated_priors, rows.weak_priors)] == [3, 1]
@@ -240,25 +230,23 @@ def test_every_row_is_so_many_times_larger_and_the_fit_the_same(problem_of):
 
 def test_no_weak_prior_stays_none_and_encoders_without_noise_need_none(problem_of):
     sensors = {"points": STATED["points"], "joints.effort": SensorOptions(std=0.3)}
-    shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, None, weak_prior_factor=0.0), settings())
+    shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, None, weak_prior_factor=0.0), SETTINGS)
     assert shrunk.options.weak_prior_factor == 0.0
     assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)
 
 
 @pytest.mark.parametrize(
-    ("role", "group", "entry", "words"),
+    ("role", "group", "entry", "missing"),
     [
-        ("driven", "joints.effort", SensorOptions(bias_std=0.4), "noise in the std of 'joints.effort'"),
-        ("driven", "joints.effort", SensorOptions(std=0.2), "noise in the bias_std of 'joints.effort'"),
-        ("driven", "joints.position", SensorOptions(), "noise in the std of 'joints.position'"),
-        ("prescribed", "points", SensorOptions(), "noise in the std of 'points'"),
-        ("prescribed", "joints.effort", SensorOptions(), "noise in the std of 'joints.effort'"),
-        ("prescribed", "joints.position", SensorOptions(), "noise in the std of 'joints.position'"),
+        ("driven", "joints.effort", SensorOptions(bias_std=0.4), "std"),
+        ("driven", "joints.effort", SensorOptions(std=0.2), "bias_std"),
+        ("driven", "joints.position", SensorOptions(), "std"),
+        *(("prescribed", group, SensorOptions(), "std") for group in STATED),
     ],
 )
-def test_a_fraction_of_what_is_not_stated_is_refused(problem_of, role, group, entry, words):
-    with pytest.raises(ConfigError, match=words):
-        _with_noise_only_stds(problem_of(role, STATED | {group: entry}), settings())
+def test_a_fraction_of_what_is_not_stated_is_refused(problem_of, role, group, entry, missing):
+    with pytest.raises(ConfigError, match=f"noise in the {missing} of '{group}'"):
+        _with_noise_only_stds(problem_of(role, STATED | {group: entry}), SETTINGS)
 
 
 def test_a_diagnosis_leaves_a_run_folder(carried_out, pendulum):

@@ -85,11 +85,8 @@ def test_an_unnamed_one_is_numbered_and_its_name_reserved_from_the_start(setting
 
 
 def test_a_name_that_another_run_has_is_refused_before_the_work(settings, tmp_path):
-    with (
-        atomic_run_folder(settings, tmp_path / "run"),
-        pytest.raises(OutputError, match="another run"),
-        atomic_run_folder(settings, tmp_path / "run"),
-    ):
+    taken = pytest.raises(OutputError, match="another run")
+    with atomic_run_folder(settings, tmp_path / "run"), taken, atomic_run_folder(settings, tmp_path / "run"):
         pass
     assert (tmp_path / "run" / "log.jsonl").is_file()
 
