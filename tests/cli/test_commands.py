@@ -68,9 +68,8 @@ def test_solve_finds_what_the_efforts_say(cli, pendulum, pendulum_data, tmp_path
     assert done.code == 0, done.err
     [folder] = (tmp_path / "runs").iterdir()
     assert folder.name.startswith("pendulum-20")
-    assert {entry.name for entry in folder.iterdir()} >= {
-        "config.yaml", "result.json", "trajectories.h5", "report.html", "log.jsonl"
-    }  # fmt: skip
+    files = {"config.yaml", "result.json", "trajectories.h5", "report.html", "log.jsonl"}
+    assert {entry.name for entry in folder.iterdir()} >= files
 
     result = json.loads((folder / "result.json").read_text(), parse_constant=pytest.fail)
     assert set(result) == SOLVE_KEYS
@@ -178,8 +177,7 @@ def test_errors_are_json_where_that_is_asked_for(cli, pendulum, tmp_path, monkey
     bug = cli("check", pendulum, "--json")
     said = json.loads(bug.out)
     assert (bug.code, said["exit_code"], said["kind"], said["what"]) == (3, 3, "bug", "ZeroDivisionError: no good")
-    assert pathlib.Path(said["where"]).is_file()
-    pathlib.Path(said["where"]).unlink()
+    pathlib.Path(said["where"]).unlink()  # which is there
 
     def stopped(arguments):
         raise KeyboardInterrupt
@@ -245,15 +243,9 @@ def test_check_says_what_kind_of_torque_is_assumed(carried_out, pendulum, pendul
 
 
 def test_check_refines_links_and_time_step(carried_out, written):
+    beam = "{length: 0.5, mass: 0.3, radius: 0.01, stiffness_per_curvature: true, clamped_at_base: true}"
     file = written(
-        "model:\n"
-        "  object:\n"
-        "    kind: segments\n"
-        "    segments:\n"
-        "      beam:\n"
-        "        {length: 0.5, mass: 0.3, radius: 0.01, stiffness_per_curvature: true, clamped_at_base: true}\n"
-        "  damping: 0.001\n"
-        "  gravity: [0, 0, 0]\n"
+        f"model: {{object: {{kind: segments, segments: {{beam: {beam}}}}}, damping: 0.001, gravity: [0, 0, 0]}}\n"
         "parameters: {beam.bend: {initial: 0.5}, beam.twist: {initial: 0.5}}\n"
     )
     done = carried_out("check", file)
@@ -325,8 +317,7 @@ def test_inspect_agrees_with_finite_differences(carried_out, written, urdf_folde
     )
     result = carried_out("inspect", file).result
     assert all(error < 1e-6 for error in result["linearisation"]["finite_difference_errors"].values())
-    assert result["equations"]["unknowns"] == 2
-    assert result["equations"]["jacobian_nonzeros"] == 4
+    assert (result["equations"]["unknowns"], result["equations"]["jacobian_nonzeros"]) == (2, 4)
 
 
 @pytest.mark.parametrize(
@@ -368,8 +359,7 @@ def test_what_is_simulated_is_exported_and_imported(cli, pendulum_data, tmp_path
     # of prescribed joints: what they need at the nodes
     assert recording.joints.effort_kind == "sample"
     assert recording.true_parameters["shoulder.stiffness"] == pendulum_data.truth["shoulder.stiffness"]
-    exported = cli("export", pendulum_data.folder / "estimate.h5", "--out", tmp_path / "csv")
-    assert exported.code == 0, exported.err
+    assert cli("export", pendulum_data.folder / "estimate.h5", "--out", tmp_path / "csv").code == 0
     done = cli("import", next((tmp_path / "csv").glob("*.csv")), "--out", tmp_path / "back.h5")
     assert done.code == 0, done.err
     back = read_recording(tmp_path / "back.h5", allow_nan_effort=True)
@@ -393,8 +383,7 @@ def test_every_shell_has_its_script(cli, shell):
     done = cli("completion", shell)
     assert (done.code, done.err) == (0, "")
     assert "yid-ocp" in done.out
-    program = shutil.which(shell)
-    if program is not None:
+    if program := shutil.which(shell):
         checked = subprocess.run([program, "-n"], input=done.out, text=True, capture_output=True, check=False)
         assert (checked.returncode, checked.stderr) == (0, "")
 

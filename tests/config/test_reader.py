@@ -82,6 +82,7 @@ def test_settings_over_the_file_keep_what_they_do_not_touch():
 
 
 METHOD = "compare.methods.multiple_shooting"
+CODE_ONLY = "first_trial_step_rule"
 METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n      VALUE\n"
 
 
@@ -121,10 +122,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         # compared methods are typed like the solver
         (METHODS.replace("VALUE", "max_iterations: abc"), [f"{METHOD}.max_iterations", "number from 1", "line 5"]),
         (METHODS.replace("VALUE", "max_iteration: 3"), [f"'max_iteration' in {METHOD}", "mean 'max_iterations'?"]),
-        (
-            METHODS.replace("VALUE", "first_trial_step_rule: last"),
-            ["no key 'first_trial_step_rule'", "node_interval", "line 5"],
-        ),
+        (METHODS.replace("VALUE", f"{CODE_ONLY}: last"), [f"no key '{CODE_ONLY}'", "node_interval", "line 5"]),
         (METHODS.replace("VALUE", "name: multiple_shooting"), ["there is no key 'name'"]),
         ("compare: {methods: {newton: {}}}\n", ["no solver 'newton'", "'gauss_newton'?", "1: compare.methods.newton"]),
     ],

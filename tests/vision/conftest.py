@@ -56,13 +56,9 @@ def run(system):
     from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
     from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 
-    posture = grasping_joint_angles(system, TRUTH)
-    motion = random_multisine_motion(
-        system, TRUTH, seed=1, initial_joint_angles=posture, excitation=MultisineOptions(gripper_travel=0.15)
-    )
-    return simulate_in_mujoco(
-        system, TRUTH, motion, SimulationOptions(3.0, time_step=2.5e-4), initial_joint_angles=posture
-    )
+    start = {"initial_joint_angles": grasping_joint_angles(system, TRUTH)}
+    motion = random_multisine_motion(system, TRUTH, seed=1, excitation=MultisineOptions(gripper_travel=0.15), **start)
+    return simulate_in_mujoco(system, TRUTH, motion, SimulationOptions(3.0, time_step=2.5e-4), **start)
 
 
 @pytest.fixture(scope="session")

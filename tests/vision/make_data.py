@@ -26,16 +26,11 @@ VOXEL = 0.011
 
 def main() -> None:
     system = baxter_foam_y_system(1)
-    posture = grasping_joint_angles(system)
-    motion = random_multisine_motion(
-        system, seed=1, initial_joint_angles=posture, excitation=MultisineOptions(gripper_travel=0.15)
-    )
-    run = simulate_in_mujoco(
-        system, None, motion, SimulationOptions(1.5, time_step=2.5e-4), initial_joint_angles=posture
-    )
-    camera = vision.VirtualCamera(
-        vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1]), timing=vision.FrameTiming(mean_rate=2.7), seed=5
-    )
+    start = {"initial_joint_angles": grasping_joint_angles(system)}
+    motion = random_multisine_motion(system, seed=1, excitation=MultisineOptions(gripper_travel=0.15), **start)
+    run = simulate_in_mujoco(system, None, motion, SimulationOptions(1.5, time_step=2.5e-4), **start)
+    pose = vision.look_at_pose([2.6, 0.0, 0.45], [0.85, 0.0, -0.1])
+    camera = vision.VirtualCamera(pose, timing=vision.FrameTiming(mean_rate=2.7), seed=5)
     made = vision.render_virtual_frames(vision.CameraScene(system, "package:baxter"), run.t, run.q, camera)
     tree = system.numeric_mechanism()
     robot = ArticulatedSurfaces(tree, load_robot_meshes("package:baxter", tree))
@@ -54,10 +49,7 @@ def main() -> None:
     joints = JointGroup(names, run.t[every], np.round(run.q[every, : len(names)], 6), position_std=2e-4)
     write_recording(Recording(joints, description="Joints beside three clouds.", source="test"), FOLDER / "joints.h5")
     shape = ShapeFitter(system)
-    truth = {
-        "points": system.point_frames,
-        "position": [np.round(shape.points_at(q), 5).tolist() for q in true],
-    }
+    truth = {"points": system.point_frames, "position": [np.round(shape.points_at(q), 5).tolist() for q in true]}
     (FOLDER / "truth.json").write_text(json.dumps(truth) + "\n")
 
 

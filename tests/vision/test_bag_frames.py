@@ -15,6 +15,7 @@ COLOURS = [np.random.default_rng(i).integers(0, 256, (5 + i, 3)).astype(np.uint8
 DEPTH = np.arange(1200, 1200 + 6 * 8, dtype=np.uint16).reshape(6, 8)
 DEPTH[0, :2] = 0
 LENS = CameraIntrinsics(8, 6, 10.0, 11.0, 3.5, 2.5, "plumb_bob", (-0.2, 0.05, 1e-3, -1e-3, 0.0))
+NO_LENS = CameraIntrinsics(8, 6, 0, 0, 0, 0)
 STAMPS = (0.3, 0.1, 0.2)
 """Since the first joint states [s]; messages come out of order."""
 KINDS = ("bag", "db3 folder", "mcap folder")
@@ -61,12 +62,8 @@ class Film(Bag):
 
     def info(self, lens=LENS, topic="/camera/depth/camera_info", model=None):
         matrix = np.array([lens.fx, 0, lens.cx, 0, lens.fy, lens.cy, 0, 0, 1])
-        names = {
-            "k": matrix,
-            "d": np.array(lens.coefficients),
-            "r": np.eye(3).ravel(),
-            "p": np.array([2 * lens.fx, 0, lens.cx, 0, 0, 2 * lens.fy, lens.cy, 0, 0, 0, 1, 0]),
-        }
+        rectified = np.array([2 * lens.fx, 0, lens.cx, 0, 0, 2 * lens.fy, lens.cy, 0, 0, 0, 1, 0])
+        names = {"k": matrix, "d": np.array(lens.coefficients), "r": np.eye(3).ravel(), "p": rectified}
         if self.ros1:
             names = {key.upper(): value for key, value in names.items()}
         nothing = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
@@ -96,7 +93,7 @@ def test_depth_images_with_the_lens_of_the_camera(tmp_path, kind, encoding):
     image = DEPTH if encoding == "16UC1" else (1e-3 * DEPTH).astype(np.float32)
     with Film(tmp_path, kind) as bag:
         bag.info()
-        bag.info(CameraIntrinsics(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/camera/colour/camera_info")
+        bag.info(NO_LENS, topic="/camera/colour/camera_info")
         bag.image(0.5, image, encoding)
         bag.image(0.1, image, "rgb8", topic="/camera/colour/image_raw")
     sequence = read_frames(bag.path, pose=POSE)
@@ -120,7 +117,7 @@ def test_a_file_of_a_realsense_camera(tmp_path):
     sensor = "/device_0/sensor_0"
     with Film(tmp_path, "bag") as bag:
         bag.info(topic=f"{sensor}/Depth_0/info/camera_info")
-        bag.info(CameraIntrinsics(8, 6, 1.0, 1.0, 0.0, 0.0), topic="/device_0/sensor_1/Color_0/info/camera_info")
+        bag.info(NO_LENS, topic="/device_0/sensor_1/Color_0/info/camera_info")
         bag.put(f"{sensor}/option/Depth_Units/value", "std_msgs/msg/Float32", data=1e-4)
         bag.image(0.0, DEPTH, "mono16", topic=f"{sensor}/Depth_0/image/data")
         bag.image(0.0, DEPTH.astype(np.uint8), "rgb8", topic="/device_0/sensor_1/Color_0/image/data")
@@ -154,11 +151,7 @@ def test_messages_of_one_time_are_told_apart(tmp_path):
         (lambda bag: bag.joints(0), {}, "no clouds and no depth images"),
         (lambda bag: [bag.cloud(0, CLOUDS[0], topic=name) for name in ("/a", "/b")], {}, "2 topics of clouds"),
         (lambda bag: bag.image(0, DEPTH, "16UC1"), {}, "intrinsics are not known"),
-        (
-            lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(CameraIntrinsics(8, 6, 0, 0, 0, 0))],
-            {},
-            "is not calibrated",
-        ),
+        (lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(NO_LENS)], {}, "is not calibrated"),
         (lambda bag: [bag.image(0, DEPTH, "16UC1"), bag.info(model="odd")], {}, "the distortion is 'odd'"),
     ],
 )
@@ -180,13 +173,8 @@ def test_a_cloud_without_places_and_a_cut_off_one_are_bad_frames(tmp_path):
 
 
 def test_damaged_bags_and_other_files_are_refused(tmp_path):
-    for name, text in (("a.bag", b"#ROSBAG V2.0\nnonsense"), ("b.mcap", b"x" * 40), ("c.db3", b"")):
+    damaged = (("a.bag", b"#ROSBAG V2.0\nnonsense", "bag"), ("b.mcap", b"x" * 40, "bag"), ("c.db3", b"", "bag"))
+    for name, text, message in (*damaged, ("d.txt", b"", "no sequence of frames"), ("e.mkv", b"nothing", "film")):
         (tmp_path / name).write_bytes(text)
-        with pytest.raises(DataError, match="bag"):
+        with pytest.raises(DataError, match=message):
             read_frames(tmp_path / name, pose=POSE)
-    (tmp_path / "d.txt").write_bytes(b"")
-    with pytest.raises(DataError, match="no sequence of frames"):
-        read_frames(tmp_path / "d.txt", pose=POSE)
-    (tmp_path / "e.mkv").write_bytes(b"nothing")
-    with pytest.raises(DataError, match="film"):
-        read_frames(tmp_path / "e.mkv", pose=POSE)

@@ -125,11 +125,8 @@ def test_a_heap_beside_it_does_not_count_against_the_fit(alone, whole):
 def without(sight, links):
     """What is seen without the points and nodes of some links."""
     keep = ~np.isin(np.arange(12), links)
-    points, nodes = np.repeat(keep, len(sight.points) // 12), np.repeat(keep, NODES)
-    weights = sight.point_weights[points]
-    return replace(
-        sight, points=sight.points[points], point_weights=weights, skeleton_nodes=sight.skeleton_nodes[nodes]
-    )
+    rows, nodes = np.repeat(keep, len(sight.points) // 12), sight.skeleton_nodes[np.repeat(keep, NODES)]
+    return replace(sight, points=sight.points[rows], point_weights=sight.point_weights[rows], skeleton_nodes=nodes)
 
 
 def test_a_hidden_branch_is_not_seen(alone, whole):

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import json
 import shutil
 
 import numpy as np
 import pytest
 
+from yid_ocp import vision
 from yid_ocp.errors import DataError
-from yid_ocp.vision import (
-    XTION_INTRINSICS,
-    CameraIntrinsics,
-    FrameSequence,
-    look_at_pose,
-    read_frames,
-    write_frame_folder,
-)
+from yid_ocp.vision import CameraIntrinsics, FrameSequence, look_at_pose, read_frames, write_frame_folder
 from yid_ocp.vision.frames import OcclusionMap
 
 CLOUD = np.array([[0.1, -0.2, 2.0], [0.0, 0.3, 1.5], [-0.4, 0.1, 2.25]])
@@ -38,14 +31,14 @@ def changed(folder, **entries):
 
 
 def test_depth_to_cloud_of_a_camera_of_58_degrees_and_another():
-    left, right = XTION_INTRINSICS.pixel_rays[240, 0], XTION_INTRINSICS.pixel_rays[240, -1]
+    xtion = vision.XTION_INTRINSICS
+    left, right = xtion.pixel_rays[240, 0], xtion.pixel_rays[240, -1]
     cosine = left @ right / np.linalg.norm(left) / np.linalg.norm(right)
     assert np.degrees(np.arccos(cosine)) == pytest.approx(58.0, abs=0.2)
-    assert (XTION_INTRINSICS.width, XTION_INTRINSICS.height) == (640, 480)
+    assert (xtion.width, xtion.height) == (640, 480)
     camera = CameraIntrinsics(4, 3, 2.0, 4.0, 1.0, 1.0)
     depth = np.full((3, 4), np.nan)
-    depth[2, 3] = 2.0
-    depth[0, 0] = 0.0
+    depth[2, 3], depth[0, 0] = 2.0, 0.0
     assert np.allclose(camera.points_from_depth(depth), [[2.0, 0.5, 2.0]])
     with pytest.raises(DataError, match="shape"):
         camera.points_from_depth(np.ones((4, 3)))
@@ -155,21 +148,19 @@ def test_what_is_wrong_with_the_camera_is_said(folder, entries, message):
 
 
 @pytest.mark.parametrize(
-    ("rows", "message"),
+    ("text", "message"),
     [
         (None, "no time stamps"),
-        ([["file", "t"]], "no frame"),
-        ([["name", "time"], ["000000.ply", "1"]], "the columns are"),
-        ([["file", "t"], ["000000.ply", "noon"]], "the time is 'noon'"),
-        ([["file", "t"], ["000000.stl", "1"]], "neither a cloud nor a depth image"),
+        ("file,t\n", "no frame"),
+        ("name,time\n000000.ply,1\n", "the columns are"),
+        ("file,t\n000000.ply,noon\n", "the time is 'noon'"),
+        ("file,t\n000000.stl,1\n", "neither a cloud nor a depth image"),
     ],
 )
-def test_what_is_wrong_with_the_stamps_is_said(folder, rows, message):
-    path = folder / "timestamps.csv"
-    path.unlink()
-    if rows is not None:
-        with path.open("w", newline="") as file:
-            csv.writer(file).writerows(rows)
+def test_what_is_wrong_with_the_stamps_is_said(folder, text, message):
+    (folder / "timestamps.csv").unlink()
+    if text is not None:
+        (folder / "timestamps.csv").write_text(text)
     with pytest.raises(DataError, match=message):
         read_frames(folder)
 
@@ -310,10 +301,8 @@ def test_the_formula_of_ros():
     assert np.allclose(pixels(LENSES["plumb_bob"], point), [u, v])
     angle = np.arctan(np.sqrt(square))
     bent = angle + 0.02 * angle**3 - 0.01 * angle**5 + 0.003 * angle**7
-    assert np.allclose(
-        pixels(LENSES["equidistant"], point),
-        [30 * x * bent / np.sqrt(square) + 31.0, 30 * y * bent / np.sqrt(square) + 24.5],
-    )
+    expected = 30 * bent / np.sqrt(square) * np.array([x, y]) + [31.0, 24.5]
+    assert np.allclose(pixels(LENSES["equidistant"], point), expected)
 
 
 def test_pixels_that_a_lens_does_not_have_are_no_points():
@@ -373,11 +362,9 @@ def test_nothing_is_seen_beside_the_picture_which_ends_where_points_stand_along_
     camera = CameraIntrinsics(320, 240, 300.0, 300.0, 159.5, 119.5)
     behind = patch([0.0, 0.0, 4.0], 1.0)
     places = np.array([[0.0, 0.0, 2.0], [1.2, 0.0, 2.0], [0.0, 0.0, -1.0]])
-    view = OcclusionMap(behind, HOME, camera)
-    assert view.is_hidden(places, np.full(3, 0.02), 0.01).tolist() == [False, True, True]
+    assert OcclusionMap(behind, HOME, camera).is_hidden(places, np.full(3, 0.02), 0.01).tolist() == [False, True, True]
     wall = patch([0.0, 0.0, 4.0], 2.0, 0.02)  # fills the picture, which is 0.5 wide in x/z
-    places = np.array([[0.2, 0.0, 2.0], [0.6, 0.0, 2.0]])
-    radius = np.full(2, 0.02)
+    places, radius = np.array([[0.2, 0.0, 2.0], [0.6, 0.0, 2.0]]), np.full(2, 0.02)
     assert OcclusionMap(wall, HOME).is_hidden(places, radius, 0.01).tolist() == [False, True]
     # a cloud of the object alone has no such side: what is missing beside it is missing
     rod = np.column_stack([np.linspace(-0.2, 0.2, 200), np.zeros(200), np.full(200, 2.0)])

@@ -8,27 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from yid_ocp import vision
 from yid_ocp.cli import main
 from yid_ocp.data.recording_hdf5 import read_recording
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.system import System
-from yid_ocp.vision import (
-    CameraScene,
-    CloudFilterOptions,
-    FrameSequence,
-    TrackOptions,
-    look_at_pose,
-    track_object,
-    write_frame_folder,
-)
+from yid_ocp.vision import CameraScene, FrameSequence, TrackOptions, look_at_pose, track_object
 from yid_ocp.vision.frame_selection import is_shape_self_touching
 
 MILLIMETRE = 1e-3
 RADIUS = 0.006
 TABLE = look_at_pose([0.0, 0.0, 1.0], [0.0, 0.0, 0.0], up=(0, 1, 0))
 WALL = look_at_pose([1.2, 0.0, -0.4], [0.0, 0.0, -0.4])
-OPTIONS = TrackOptions(root_placement="free", filters=CloudFilterOptions(voxel_size=0.004), min_point_std=0.002)
+FILTERS = vision.CloudFilterOptions(voxel_size=0.004)
+OPTIONS = TrackOptions(root_placement="free", filters=FILTERS, min_point_std=0.002)
 CONFIG = """\
 model:
   robot: null
@@ -75,10 +69,8 @@ def snake(k):
 
 
 def swing(k):
-    angle = 0.5 * np.sin(0.9 * k)
-    return line(
-        lambda s: np.stack([0.1 * np.cos(k) * s**2, np.sin(angle * s) * s, -np.cos(angle * s) * s], axis=1), 1.0
-    )
+    angle, out = 0.5 * np.sin(0.9 * k), 0.1 * np.cos(k)
+    return line(lambda s: np.stack([out * s**2, np.sin(angle * s) * s, -np.cos(angle * s) * s], axis=1), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -136,10 +128,8 @@ def test_either_end_where_nothing_tells(rope):
 
 
 def test_branches_tell_where_the_root_is():
-    segments = [Segment("stem", 0.4, 0.1, RADIUS, links=5)]
-    segments += [
-        Segment(name, length, 0.1, RADIUS, links=4, parent="stem") for name, length in (("a", 0.3), ("b", 0.2))
-    ]
+    branches = (Segment(name, size, 0.1, RADIUS, links=4, parent="stem") for name, size in (("a", 0.3), ("b", 0.2)))
+    segments = [Segment("stem", 0.4, 0.1, RADIUS, links=5), *branches]
     names = ("stem:0%", "w_stem", "w_a", "w_b")
     system = System.build(objects=[(flexible_object(segments), None, None)], point_frames=names)
 
@@ -204,7 +194,7 @@ def test_a_robot_says_where_the_root_is(rope):
 
 def test_the_command_needs_no_recording(tmp_path, capsys):
     lines = [snake(k) for k in range(2)]
-    write_frame_folder(film(lines, TABLE), tmp_path / "frames")
+    vision.write_frame_folder(film(lines, TABLE), tmp_path / "frames")
     (tmp_path / "rope.yaml").write_text(CONFIG.replace("FRAMES", str(tmp_path / "frames")))
     assert main(["track", str(tmp_path / "rope.yaml"), "--out", str(tmp_path / "run")]) == 0, capsys.readouterr().err
     group = read_recording(tmp_path / "run" / "recording.h5").points[0]

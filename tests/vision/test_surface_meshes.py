@@ -7,15 +7,11 @@ import pytest
 
 from yid_ocp import vision
 from yid_ocp.errors import ConfigError, DataError, ModelError
+from yid_ocp.model.rotations import homogeneous_transform
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import read_urdf
-from yid_ocp.vision.surface_meshes import (
-    ArticulatedSurfaces,
-    TriangleMesh,
-    _resolve_mesh_path,
-    load_robot_meshes,
-    tube_meshes_by_joint,
-)
+from yid_ocp.vision import surface_meshes
+from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, TriangleMesh, load_robot_meshes, tube_meshes_by_joint
 
 SHAPE = (480, 640)
 
@@ -109,11 +105,8 @@ def test_virtual_frames_are_the_same_every_time(system, run):
 def ball(urdf_folder):
     """A ball of 0.1 m on the second joint's frame of a double pendulum, and a box in the world."""
     tree = read_urdf(urdf_folder / "double_pendulum.urdf").with_numeric_values()
-    placed = np.eye(4)
-    placed[:3, 3] = [0.0, 5.0, 0.0]
-    return ArticulatedSurfaces(
-        tree, {1: TriangleMesh.sphere(0.1), -1: TriangleMesh.box([1.0, 1.0, 1.0]).transformed(placed)}
-    )
+    box = TriangleMesh.box([1.0, 1.0, 1.0]).transformed(homogeneous_transform(np.eye(3), [0.0, 5.0, 0.0]))
+    return ArticulatedSurfaces(tree, {1: TriangleMesh.sphere(0.1), -1: box})
 
 
 def centre(surfaces, q):
@@ -196,7 +189,7 @@ def test_what_cannot_be_seen_is_said(tmp_path, urdf_folder):
     with pytest.raises(ModelError, match="no visual meshes"):
         load_robot_meshes(bare, tree)
     with pytest.raises(ModelError, match="is not there"):
-        _resolve_mesh_path("package://nobody/mesh.dae", bare)
+        surface_meshes._resolve_mesh_path("package://nobody/mesh.dae", bare)
 
 
 def test_names_of_mesh_files(tmp_path):
@@ -205,6 +198,6 @@ def test_names_of_mesh_files(tmp_path):
     (package / "mesh.stl").write_text("")
     urdf = package / "urdf" / "arm.urdf"
     for name in ("package://arm/mesh.stl", "../mesh.stl", f"file://{package}/mesh.stl"):
-        assert _resolve_mesh_path(name, urdf).resolve() == package / "mesh.stl"
-    package.rename(tmp_path / "share" / "arm_1.2")  # a package's folder need not bear its name
-    assert _resolve_mesh_path("package://arm/mesh.stl", tmp_path / "share" / "arm_1.2" / "urdf" / "arm.urdf").is_file()
+        assert surface_meshes._resolve_mesh_path(name, urdf).resolve() == package / "mesh.stl"
+    renamed = package.rename(tmp_path / "share" / "arm_1.2")  # a package's folder need not bear its name
+    assert surface_meshes._resolve_mesh_path("package://arm/mesh.stl", renamed / "urdf" / "arm.urdf").is_file()

@@ -6,17 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from yid_ocp import vision
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, ModelError
-from yid_ocp.vision import (
-    CameraClockOptions,
-    CameraScene,
-    CloudFilterOptions,
-    FrameSequence,
-    TrackOptions,
-    track_object,
-)
+from yid_ocp.vision import CameraScene, TrackOptions, track_object
 from yid_ocp.vision.camera_registration import CLOCK_OFFSET_INDEX, CameraState
 from yid_ocp.vision.track import FrameTracker
 
@@ -191,7 +185,7 @@ def test_bad_frames_are_dropped_with_the_reason_and_do_not_stop_the_rest(system,
     ("scale", "options", "message"),
     [
         (1000, TrackOptions(), "metres"),
-        (1, TrackOptions(filters=CloudFilterOptions(box_lower=(0.0, 0.0, 5.0))), "camera's pose"),
+        (1, TrackOptions(filters=vision.CloudFilterOptions(box_lower=(0.0, 0.0, 5.0))), "camera's pose"),
     ],
 )
 def test_nothing_but_bad_clouds_is_an_error(system, small, scale, options, message):
@@ -209,7 +203,7 @@ def test_the_time_of_another_clock(system, small):
     with pytest.raises(DataError, match="their clocks are not the same") as caught:
         track_object(CameraScene(system), small.recording, later)
     assert "give the clock offset" in caught.value.hint
-    options = TrackOptions(clock=CameraClockOptions(initial_offset=1.7e9))
+    options = TrackOptions(clock=vision.CameraClockOptions(initial_offset=1.7e9))
     assert len(track_object(CameraScene(system), small.recording, later, options).t) == 3
 
 
@@ -224,4 +218,4 @@ def test_a_recording_that_does_not_fit(system, small, urdf_folder):
     with pytest.raises(ModelError, match="no visual meshes"):
         track_object(CameraScene(system, urdf_folder / "double_pendulum.urdf"), small.recording, small.sequence)
     with pytest.raises(DataError, match="pose of the camera is missing"):
-        FrameSequence.from_clouds([0.0], [small.clouds[0]], None)
+        vision.FrameSequence.from_clouds([0.0], [small.clouds[0]], None)

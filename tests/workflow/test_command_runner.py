@@ -94,13 +94,11 @@ def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(monkeypat
 
 
 def test_who_does_not_look_is_shown_nothing_or_lines():
-    for arguments, kind in (
-        (asked(quiet=True), None),
-        (asked(program=True), None),
-        (asked(), command_runner.StderrLogLinesProgress),
-    ):
+    for arguments in (asked(quiet=True), asked(program=True)):
         with command_runner.stderr_progress_display(arguments) as progress:
-            assert progress is NULL_PROGRESS if kind is None else isinstance(progress, kind)
+            assert progress is NULL_PROGRESS
+    with command_runner.stderr_progress_display(asked()) as progress:
+        assert isinstance(progress, command_runner.StderrLogLinesProgress)
 
 
 @pytest.mark.parametrize(("quiet", "reached"), [(True, True), (False, True), (False, False)])
@@ -125,7 +123,6 @@ def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setattr(command_runner, "SUMMARY_BY_FORMAT", {"made": lambda result: []})
-    command_runner.run_command_and_print(
-        asked(), lambda progress: command_runner.CommandResult(tmp_path / "there", {"format": "made"}, None)
-    )
+    made = command_runner.CommandResult(tmp_path / "there", {"format": "made"}, None)
+    command_runner.run_command_and_print(asked(), lambda progress: made)
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")

@@ -83,10 +83,8 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
     assert init(*CABLE) == 0
     assert "m1 at cable:50%" in capsys.readouterr().out
     run = load_config("run.yaml")
-    assert run.model.arms.mode == "prescribed"
-    assert run.model.arms.joints == ("roll", "pitch")
-    assert run.problem.time_step == pytest.approx(0.008)
-    assert run.problem.initial_state == "equilibrium"
+    assert (run.model.arms.mode, run.model.arms.joints) == ("prescribed", ("roll", "pitch"))
+    assert (run.problem.time_step, run.problem.initial_state) == (pytest.approx(0.008), "equilibrium")
     assert run.sensors["points"].frames == {"m1": "cable:50%", "m2": "w_cable"}
     # white noise from differences of a smooth motion, within a fifth
     assert run.sensors["points"].std == pytest.approx(2e-4, rel=0.2)
@@ -104,10 +102,9 @@ def test_the_file_loads_and_says_what_was_recorded(bench: Path, capsys: pytest.C
 
 
 def test_several_recordings_are_split_and_a_rest_splits_one(bench: Path) -> None:
-    names = []
-    for i in range(4):
-        write_recording(moved(SHORT, seed=i), bench / f"run_{i}.h5")
-        names.append(f"run_{i}.h5")
+    names = [f"run_{i}.h5" for i in range(4)]
+    for i, name in enumerate(names):
+        write_recording(moved(SHORT, seed=i), bench / name)
     assert init(*CABLE, files=names) == 0
     recordings = load_config("run.yaml").recordings
     assert [Path(p).name for p in recordings.estimate] == names[:3]
@@ -169,9 +166,8 @@ def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsy
     assert init(*CABLE) == 0
     assert main(["check", "run.yaml", "--out", "checked", "--set", "model.arms.mode=servo"]) == 2
     said = capsys.readouterr().err
-    assert "no commanded positions" in said
-    assert "joints/position_command" in said
-    assert "prescribed" in said
+    for words in ("no commanded positions", "joints/position_command", "prescribed"):
+        assert words in said
 
 
 def test_a_tree_gets_its_markers_where_they_are(bench: Path) -> None:
@@ -237,8 +233,7 @@ def test_what_is_missing_is_named_and_nothing_is_written(case, bench, capsys) ->
 
 
 def test_recordings_that_do_not_fit_are_refused(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recording = moved(SHORT, parts=())
-    write_recording(recording, bench / "one.h5")
+    write_recording(moved(SHORT, parts=()), bench / "one.h5")
     assert init(*CABLE) == 2
     assert "nothing in the recording shows what the object does" in capsys.readouterr().err
     (bench / "bag.csv").write_text("t,q_shoulder,tip_x,tip_y,tip_z\n" + "".join(f"{k},0.1,0,0,0.5\n" for k in range(9)))

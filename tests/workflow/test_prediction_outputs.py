@@ -25,9 +25,8 @@ from yid_ocp.workflow.check import _input_noise
 
 def test_a_solution_with_its_predictions(solved_pendulum, tmp_path):
     problem, solution, held_out = solved_pendulum
-    prediction_outputs.write_solve_trajectories(
-        tmp_path / "t.h5", problem, solution, [(held_out[0][0], "step 3 did not converge")]
-    )
+    apart = [(held_out[0][0], "step 3 did not converge")]
+    prediction_outputs.write_solve_trajectories(tmp_path / "t.h5", problem, solution, apart)
     with h5py.File(tmp_path / "t.h5") as file:
         assert file.attrs["format"] == "yid-trajectories/1"
         assert list(file["unknowns"].attrs["names"]) == list(solution.unknown_names)
@@ -82,8 +81,7 @@ def test_a_held_out_recording_beside_a_guess_without_a_model(solved_pendulum):
         assert entry["rmse"][channel] == pytest.approx(np.sqrt(np.nanmean(error**2)))
         assert entry["baselines"]["zero"][channel] == pytest.approx(np.sqrt(np.nanmean(samples.value[:, i] ** 2)))
     failed = prediction_outputs.prediction_error_entry(problem, held_out[0][0], "step 3 did not converge")
-    assert failed["message"] == "step 3 did not converge"
-    assert failed["rmse"] == {}
+    assert (failed["message"], failed["rmse"]) == ("step 3 did not converge", {})
     assert failed["baselines"] == entry["baselines"]
 
 
