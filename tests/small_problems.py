@@ -117,6 +117,16 @@ def taken(step, seed, *, efforts=True, camera=True, name=None, steps=STEPS):
     return Recording(group, tuple(groups), name=name or f"run_{seed}")
 
 
+def places(system, frames, q):
+    """Positions of frames at a configuration, or along a motion, time first."""
+    symbol = ca.SX.sym("q", system.n_coordinates)
+    kinematics = forward_kinematics(system.mechanism, symbol)
+    expression = ca.horzcat(*(kinematics.frame_position(frame) for frame in frames))
+    function = ca.Function("at", [symbol, system.parameters.symbols], [expression])
+    found = np.array([np.array(function(at, system.parameters.vector())).T for at in np.atleast_2d(q)])
+    return found if np.ndim(q) == 2 else found[0]
+
+
 def swinging_pendulum(folder, *effects):
     """The step of a damped double pendulum, and a function that records a free swing of it, its lower points seen.
 
@@ -128,16 +138,13 @@ def swinging_pendulum(folder, *effects):
     real = system.with_effects([make_effect(kind, place, system, values) for kind, place, values in effects])
     moving = compile_step(real, H, use_compiler=False) if effects else step
     frames = list(system.mechanism.frames)[-2:]
-    q = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, q)
-    place = ca.Function("place", [q], [ca.horzcat(*(kinematics.frame_position(frame) for frame in frames))])
 
     def record(seed, steps, bend, noise=0.0):
         rng = np.random.default_rng(seed)
         start = np.zeros(step.sizes["nx"])
         start[:2], start[2:4] = bend * rng.standard_normal(2), 0.02 * rng.standard_normal(2)
         states = simulate(moving, real.parameters.vector(), start, steps).state
-        clean = np.stack([np.array(place(x[:2])).T for x in states])
+        clean = places(system, frames, states[:, :2])
         position = clean + noise * rng.standard_normal(clean.shape)
         group = seen(frames, H * np.arange(steps + 1), position, std=np.full(clean.shape, 1e-3))
         return recording(None, group, name=f"swing_{seed}")

@@ -53,11 +53,6 @@ def place(file: Path, more: list[Path]) -> list[str]:
     return [str(file), *map(str, more)]
 
 
-def thread_count(number: int) -> int:
-    del number
-    return threads_of_process()
-
-
 def fragile(number: int, broken: str = "") -> int:
     if number == 3 or Path(broken).is_file():
         raise ZeroDivisionError(f"no {number}")
@@ -80,9 +75,9 @@ def strange(number: int) -> Any:
     return {"set": {number}} if number else float("nan")
 
 
-def process_name(number: int) -> str:
+def process_name_and_threads(number: int) -> tuple[str, int]:
     del number
-    return multiprocessing.current_process().name
+    return multiprocessing.current_process().name, threads_of_process()
 
 
 def tasks_of(count: int, **arguments: Any) -> list[Task]:
@@ -277,8 +272,8 @@ def test_one_process_and_two_find_the_same(tmp_path):
     here = multiprocessing.current_process().name
     for workers in (1, 2):
         with process_pool(workers) as pool:
-            found = run_tasks(process_name, tasks_of(4), tmp_path / str(workers), pool)
-        assert 1 <= len({entry.value for entry in found} - {here}) <= workers
+            found = run_tasks(process_name_and_threads, tasks_of(4), tmp_path / str(workers), pool)
+        assert 1 <= len({entry.value[0] for entry in found} - {here}) <= workers
     one, two = (sorted(path.name for path in (tmp_path / folder).iterdir()) for folder in ("1", "2"))
     assert one == two
     assert len(one) == 4
@@ -286,8 +281,8 @@ def test_one_process_and_two_find_the_same(tmp_path):
 
 def test_processes_share_the_threads_of_the_machine_and_threads_keep_the_order(tmp_path, monkeypatch):
     monkeypatch.setenv("YID_OCP_THREADS", "4")
-    found = run_tasks(thread_count, tasks_of(2), tmp_path, WorkerConfig(n_processes=2))
-    assert [entry.value for entry in found] == [2, 2]
+    found = run_tasks(process_name_and_threads, tasks_of(2), tmp_path, WorkerConfig(n_processes=2))
+    assert [entry.value[1] for entry in found] == [2, 2]
     assert map_in_threads(lambda x: x * x, range(7)) == [x * x for x in range(7)]
 
 

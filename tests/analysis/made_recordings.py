@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import casadi as ca
 import numpy as np
 
 from yid_ocp.analysis.experiment_design import RecordedExperiment
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.model import Grasp, Mechanism, Segment, System, flexible_object
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import ProblemOptions
 from yid_ocp.problem.measurements import TimeGrid
@@ -32,15 +30,6 @@ def setting(*groups, sensors=None, frames=("a", "b", "tip"), **more):
         system=SimpleNamespace(mechanism=Mechanism("made", (), dict.fromkeys(frames))),
     )
     return RecordedExperiment(problem, np.zeros(1), **more), episode
-
-
-def places(system, frames, q):
-    """Positions of frames at a configuration."""
-    symbol = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, symbol)
-    expression = ca.horzcat(*(kinematics.frame_position(frame) for frame in frames))
-    function = ca.Function("at", [symbol, system.parameters.symbols], [expression])
-    return np.array(function(q, system.parameters.vector())).T
 
 
 def holding_pendulum(folder, links=3):

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from made_models import Formula, estimate, solution
 from made_models import estimate as estimated
-from made_recordings import chain_of_motors, places
+from made_recordings import chain_of_motors
+from small_problems import places
 
 from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.discretisation import (
@@ -342,9 +343,7 @@ def light_recording(light):
     """The cable as a step of a millisecond moves it, its points seen to a millimetre at 100 Hz."""
     fine = light(0.5, 0.001)
     t, path, rollout = moved_hands(fine, 0.8)
-    seen = np.array(
-        [places(fine.system, fine.system.point_frames, q) for q in rollout.state[::10, : fine.system.n_coordinates]]
-    )
+    seen = places(fine.system, fine.system.point_frames, rollout.state[::10, : fine.system.n_coordinates])
     seen += 1e-3 * np.random.default_rng(0).standard_normal(seen.shape)
     points = PointGroup("points", fine.system.point_frames, t[::10], seen, 1e-3)
     return Recording(JointGroup(["x", "z"], t[::5], path[::5], position_std=0.0), (points,), name="light")

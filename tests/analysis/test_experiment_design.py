@@ -10,7 +10,8 @@ import casadi as ca
 import numpy as np
 import pytest
 from heard import Heard
-from made_recordings import chain_of_motors, group, holding_pendulum, places, setting
+from made_recordings import chain_of_motors, group, holding_pendulum, setting
+from small_problems import places
 
 from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis import torque_error_propagation as propagation
@@ -85,9 +86,8 @@ def test_observations_are_of_used_points_that_the_model_has_where_they_were_seen
         "points_arm": SensorOptions(points=("b",)),
         "points_off": SensorOptions(use=False),
     }
-    chosen, episode = setting(
-        replace(made, position=position), group("points_arm"), group("points_off"), sensors=sensors
-    )
+    groups = replace(made, position=position), group("points_arm"), group("points_off")
+    chosen, episode = setting(*groups, sensors=sensors)
     found = chosen.existing_sensor_observations(episode)
     seen = [("points_camera", "a"), ("points_camera", "tip"), ("points_arm", "b")]
     assert [(view.point_group, view.frame) for view in found] == seen

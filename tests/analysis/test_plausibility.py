@@ -326,11 +326,9 @@ def pendulum_arm(urdf_folder) -> RecordedJointsModel:
     return RecordedJointsModel.from_system(system, system.parameters.vector())
 
 
-def swung(
-    pendulum_arm: RecordedJointsModel, hertz: float, size: float = 0.3, noise: float = 0.05, seed: int = 0
-) -> Recording:
+def swung(pendulum_arm: RecordedJointsModel, hertz: float, size: float = 0.3, seed: int = 0) -> Recording:
     """Both joints to and fro, with the efforts that they need and noise."""
-    rng = np.random.default_rng(seed)
+    rng, noise = np.random.default_rng(seed), 0.05
     t = 0.01 * np.arange(3001)
     phase = 2 * np.pi * hertz * t[:, None] + np.array([0.0, 1.0])
     rate = 2 * np.pi * hertz

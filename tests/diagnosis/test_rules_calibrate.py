@@ -185,13 +185,10 @@ def kept():
     return json.loads((files("yid_ocp") / "data" / "defaults" / "thresholds.json").read_text("utf-8"))
 
 
-def test_defaults_are_those_that_it_advises(kept):
+def test_defaults_are_those_that_it_advises_and_follow_from_its_samples_by_the_rules_as_they_are(kept):
     settings = [rule.setting for rule in _CALIBRATION_RULES.values()]
     assert kept["format"] == _CALIBRATION_FORMAT
     assert kept["settings"] == {setting: getattr(DEFAULT_THRESHOLDS, setting) for setting in settings}
-
-
-def test_its_advice_follows_from_its_samples_by_the_rules_as_they_are(kept):
     rules = kept["rules"]
     assert set(rules) == set(_CALIBRATION_RULES)
     for name, rule in _CALIBRATION_RULES.items():

@@ -518,19 +518,13 @@ def test_an_effect_that_is_not_there_any_more_beside_another_is_left_out_again(m
 def test_the_last_of_three_may_make_both_others_superfluous(monkeypatch):
     rounds = Rounds(monkeypatch, GROWING | {"bc": (1.4, 1.6), "c": (1.3, 1.5)}, p_values=(1e-9, 1e-9, 1e-9))
     rounds.scores = rounds.scores[:2]
-    monkeypatch.setattr(rounds, "screened", lambda base=(), own=rounds.screened: screened_with(own, base))
+    # the third candidate shows only once two are in the model
+    usual, last = rounds.screened, ScreeningResult((), (score(C, p=1e-9),), alike([C.label], [[1.0]]), FEW)
+    monkeypatch.setattr(rounds, "screened", lambda base=(): usual(base) if len(base) < 2 else last)
     first, chosen, added = rounds.compose()
     assert chosen == ["c"]
     assert added[0].cumulative_closure.fraction == pytest.approx(1 - 0.4 / 4.1)
     assert first == ["c", "a", "b"], "what stays alone is said first, as it ended"
-
-
-def screened_with(usual, base):
-    """The third candidate shows only once two are in the model."""
-    found = usual(base)
-    if len(base) < 2:
-        return found
-    return ScreeningResult((), (score(C, p=1e-9),), alike([C.label], [[1.0]]), FEW)
 
 
 def test_a_later_effect_shows_what_an_earlier_one_stood_in_for(monkeypatch):

@@ -56,23 +56,20 @@ def test_part_of_the_parameters_is_freed_by_columns_of_the_whole(screened):
     assert composed.problem.free == composed.nominal_free_parameters == ("shoulder.damping", "elbow.damping")
 
 
-def test_screening_finds_the_withheld_effect_first(screened):
-    _, nominal, point = screened
+def test_screening_finds_the_withheld_effect_first_and_promises_what_a_refit_does_to_a_linear_model(screened):
+    composed, nominal, point = screened
     ranked = score_candidates(point, residual_channel_samples(nominal.problem), candidate_detectability(point))
     assert ranked[0].effect.label == "joint_coulomb@elbow"
     assert ranked[0].predicted_values["joint_coulomb@elbow.tau_c"] == pytest.approx(0.1, rel=0.1)
     assert ranked[0].p_value < 1e-6
     assert all(a.predicted_chi2_decrease >= b.predicted_chi2_decrease for a, b in itertools.pairwise(ranked))
-
-
-def test_the_promised_decrease_is_that_of_a_refit_where_the_model_is_linear(screened):
-    composed, nominal, point = screened
-    scores = score_candidates(point, residual_channel_samples(nominal.problem), candidate_detectability(point))
-    ranked = {s.effect.label: s for s in scores}
+    by_label = {s.effect.label: s for s in ranked}
     for label in ("joint_coulomb@elbow", "rotor_inertia@elbow", "effort_offset@shoulder"):
         effect = next(e for e in composed.candidate_effects if e.label == label)
         fit = refit_with_effects(composed, (effect,), nominal.values)
-        assert 2 * (nominal.cost - fit.cost) == pytest.approx(ranked[label].predicted_chi2_decrease, rel=1e-3, abs=1e-3)
+        assert 2 * (nominal.cost - fit.cost) == pytest.approx(
+            by_label[label].predicted_chi2_decrease, rel=1e-3, abs=1e-3
+        )
 
 
 def test_what_the_fit_has_explained_is_projected_off_and_overlaps_are_parts_of_the_rest(screened):

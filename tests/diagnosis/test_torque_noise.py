@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
 from factories import cases
+from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis import diagnose
@@ -28,7 +28,6 @@ from yid_ocp.inference.whitening import (
 )
 from yid_ocp.integrator.step import Step, compile_step, simulate
 from yid_ocp.model import System
-from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.servos_and_springs import RobotJointSpring
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -60,10 +59,8 @@ def recorded(step: Step, seed: int, offset: float | None = None, friction: float
     effort = torque[:, None] + WHITE * rng.standard_normal((STEPS + 1, 1)) + off
     said = {"position_std": ANGLE, "effort_std": WHITE, "effort_bias_std": OFFSET, "effort_kind": "command"}
     joints = JointGroup(("shoulder",), t, angle, effort=effort, **said)
-    q = ca.SX.sym("q", system.n_coordinates)
-    place = ca.Function("p", [q], [forward_kinematics(system.mechanism, q).frame_position("tip")])
-    tip = np.array([np.array(place(x[: system.n_coordinates])).T for x in swept.state])
-    tip = tip + POINT * rng.standard_normal((STEPS + 1, 1, 3))
+    tip = places(system, ["tip"], swept.state[:, : system.n_coordinates])
+    tip += POINT * rng.standard_normal((STEPS + 1, 1, 3))
     points = PointGroup("points_camera", ("tip",), t, tip, std=np.full(tip.shape, POINT))
     return Recording(joints, (points,), name=f"run_{seed}")
 

@@ -11,6 +11,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import threadpoolctl
+from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.diagnosis.localise import localise_gap, smoothed_unknown_z_scores
@@ -350,10 +351,7 @@ def recorded(system: System, pushed: dict[int, tuple[float, float, float]], seed
     swept = simulate(step, system.parameters.vector(), np.zeros(step.sizes["nx"]), steps, extra)
     assert swept.status.is_converged
     known = list(system.mechanism.frames)[-2:]
-    q = ca.SX.sym("q", system.n_coordinates)
-    kinematics = forward_kinematics(system.mechanism, q)
-    place = ca.Function("p", [q], [ca.horzcat(*(kinematics.frame_position(f) for f in known))])
-    position = np.stack([np.array(place(x[:2])).T for x in swept.state])
+    position = places(system, known, swept.state[:, :2])
     noise = np.random.default_rng(seed).standard_normal(position.shape)
     points = PointGroup("points", tuple(known), t, position + 1e-3 * noise, std=np.full(position.shape, 1e-3))
     effort = {"effort": np.vstack([torque, torque[-1:]]), "effort_std": 0.0, "effort_kind": "command"}
