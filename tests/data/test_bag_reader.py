@@ -75,10 +75,11 @@ def write_bag(folder: Path, kind: str, messages: Messages) -> Path:
     return bag.path
 
 
-def refused(path: Path, message: str, hint: str = "", **options: Any) -> None:
+def refused(path: Path, message: str, **options: Any) -> str:
+    """The hint of an error that reading ends with."""
     with pytest.raises(DataError, match=message) as caught:
         read_any(path, **options)
-    assert hint in caught.value.hint
+    return caught.value.hint
 
 
 def arm_and_camera() -> Messages:
@@ -127,9 +128,9 @@ def test_bag_order_and_sets_of_joints_may_change(tmp_path: Path) -> None:
     gripper = joint_state(("finger",), START, position=[0.5])
     (tmp_path / "other").mkdir()
     path = write_bag(tmp_path / "other", "bag", [("/joint_states", START, arm), ("/joint_states", START, gripper)])
-    refused(path, "2 different sets of joints", "--joints")
+    assert "--joints" in refused(path, "2 different sets of joints")
     assert read_any(path, joints=["b"]).joint_names == ("b",)
-    refused(path, "no joint 'fingr'", "did you mean 'finger'?", joints=["a", "fingr"])
+    assert refused(path, "no joint 'fingr'", joints=["a", "fingr"]) == "did you mean 'finger'?"
     refused(path, "never come in one message", joints=["a", "finger"])
 
 
@@ -162,7 +163,7 @@ def test_bag_with_several_joint_topics(tmp_path: Path) -> None:
     alone = read_any(path, joint_topics=["/right"])
     assert alone.joint_names == ("b",)
     assert any(note.startswith("/left was left out") for note in alone.notes)
-    refused(path, "on the topic '/rigth'", "did you mean '/right'?", joint_topics=["/rigth"])
+    assert refused(path, "on the topic '/rigth'", joint_topics=["/rigth"]) == "did you mean '/right'?"
 
 
 def test_joint_topics_that_do_not_fit_together(tmp_path: Path) -> None:
@@ -170,7 +171,7 @@ def test_joint_topics_that_do_not_fit_together(tmp_path: Path) -> None:
     (tmp_path / "twice").mkdir()
     one = joint_state(("a",), START, position=[1.0])
     path = write_bag(tmp_path / "twice", "mcap", [("/x", START, one), ("/y", START, one)])
-    refused(path, "joint 'a' is on /x and on /y", "--joint-topic")
+    assert "--joint-topic" in refused(path, "joint 'a' is on /x and on /y")
 
 
 def test_a_gap_of_one_topic_stays_a_gap_and_commands_are_held_until_the_next(tmp_path: Path) -> None:
@@ -339,7 +340,7 @@ def test_bags_that_are_none_and_no_rosbags(tmp_path: Path, monkeypatch: pytest.M
     refused(tmp_path, "the bag cannot be read")
     refused(tmp_path / "absent.bag", "no such file")
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    refused(tmp_path, "needs the package rosbags", "pip install 'yid-ocp[bags]'")
+    assert refused(tmp_path, "needs the package rosbags") == "pip install 'yid-ocp[bags]'"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the system cannot limit memory")

@@ -299,8 +299,8 @@ UNREADABLE: dict[str, tuple[Callable[[h5py.File, Path], object], str]] = {
     "virtual values": (virtual_values, OTHER_FILE),
     "groups without end": (lambda f, o: f.__setitem__("a/self", f["a"]), "stand in one another"),
     # numbers of one byte each; as float64 with copies they are 27 GB
-    "small, but unpacks to more": (lambda f, o: f.create_dataset("b", (120_000_000, 7), "i1", **PACKED), "840 million"),
-    "declared, but not there": (lambda f, o: f.create_dataset("b", (10**9,), "f8", chunks=(1000,)), "1000 million"),
+    "a bomb": (lambda f, o: f.create_dataset("b", (120_000_000, 7), "i1", **PACKED), "declares 840 million numbers"),
+    "not there": (lambda f, o: f.create_dataset("b", (10**9,), "f8", chunks=(1000,)), "declares 1000 million numbers"),
 }
 
 
