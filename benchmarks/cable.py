@@ -114,7 +114,8 @@ def point_rmse_by_recording(problem: EstimationProblem, x: np.ndarray, points: S
     """
     errors, found = {}, problem.predict_held_out(x)
     for i, episode in enumerate(problem.episodes):
-        found.append((episode, problem.predictor.predict_episode(episode, *problem.split(x, i), False)))
+        own = problem.theta_and_initial_state_offset(x, i)
+        found.append((episode, problem.predictor.predict_episode(episode, *own, False)))
     for episode, result in found:
         if isinstance(result, str):
             errors[episode.name] = float("nan")
@@ -159,7 +160,7 @@ def run(folder: Path = FOLDER, iterations: int = 15) -> dict[str, Any]:
     nominal = point_rmse_by_recording(undeformed, undeformed.initial_unknowns, cable.free_vertex_names)
     point_rmse_by_recording(problem, problem.initial_unknowns, cable.free_vertex_names)
     seconds["starts"] = time.perf_counter() - clock
-    episode, (theta, offset) = problem.episodes[0], problem.split(problem.initial_unknowns, 0)
+    episode, (theta, offset) = problem.episodes[0], problem.theta_and_initial_state_offset(problem.initial_unknowns, 0)
     clock = time.perf_counter()
     problem.predictor.predict_episode(episode, theta, offset, False)
     seconds["rollout"] = time.perf_counter() - clock

@@ -46,7 +46,11 @@ from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.joint_motion import MultisineOptions, grasping_joint_angles, random_multisine_motion
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions, simulate_in_mujoco
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.plan import compile_step_for_planning, identified_parameters_with_covariance, start_configuration
+from yid_ocp.workflow.plan import (
+    compile_step_for_planning,
+    identified_parameters_with_covariance,
+    start_joint_positions_from_run,
+)
 from yid_ocp.workflow.solve import run_solve
 
 Array = NDArray[np.float64]
@@ -311,7 +315,9 @@ def two_hands() -> None:
     ):
         run = load_config(CONFIG.with_name(f"{config}.yaml"), more)
         step = compile_step_for_planning(run)
-        made = plan_motion_to_target(step, replace(run.plan, start_joint_positions=start_configuration(run, step)))
+        made = plan_motion_to_target(
+            step, replace(run.plan, start_joint_positions=start_joint_positions_from_run(run, step))
+        )
         points = tuple(dict.fromkeys((*step.system.point_frames, made.target_point)))
         twin = replace(step.system, driven=step.system.prescribed, prescribed=(), point_frames=points)
         smooth = replace(

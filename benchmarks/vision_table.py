@@ -325,7 +325,7 @@ def cast(meshes: Sequence[TriangleMesh], pose: Array) -> tuple[Array, Array]:
         o3d.core.Tensor(np.ascontiguousarray(whole.vertices, dtype=np.float32)),
         o3d.core.Tensor(np.ascontiguousarray(whole.faces, dtype=np.uint32)),
     )
-    directions = LENS.pixel_rays @ pose[:3, :3].T
+    directions = LENS.pixel_rays_at_unit_depth @ pose[:3, :3].T
     rays = np.concatenate([np.broadcast_to(pose[:3, 3], directions.shape), directions], axis=-1)
     answer = scene.cast_rays(o3d.core.Tensor(np.ascontiguousarray(rays, dtype=np.float32)), nthreads=1)
     normals = answer["primitive_normals"].numpy()

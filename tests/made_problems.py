@@ -110,7 +110,7 @@ class MadeUp:
         unit[: count - self._stated] = self.rms_noise_of_data_residuals
         return evaluation.residual[:count] / unit, evaluation.jacobian[:count] / unit[:, None]
 
-    def split(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
+    def theta_and_initial_state_offset(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
         theta = self.theta.copy()
         theta[len(theta) - len(x) :] = x[::-1]
         return theta, np.zeros(0)

@@ -73,13 +73,13 @@ class Formula:
         self.system = SimpleNamespace(parameters=entries)
         self.asked: list[tuple[float, ...]] = []
 
-    def split(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
+    def theta_and_initial_state_offset(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
         values = dict(zip((name.split("[")[0] for name in self.unknown_names), np.asarray(x, float), strict=True))
         return np.array([values[name] for name in self.system.parameters.names]), np.zeros(0)
 
     @property
     def theta(self) -> np.ndarray:
-        return self.split(self.initial_unknowns, 0)[0]
+        return self.theta_and_initial_state_offset(self.initial_unknowns, 0)[0]
 
     @property
     def positive_unknowns_mask(self) -> np.ndarray:

@@ -394,7 +394,7 @@ class Means:
         start = None if speed is None else SimpleNamespace(fitted_parameters={START_SPEED_PARAMETER_NAME: speed})
         return SimpleNamespace(measurements=(samples,), fixed_initial_state=start)
 
-    def split(self, x, i):
+    def theta_and_initial_state_offset(self, x, i):
         return float(x[0]) + (0.0 if "a.memory" in self.unknown_names else self.off), None
 
     def evaluate(self, x, equilibrium_guesses=None):

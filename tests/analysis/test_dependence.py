@@ -79,10 +79,10 @@ def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
     assert twist.seen == ()
     assert twist.best == ""
     said = f"T1.twist enters 6 rows ({', '.join(rows)}), none of which a sensor sees to first order."
-    assert twist.words.startswith(said)
-    assert "moves no reading by a millionth of its standard deviation within 0.6 s" in twist.words
+    assert twist.description.startswith(said)
+    assert "moves no reading by a millionth of its standard deviation within 0.6 s" in twist.description
     assert bend.seen == bend.rows
-    assert "all of which sensors see to first order, points_camera best" in bend.words
+    assert "all of which sensors see to first order, points_camera best" in bend.description
     # a rod that hangs straight does not bend: its stiffness moves nothing either
     assert bend.moved < 1e-6
 
@@ -92,10 +92,10 @@ def test_the_twist_of_a_bent_rod_is_seen_but_not_its_stiffness(hanging):
     found, _, _ = judged(hanging(gravity=(3.0, 0.0, -9.0)))
     twist, bend = found["T1.twist"], found["T1.bend"]
     assert twist.seen == twist.rows
-    assert "all of which sensors see to first order, points_camera best" in twist.words
+    assert "all of which sensors see to first order, points_camera best" in twist.description
     assert twist.moved < 1e-6
     assert bend.moved > 0.1
-    assert f"one N m/rad more of it moves readings by at most {bend.moved:.2g} standard deviations" in bend.words
+    assert f"one N m/rad more of it moves readings by at most {bend.moved:.2g} standard deviations" in bend.description
 
 
 def test_a_length_changes_readings_directly_and_this_counts(hanging):
@@ -103,7 +103,7 @@ def test_a_length_changes_readings_directly_and_this_counts(hanging):
     found, rest, _ = judged(problem)
     assert found["T1.length"].read == ("points_camera",)
     assert found["T1.bend"].read == ()
-    assert "the reading of points_camera depends on it directly" in found["T1.length"].words
+    assert "the reading of points_camera depends on it directly" in found["T1.length"].description
     assert found["T1.length"].moved == pytest.approx(moved_by(problem, rest, "T1.length"), rel=1e-6)
     # the tip goes down by as much, of a standard deviation of 2 mm
     assert found["T1.length"].moved == pytest.approx(1.0 / STD, rel=1e-6)
@@ -184,7 +184,7 @@ def test_without_sensors_only_rows_are_said(hanging):
     found = {e.parameter: e for e in parameter_rows_and_sensor_responses(step, symbols, None, rest.state, theta, rows)}
     assert found["T1.twist"].seen is None
     assert found["T1.twist"].moved is None
-    assert found["T1.bend"].words == "T1.bend enters 12 rows (6 of del, 6 of p1)."
+    assert found["T1.bend"].description == "T1.bend enters 12 rows (6 of del, 6 of p1)."
 
 
 ROWS = "k enters 2 rows (del[a], p1[a])"
@@ -214,7 +214,7 @@ MANY = (*(f"del[{i}]" for i in range(5)), *(f"p1[{i}]" for i in range(4)))
 )
 def test_words(changes, words):
     made = ParameterRowsAndSensorResponse("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
-    assert replace(made, **changes).words == words
+    assert replace(made, **changes).description == words
 
 
 @pytest.fixture(scope="module")

@@ -284,7 +284,9 @@ def test_welds_keep_the_orientation_at_the_start(held_tube):
     builder, made = built(held_tube, "weld")
     (grasp,), free = made.problem.system.grasps, builder.build_experiment(frozenset())
     assert grasp.kind == "weld"
-    start = free.problem.initial_state(free.problem.episodes[0], *free.problem.split(free.x, 0))
+    start = free.problem.initial_state(
+        free.problem.episodes[0], *free.problem.theta_and_initial_state_offset(free.x, 0)
+    )
     system, symbol = free.problem.system, ca.SX.sym("q", made.problem.system.n_coordinates)
     tree = system.numeric_mechanism()
     kinematics = forward_kinematics(tree, symbol)

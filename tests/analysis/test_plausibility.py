@@ -406,4 +406,4 @@ def test_noise_that_settings_state_ten_times_too_large(springs):
     name, value = doubt.setting.split(": ")
     assert name == "sensors.points_camera.std"
     assert float(value) == pytest.approx(1e-3, rel=0.15)
-    assert np.isclose(doubt.evidence, 1e-2 / (5 * float(value)), rtol=0.05)
+    assert np.isclose(doubt.evidence_ratio, 1e-2 / (5 * float(value)), rtol=0.05)

@@ -41,7 +41,7 @@ def test_blocks_have_the_names_of_the_project(symbols):
     assert [block.name for block in symbols.row_blocks] == ["del", "internal", "constraint", "p1"]
     parts = "x", "y", "z", "tilt_x", "tilt_y"
     assert symbols.row_blocks[2].full_names == tuple(f"constraint[hand.{part}]" for part in parts)
-    assert list(symbols.row_blocks[1].labels) == list(symbols.equations.system.internal_coordinates)
+    assert list(symbols.row_blocks[1].labels) == list(symbols.equations.system.internal_coordinate_symbols)
     assert symbols.column_blocks[3].full_names == ("u[shoulder]",)
     # parameters are called as everywhere, without a block
     assert symbols.column_blocks[4].full_names == symbols.equations.system.parameters.names

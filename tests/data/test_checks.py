@@ -52,7 +52,7 @@ def column(values, j, change):
 def causes(recording, driving=True, **sensors) -> set[str]:
     chosen = {name.replace("_", "."): options for name, options in sensors.items()}
     found = recording_quality_issues(recording, lambda group: chosen.get(group, SensorOptions()), driving)
-    assert all(doubt.recording == recording.name and doubt.advice and doubt.evidence >= 1 for doubt in found)
+    assert all(doubt.recording == recording.name and doubt.advice and doubt.evidence_ratio >= 1 for doubt in found)
     return {doubt.cause for doubt in found}
 
 

@@ -52,7 +52,7 @@ def swing(folder, name, seed, effects="[]"):
     problem = build_problem(run)
     start = {f"start.q.{joint}[bare]": 0.1 for joint in problem.system.mechanism.joint_names}
     values = problem.named_values(problem.vector({**TRUTH, **start}))
-    theta, offset = problem.split(problem.vector(values), 0)
+    theta, offset = problem.theta_and_initial_state_offset(problem.vector(values), 0)
     outcome = problem.predictor.predict_episode(problem.episodes[0], theta, offset, False)
     assert not isinstance(outcome, str)
     made = recording_from_prediction(problem.predictor, problem.episodes[0], outcome, problem.theta, seed)

@@ -228,7 +228,7 @@ def test_taking_noise_off_a_reading_leaves_the_torque_that_acts(step, inverse):
     problem = EstimationProblem(gained, [recorded(step, 7)], ("effort_gain@shoulder.inverse",))
     at, near = (np.array([value]) for value in (inverse, inverse + 0.01))
     episode = problem_whitened_at(problem, at, rounds=3).episodes[0]
-    errors, [theta, later] = episode.input_errors, [problem.split(x, 0)[0] for x in (at, near)]
+    errors, [theta, later] = episode.input_errors, [problem.theta_and_initial_state_offset(x, 0)[0] for x in (at, near)]
     assert np.max(np.abs(errors.torque_noise)) > WHITE
     acting, more = (problem.predictor.corrected_inputs(episode, own, ()).torque for own in (theta, later))
     np.testing.assert_allclose(acting, inverse * episode.torque - errors.total_torque_error, atol=1e-12)

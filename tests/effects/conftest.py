@@ -104,7 +104,7 @@ class Bench:
         state, n = np.zeros(sizes["nx"]), sizes["n"]
         state[at] = self.rest.state[: len(at)]
         state[[n + i for i in at]] = self.rest.state[len(at) : 2 * len(at)] + self.kick
-        for row, name in enumerate(step.system.internal_coordinates):
+        for row, name in enumerate(step.system.internal_coordinate_symbols):
             joint = name.rpartition(".")[2]
             if joint in names and not name.startswith("hysteresis"):
                 state[2 * n + row] = state[names.index(joint)]

@@ -50,7 +50,7 @@ def residual(problem, x, torque=0.0, posture=0.0, reference=None):
         feedback = replace(feedback, reference=feedback.reference + reference)
     torques = {"torque": episode.torque + torque, "measured_driven_angles": arm}
     changed = replace(episode, **torques, tracking_feedback=feedback, input_errors=errors)
-    result = problem.predictor.predict_episode(changed, *problem.split(x, 0), False)
+    result = problem.predictor.predict_episode(changed, *problem.theta_and_initial_state_offset(x, 0), False)
     return _sensor_whitened_residual(changed.measurements, result).residual
 
 
@@ -130,7 +130,9 @@ def small_gap(problem, size=1.0):
     rng = np.random.default_rng(5)
     truth = replace(episode, torque=episode.torque + 0.3 * size * TORQUE * rng.standard_normal(episode.torque.shape))
     truth = replace(truth, tracking_feedback=None)
-    result = problem.predictor.predict_episode(truth, *problem.split(problem.initial_unknowns, 0), False)
+    result = problem.predictor.predict_episode(
+        truth, *problem.theta_and_initial_state_offset(problem.initial_unknowns, 0), False
+    )
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     samples = tuple(replace(s, value=y + s.std * rng.standard_normal(y.shape)) for s, y in pairs)
     angles = result.rollout.state[:, :1] + size * ANGLE * rng.standard_normal((len(result.rollout.state), 1))
@@ -192,7 +194,7 @@ def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, fee
     other = replace(again, input_errors=episode.input_errors)
     found = []
     for each in (episode, other):
-        result = weighted.predictor.predict_episode(each, *problem.split(x, 0), False)
+        result = weighted.predictor.predict_episode(each, *problem.theta_and_initial_state_offset(x, 0), False)
         found.append(estimate_episode_torque_bias(each, result, whitening)[0])
     seen = 1 - (whitening.torque_bias_std[0] / BIAS) ** 2
     assert seen > 0.05

@@ -34,12 +34,12 @@ from yid_ocp.model.urdf import read_urdf
 
 @dataclass(frozen=True)
 class Added:
-    """An effect made of functions; `internal_coordinates` names its coordinates without momentum."""
+    """An effect made of functions; `internal_coordinate_symbols` names its coordinates without momentum."""
 
     kind: str
     location: str
     parameters: Parameters
-    internal_coordinates: Mapping[str, ca.SX] = field(default_factory=dict)
+    internal_coordinate_symbols: Mapping[str, ca.SX] = field(default_factory=dict)
     change: Callable = lambda effect, system: system
     add: Callable = lambda effect, state: StepTerms()
 
@@ -115,7 +115,7 @@ def creeping_grasp(grasp: str, rate: float) -> Added:
     internal = {name: ca.SX.sym(name)}
 
     def change(effect, system):
-        return changed_grasp(system, grasp, axial_slip=effect.internal_coordinates[name])
+        return changed_grasp(system, grasp, axial_slip=effect.internal_coordinate_symbols[name])
 
     def add(effect, state):
         held = next(g.held_frame for g in state.system.grasps if g.name == grasp)
@@ -136,7 +136,7 @@ def growing_link(joint: str, length: float, time: float) -> Added:
 
     def change(effect, system):
         placement = system.mechanism.joints[system.mechanism.joint_index(joint)].placement
-        shift = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(effect.internal_coordinates[name], 0, 0))
+        shift = Placement(ca.SX(ca.DM.eye(3)), ca.vertcat(effect.internal_coordinate_symbols[name], 0, 0))
         return changed_joint(system, joint, placement=placement @ shift)
 
     def add(effect, state):

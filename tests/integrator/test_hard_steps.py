@@ -44,7 +44,7 @@ class Hard:
         return compile_step(self.system, self.time_step, use_compiler=use_compiler, tolerance=self.tolerance)
 
     def inputs(self):
-        n, nz = self.system.n_coordinates, len(self.system.internal_coordinates)
+        n, nz = self.system.n_coordinates, len(self.system.internal_coordinate_symbols)
         start = np.concatenate([self.q, np.broadcast_to(self.p, n), np.zeros(nz)])
         torque = np.full((self.steps, len(self.system.driven)), self.torque)
         path = np.tile(self.q[list(self.system.prescribed_coordinate_indices)], (self.steps + 1, 1))

@@ -31,7 +31,7 @@ def rested(step, theta, angle=START, path=None):
 
 def places(mover, state, name="tip"):
     """Positions of a frame along states."""
-    return mover.trajectories(FramePositionFunction(mover.step.system, [name]), state)[:, 0]
+    return mover.frame_trajectories(FramePositionFunction(mover.step.system, [name]), state)[:, 0]
 
 
 def elsewhere(plan, change):

@@ -92,7 +92,7 @@ def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, 
     assert min(max(v for k, v in travel.items() if k.startswith(side)) for side in ("left", "right")) > 0.01
     system = found.simulator.step.system
     names = [end for grasp in system.grasps for end in (grasp.holder_frame, grasp.held_frame)]
-    at = found.simulator.trajectories(FramePositionFunction(system, names), found.rollout.state)
+    at = found.simulator.frame_trajectories(FramePositionFunction(system, names), found.rollout.state)
     at = at.reshape(len(found.t), -1, 2, 3)
     assert np.abs(at[:, :, 0] - at[:, :, 1]).max() < 1e-8
 

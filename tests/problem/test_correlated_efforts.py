@@ -111,7 +111,7 @@ def test_derivatives_and_transcriptions_count_what_is_correlated(urdf_folder, ho
     np.testing.assert_allclose(evaluation.jacobian, np.stack(moved, axis=1), rtol=1e-5, atol=1e-5 * np.abs(moved).max())
     np.testing.assert_allclose(problem.cost_and_gradient(x)[1], evaluation.jacobian.T @ evaluation.residual, rtol=1e-8)
     program = transcribe(problem)
-    arguments, theta = program.solver_arguments, program.block("theta").index.ravel()
+    arguments, theta = program.solver_arguments, program.block_layout("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
     solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9})
     assert float(solver(**arguments)["f"]) == pytest.approx(evaluation.cost, rel=1e-8)
@@ -148,7 +148,7 @@ def test_a_gear_does_not_give_way_to_the_noise_of_an_effort_that_is_compared(urd
         arm(step, path, made, angle=0.0, free=(name,)).episodes[0]
         for made in (effort, effort + 0.3 * rng.standard_normal(effort.shape), effort + 2.0)
     )
-    inner, gain = slice(50, -50), LowPassFilter(CUTOFF).noise_gains(0.01)[0]
+    inner, gain = slice(50, -50), LowPassFilter(CUTOFF).noise_gains_of_value_and_rates(0.01)[0]
     smooth = LowPassFilter(CUTOFF)(clean.grid.node_times, effort)
     np.testing.assert_allclose(clean.joint_loads[inner], smooth[inner], atol=0.02)
     assert np.std((noisy.joint_loads - clean.joint_loads)[inner]) < 0.5 * 0.3 * gain

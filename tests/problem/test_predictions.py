@@ -73,7 +73,7 @@ def test_residuals_are_those_of_the_result(problem):
         assert entry.unit == errors[entry.channel]["unit"]
         assert entry.t.shape == (len(entry.measured),)
         assert entry.measured.shape == entry.predicted.shape == entry.noise_std.shape
-        assert np.array_equal(entry.residual, entry.predicted - entry.measured, equal_nan=True)
+        assert np.array_equal(entry.predicted_minus_measured, entry.predicted - entry.measured, equal_nan=True)
     tip = next(entry for entry in found if entry.channel.endswith(".tip"))
     group = problem.episodes[0].recording.points[0]
     assert np.allclose(tip.t, group.t)

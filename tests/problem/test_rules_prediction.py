@@ -213,7 +213,7 @@ def test_readings_along_a_trajectory_are_those_of_its_rollout(urdf_folder):
     problem = problem_of(urdf_folder, "free", seeds=(1,))
     x = problem.initial_unknowns
     evaluation = problem.evaluate(x, False)
-    state, theta = evaluation.episode_predictions[0].rollout.state, problem.split(x, 0)[0]
+    state, theta = evaluation.episode_predictions[0].rollout.state, problem.theta_and_initial_state_offset(x, 0)[0]
     by_state = np.zeros((STEPS + 1, 4, len(x)))
     for k, samples in enumerate(problem.episodes[0].measurements):
         along, slopes = problem.predictor.readings_along_trajectory(samples, state, by_state, theta)

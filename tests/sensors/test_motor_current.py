@@ -70,7 +70,7 @@ def test_damping_is_found_from_currents_of_another_engine(step, made):
 def test_currents_say_what_efforts_say(step, made):
     """Over a constant, they give the residual and the slopes of an effort sensor with as much noise."""
     motors, joints = made.channel_groups[0], made.joints
-    effort = motors.values["current"][:, ::-1] * list(CONSTANTS.values())
+    effort = motors.values_by_quantity["current"][:, ::-1] * list(CONSTANTS.values())
     known = replace(joints, effort=effort, effort_std=NOISE * np.abs(list(CONSTANTS.values())), position_std=1e-4)
     pair = []
     for recording in (replace(made, joints=replace(joints, position_std=1e-4)), replace(made, joints=known)):
@@ -86,7 +86,11 @@ def test_a_synthetic_recording_holds_currents(step, made):
     problem = problem_of(step, made)
     again = problem.simulate_recording(TRUTH, seed=1)
     [motors] = again.channel_groups
-    assert (motors.name, motors.names, motors.values["current"].shape) == ("motors_left", PENDULUM, (401, 2))
+    assert (motors.name, motors.names, motors.values_by_quantity["current"].shape) == (
+        "motors_left",
+        PENDULUM,
+        (401, 2),
+    )
     again = replace(again, name="arm", joints=replace(again.joints, effort=None))
     found = solve(problem_of(step, again), GaussNewton()).parameters
     assert all(abs(found[name].value - true) < 4 * found[name].std for name, true in TRUTH.items())
@@ -96,8 +100,13 @@ def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, m
     write_recording(made, tmp_path / "run.h5")
     again = read_recording(tmp_path / "run.h5")
     [one], [other] = made.channel_groups, again.channel_groups
-    assert (one.name, one.names, one.stds, one.clock) == (other.name, other.names, other.stds, other.clock)
-    np.testing.assert_array_equal(one.values["current"], other.values["current"])
+    assert (one.name, one.names, one.stds_by_attribute, one.clock) == (
+        other.name,
+        other.names,
+        other.stds_by_attribute,
+        other.clock,
+    )
+    np.testing.assert_array_equal(one.values_by_quantity["current"], other.values_by_quantity["current"])
     with h5py.File(tmp_path / "run.h5") as file:
         assert {key: file["motors_left"][key].attrs["unit"] for key in ("t", "current")} == {"t": "s", "current": "A"}
     assert made.time_slice(1.0, 2.0).channel_groups[0].t[[0, -1]] == pytest.approx([1.0, 2.0])
@@ -120,10 +129,10 @@ def test_the_file_keeps_currents_and_refuses_what_no_sensor_declares(tmp_path, m
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"values": {"current": np.zeros((400, 2))}}, r"shape \(400, 2\)"),
-        ({"values": {"current": np.full((401, 2), np.nan)}}, "not finite"),
-        ({"values": {"voltage": np.zeros((401, 2))}}, "no sensor declares a dataset 'voltage'"),
-        ({"stds": {"current_std": -1.0}}, "current_std is -1.0"),
+        ({"values_by_quantity": {"current": np.zeros((400, 2))}}, r"shape \(400, 2\)"),
+        ({"values_by_quantity": {"current": np.full((401, 2), np.nan)}}, "not finite"),
+        ({"values_by_quantity": {"voltage": np.zeros((401, 2))}}, "no sensor declares a dataset 'voltage'"),
+        ({"stds_by_attribute": {"current_std": -1.0}}, "current_std is -1.0"),
         ({"name": "engines"}, "no sensor declares a dataset 'current'"),
         ({"t": T[::-1]}, "does not advance"),
     ],
@@ -140,7 +149,7 @@ def test_a_group_that_cannot_be_written_is_refused(tmp_path, made, changes, mess
         (SensorOptions(), {}, "torque constants are not given"),
         (SensorOptions(constants={"torque_constant": 0.0}), {}, "a torque constant is zero"),
         (SensorOptions(constants={"torque_constant": {"elbow": 1.0}}), {}, "joint 'shoulder' has no value"),
-        (KNOWN, {"stds": {}}, "noise level of the motor currents"),
+        (KNOWN, {"stds_by_attribute": {}}, "noise level of the motor currents"),
         (KNOWN, {"names": ("elbow", "sholder")}, "no joint 'sholder'"),
         (replace(KNOWN, use=False), {}, "no measurement that the model could be compared with"),
     ],

@@ -126,7 +126,7 @@ def test_its_reduced_gradient_is_the_problems(problem):
         # the program holds the first state where the problem holds its offset from rest, which moves with theta
         count = len(problem.shared_parameters)
         for i, episode in enumerate(problem.episodes):
-            by = problem.initial_state(episode, problem.split(x, i)[0]).state_sensitivity[rows]
+            by = problem.initial_state(episode, problem.theta_and_initial_state_offset(x, i)[0]).state_sensitivity[rows]
             at = problem.unknowns.unknown_indices_of_recording(i)[len(problem.unknowns.free_parameters) :]
             expected[:count] -= by[:, :count].T @ expected[at]
     np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7 * np.abs(expected).max())
@@ -157,7 +157,7 @@ def test_internal_coordinates_are_among_the_states(paper_systems, recording, one
         step, [recording], ("T1.bend", effect.parameters.names[0]), ProblemOptions(duration=0.05)
     )
     program = transcribe(problem)
-    assert program.block("z").index.shape == (step.sizes["nz"], 6)
+    assert program.block_layout("z").index.shape == (step.sizes["nz"], 6)
     x = problem.initial_unknowns * 4
     w, evaluation = rolled_out(problem, program, x)
     cost, defects = values_at(program, w, program.f, program.g)
@@ -246,7 +246,7 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     assert problem_whitened_by_sensor_noise(problem).evaluate(x).cost > 3 * expected
     program = transcribe(problem)
     arguments = program.solver_arguments
-    theta = program.block("theta").index.ravel()
+    theta = program.block_layout("theta").index.ravel()
     arguments["lbx"][theta] = arguments["ubx"][theta] = x
     solver = program.make_solver("ipopt", "exact", ipopt={"print_level": 0, "sb": "yes", "tol": 1e-9, "max_iter": 50})
     found = solver(**arguments)
@@ -256,7 +256,7 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     exact = not encoders and feedback["feedback"] != "lqr"
     assert float(found["f"]) == pytest.approx(expected, rel=1e-4 if exact else 4e-3)
     assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback["feedback"] != "none")
-    assert program.block("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
+    assert program.block_layout("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
 
 
 def test_a_fit_among_noise_is_judged_by_its_likelihood(urdf_folder):

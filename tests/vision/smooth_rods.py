@@ -102,7 +102,7 @@ def seen(meshes: Sequence[TriangleMesh], seed, *, pose=None, pinhole=PINHOLE, no
     mesh = TriangleMesh.concatenate(list(meshes))
     corners, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
     scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(faces))
-    directions = pinhole.pixel_rays @ camera[:3, :3].T
+    directions = pinhole.pixel_rays_at_unit_depth @ camera[:3, :3].T
     packed = np.concatenate([np.broadcast_to(camera[:3, 3], directions.shape), directions], axis=-1)
     depth = scene.cast_rays(o3d.core.Tensor(packed.astype(np.float32)), nthreads=1)["t_hit"].numpy().astype(float)
     rng = np.random.default_rng(seed)

@@ -32,7 +32,7 @@ def changed(folder, **entries):
 
 def test_depth_to_cloud_of_a_camera_of_58_degrees_and_another():
     xtion = vision.XTION_INTRINSICS
-    left, right = xtion.pixel_rays[240, 0], xtion.pixel_rays[240, -1]
+    left, right = xtion.pixel_rays_at_unit_depth[240, 0], xtion.pixel_rays_at_unit_depth[240, -1]
     cosine = left @ right / np.linalg.norm(left) / np.linalg.norm(right)
     assert np.degrees(np.arccos(cosine)) == pytest.approx(58.0, abs=0.2)
     assert (xtion.width, xtion.height) == (640, 480)
@@ -287,7 +287,7 @@ def pixels(lens, points):
 @pytest.mark.parametrize("name", LENSES)
 def test_a_ray_appears_at_its_pixel(name):
     u, v = np.meshgrid(np.arange(64), np.arange(48))
-    assert np.abs(pixels(LENSES[name], LENSES[name].pixel_rays) - np.stack([u, v], axis=-1)).max() < 2e-3
+    assert np.abs(pixels(LENSES[name], LENSES[name].pixel_rays_at_unit_depth) - np.stack([u, v], axis=-1)).max() < 2e-3
 
 
 def test_the_formula_of_ros():
@@ -308,7 +308,7 @@ def test_the_formula_of_ros():
 def test_pixels_that_a_lens_does_not_have_are_no_points():
     """A barrel that turns back: its corners have no direction."""
     lens = CameraIntrinsics(64, 48, 30.0, 30.0, 31.5, 23.5, "plumb_bob", (-0.6, 0.0, 0.0, 0.0))
-    assert np.isnan(lens.pixel_rays[0, 0]).any()
+    assert np.isnan(lens.pixel_rays_at_unit_depth[0, 0]).any()
     cloud = lens.points_from_depth(np.ones((48, 64)))
     assert np.isfinite(cloud).all()
     assert len(cloud) < 48 * 64

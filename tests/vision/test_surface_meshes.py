@@ -150,7 +150,7 @@ def test_rays_meet_a_ball_where_it_is(ball):
     away = np.linalg.norm([1.2, 0.3, 0.1])
     assert depth[15, 20] == pytest.approx(away - 0.1, abs=1e-3)
     assert cosine[15, 20] == pytest.approx(1.0, abs=0.01)
-    rays = camera.pixel_rays / np.linalg.norm(camera.pixel_rays, axis=2)[..., None]
+    rays = camera.pixel_rays_at_unit_depth / np.linalg.norm(camera.pixel_rays_at_unit_depth, axis=2)[..., None]
     miss = away * np.sqrt(1 - rays[..., 2] ** 2)
     assert np.isfinite(depth[miss < 0.097]).all()
     assert np.isinf(depth[miss > 0.103]).all()

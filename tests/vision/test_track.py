@@ -132,11 +132,11 @@ def test_the_points_are_those_that_no_arm_holds(system, small):
 def test_the_spline_passes_through_the_good_frames(clean, system):
     found = clean.track
     for k, t in enumerate(found.t):
-        assert np.allclose(found.points_at(t), found.position[k], atol=1e-9)
+        assert np.allclose(found.point_positions_at_time(t), found.position[k], atol=1e-9)
     between = 0.5 * (found.t[4] + found.t[5])
     truth = found._place(clean.made.true_configuration_at(between))
-    assert np.linalg.norm(found.points_at(between) - truth, axis=1).max() < 0.05
-    assert np.array_equal(found.configuration_at(found.t[-1] + 5.0), found.configuration_at(found.t[-1]))
+    assert np.linalg.norm(found.point_positions_at_time(between) - truth, axis=1).max() < 0.05
+    assert np.array_equal(found.configuration_at_time(found.t[-1] + 5.0), found.configuration_at_time(found.t[-1]))
 
 
 def unreadable():

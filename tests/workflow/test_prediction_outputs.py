@@ -104,7 +104,9 @@ def problem_of(step, *, bias=OFFSET, white=WHITE, held_out=True, options=None):
     bare = replace(options, feedback="none", proportional_gains=None)
     made = EstimationProblem(step, [first], ("elbow.stiffness",), bare)
     episode = made.episodes[0]
-    swept = made.predictor.predict_episode(episode, *made.split(made.initial_unknowns, 0), False)
+    swept = made.predictor.predict_episode(
+        episode, *made.theta_and_initial_state_offset(made.initial_unknowns, 0), False
+    )
     joints = replace(first.joints, position=swept.rollout.state[:, :1], effort=torque + 0.3)
     recordings = [replace(first, joints=joints, name=name) for name in ("first", "second")]
     apart = recordings[1:] if held_out else ()
@@ -145,7 +147,9 @@ def test_the_table_has_a_row_for_a_joint_and_a_column_for_a_recording():
 
 def simulated(problem, seeds):
     episode = problem.episodes[0]
-    outcome = problem.predictor.predict_episode(episode, *problem.split(problem.initial_unknowns, 0), False)
+    outcome = problem.predictor.predict_episode(
+        episode, *problem.theta_and_initial_state_offset(problem.initial_unknowns, 0), False
+    )
     known = (problem.predictor, episode, outcome, problem.theta)
     return [recording_from_prediction(*known, seed).joints for seed in seeds]
 
@@ -212,7 +216,7 @@ def test_the_best_guess_counts():
     said["baselines"]["stays"] = {"points.p": 0.1}
     (doubt,) = prediction_outputs.worse_than_baseline_issues([said], UNITS)
     assert doubt.what == "the model is off by 0.2 m (rms), the guess 'stays' without a model by 0.1 m"
-    assert doubt.evidence == pytest.approx(0.2 / 0.105)
+    assert doubt.evidence_ratio == pytest.approx(0.2 / 0.105)
 
 
 @pytest.mark.parametrize(("factor", "believed"), [(1.0, True), (0.4, False)])

@@ -338,7 +338,7 @@ def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> Al
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)
     for i, episode in enumerate(problem.episodes):
-        shared, offset = problem.split(x, i)
+        shared, offset = problem.theta_and_initial_state_offset(x, i)
         theta = predictor.theta_with_episode_values(episode, shared)
         begin = predictor.initial_state(episode, theta, offset, ())
         if begin.failure_message:

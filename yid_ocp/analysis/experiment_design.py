@@ -70,7 +70,7 @@ class RecordedExperiment:
     @property
     def parameter_values(self) -> dict[str, float]:
         """Values of all model parameters at `x`, by name."""
-        theta, _ = self.problem.split(self.x, 0)
+        theta, _ = self.problem.theta_and_initial_state_offset(self.x, 0)
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_sample_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
@@ -377,7 +377,11 @@ class CandidateExperimentBuilder:
         layout = self.build_experiment(others)
         if isinstance(layout, str):
             raise SolverError(layout)
-        problem, n, (theta, offset) = layout.problem, system.n_coordinates, layout.problem.split(layout.x, 0)
+        problem, n, (theta, offset) = (
+            layout.problem,
+            system.n_coordinates,
+            layout.problem.theta_and_initial_state_offset(layout.x, 0),
+        )
         start = problem.initial_state(problem.episodes[0], theta, offset)
         if start.failure_message:
             raise SolverError(start.failure_message)

@@ -70,8 +70,8 @@ def fit_friction_law(
                 errors[episode.name] = float("nan")
                 continue
             parts = channel_predictions(episode, outcome)
-            scale = [np.ones_like(p.residual) if len(units) == 1 else p.noise_std for p in parts]
-            squares = [np.sum((p.residual / s) ** 2, axis=1) for p, s in zip(parts, scale, strict=True)]
+            scale = [np.ones_like(p.predicted_minus_measured) if len(units) == 1 else p.noise_std for p in parts]
+            squares = [np.sum((p.predicted_minus_measured / s) ** 2, axis=1) for p, s in zip(parts, scale, strict=True)]
             errors[episode.name] = float(np.sqrt(np.nanmean(np.concatenate(squares))))
     unit = units.pop() if len(units) == 1 else "std"
     free = {name: entry for name, entry in solution.parameters.items() if name in problem.free}
@@ -127,7 +127,7 @@ def friction_torque_clouds(
         assert joints is not None
         low_pass = LowPassFilter(problem.options.path_cutoff)
         path = smoothed_joint_angles(joints, driven, episode.grid, episode.name, low_pass)
-        theta, _ = problem.split(solution.x, i)
+        theta, _ = problem.theta_and_initial_state_offset(solution.x, i)
         theta = problem.predictor.theta_with_episode_values(episode, theta)
         inputs = problem.predictor.corrected_inputs(episode, theta, ())
         shift = inputs.driven_angles - episode.measured_driven_angles

@@ -85,7 +85,9 @@ def linearise_step_equations(
 
 def system_with_numeric_parameters(system: System, theta: Array) -> System:
     """The system with numeric parameter values in place of symbols, internal coordinates at zero."""
-    inner = ca.vertcat(*system.internal_coordinates.values()) if system.internal_coordinates else ca.SX(0, 1)
+    inner = (
+        ca.vertcat(*system.internal_coordinate_symbols.values()) if system.internal_coordinate_symbols else ca.SX(0, 1)
+    )
     symbols = ca.vertcat(system.parameters.symbols, inner)
     values = np.concatenate([theta, np.zeros(inner.numel())])
 
@@ -135,7 +137,7 @@ class ParameterRowsAndSensorResponse:
     along: float | None = None  # the same of all readings of the recordings, root of the sum of squares
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """Sentences on the equation rows, then on the change of readings from rest and along the recordings."""
         said = f"{self.parameter} enters {self._rows}"
         if self.read:
@@ -370,7 +372,7 @@ def step_sparsity_patterns(symbols: StepSymbols) -> dict[str, SparsityPattern]:
         full[known] = y
         direct = np.hstack([block("p1", column) for column in columns])
         p1 = direct | _times(np.hstack([block("p1", c) for c in ("q1", "z1", "lam")]), full)
-        nz = len(system.internal_coordinates)
+        nz = len(system.internal_coordinate_symbols)
         return np.vstack([full[:nc], p1, full[nc : nc + nz]])
 
     unknowns = _blocks(symbols, "q1", "z1", "lam", kept=free)

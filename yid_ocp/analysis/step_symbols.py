@@ -244,7 +244,7 @@ class StepSymbols(ReprMixin):
     def from_equations(equations: DiscreteEquations) -> StepSymbols:
         """Named rows and columns of a step's equations."""
         e, system = equations, equations.system
-        joints, internal = system.mechanism.joint_names, tuple(system.internal_coordinates)
+        joints, internal = system.mechanism.joint_names, tuple(system.internal_coordinate_symbols)
         closed = tuple(name for grasp in system.grasps for name in grasp.constraint_equation_names)
         k, after = r"_{k,\,#}", r"_{k+1,\,#}"
         rows = (

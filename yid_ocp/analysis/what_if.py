@@ -61,7 +61,7 @@ class ChangedExperimentResult:
     """
 
     changes: tuple[str, ...]
-    words: str
+    description: str
     std_relative: Mapping[str, float]
     verdicts: Mapping[str, str]
     identifiable: int  # number of parameters
@@ -93,7 +93,7 @@ class ExperimentRanking(ReprMixin):
     def _summary(self) -> ReprSummary:
         shown = (self.unchanged_experiment, *self.single_changes)
         rows = [("change", "parameters found", "gain [nat]")]
-        rows += [(entry.words, str(entry.identifiable), f"{entry.gain:.3g}") for entry in shown]
+        rows += [(entry.description, str(entry.identifiable), f"{entry.gain:.3g}") for entry in shown]
         count = count_with_noun(len(self.single_changes), "change")
         return ReprSummary(f"{count}, {self.n_evaluated_sets} sets of them judged", rows)
 

@@ -166,7 +166,7 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
             yield Issue("quantised", what, "not_trusted", ratio, advice, "", group, channel, setting=line)
             continue
         seen = max(white_noise_std(t, column) for column in columns)
-        if next(entry.clock for entry in recording.groups if entry.name == group) == "nominal":
+        if next(entry.clock for entry in recording.joint_and_point_groups if entry.name == group) == "nominal":
             # when a sample was taken is known to half a period, which looks like noise wherever something moves
             seen -= min(seen, 0.5 * max(float(np.mean(np.abs(np.diff(column)))) for column in columns))
         if seen > QUALITY_LIMITS.max_noise_ratio * stated > 0:

@@ -318,15 +318,15 @@ def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
 
 def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
     """Issue naming the second recording if both hold the same measurement at least in part, else None."""
-    others = {group.name: group for group in other.groups}
+    others = {group.name: group for group in other.joint_and_point_groups}
     count = 0
-    for group in one.groups if one.joints is None else (one.joints,):
+    for group in one.joint_and_point_groups if one.joints is None else (one.joints,):
         if group.name in others:
             numbers = _transitions(group, others[group.name])
             length = _longest_shared_run(*numbers)
             if length and _log_chance_of_run(*numbers, length) < math.log(QUALITY_LIMITS.max_chance_of_shared_run):
                 count = max(count, length + 1)
-    few = min(len(group.t) for recording in (one, other) for group in recording.groups[:1])
+    few = min(len(group.t) for recording in (one, other) for group in recording.joint_and_point_groups[:1])
     if count < min(QUALITY_LIMITS.min_shared_samples, 0.5 * few):
         return None
     what = f"{count} samples of {other.name} are those of {one.name} to the last digit"

@@ -15,7 +15,7 @@ from yid_ocp.sensors import SensorOptions
 Severity = Literal["warning", "not_trusted", "refused"]
 
 MAX_EVIDENCE_RATIO = 1e3
-"""Largest value of `Issue.evidence`; larger ratios are clipped."""
+"""Largest value of `Issue.evidence_ratio`; larger ratios are clipped."""
 DEGREES_PER_RADIAN = math.degrees(1.0)
 MIN_DIFFERENCES_FOR_NOISE_STD = 30
 """Smallest number of differences between samples from which a channel's noise is estimated."""
@@ -53,7 +53,9 @@ class Issue:
     what: str  # the same in one sentence, with numbers
     # whether a run goes on as it would (and says so), goes on but says of no number that it is found, or stops
     weight: Severity
-    evidence: float  # how many times what was seen exceeds the limit from which on it counts, 1 to `MAX_EVIDENCE_RATIO`
+    evidence_ratio: (
+        float  # how many times what was seen exceeds the limit from which on it counts, 1 to `MAX_EVIDENCE_RATIO`
+    )
     advice: str  # what to do
     # where; empty for all of them
     recording: str
@@ -67,12 +69,12 @@ class Issue:
     def __post_init__(self) -> None:
         if self.cause not in ISSUE_CAUSE_DESCRIPTIONS:
             raise ValueError(f"there is no cause '{self.cause}'")
-        object.__setattr__(self, "evidence", float(min(max(self.evidence, 1.0), MAX_EVIDENCE_RATIO)))
+        object.__setattr__(self, "evidence_ratio", float(min(max(self.evidence_ratio, 1.0), MAX_EVIDENCE_RATIO)))
 
     @property
     def certainty_word(self) -> str:
         """Certainty in one word: perhaps, likely or certain."""
-        return "perhaps" if self.evidence < 1.5 else "likely" if self.evidence < 3 else "certain"
+        return "perhaps" if self.evidence_ratio < 1.5 else "likely" if self.evidence_ratio < 3 else "certain"
 
     @property
     def where(self) -> str:

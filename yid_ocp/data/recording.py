@@ -183,9 +183,9 @@ class ChannelGroup(ReprMixin):
         Of joints, or whatever the columns are.
     t : ndarray, shape (M,)
         Strictly increasing time [s].
-    values : mapping of quantity to ndarray, shape (M, k) or (M, k, components)
+    values_by_quantity : mapping of quantity to ndarray, shape (M, k) or (M, k, components)
         In the channel's unit.
-    stds : mapping of str to float or ndarray, shape (k,)
+    stds_by_attribute : mapping of str to float or ndarray, shape (k,)
         Noise by attribute (`QUANTITY_std`, `QUANTITY_bias_std`), where known, in the channel's unit.
     clock : {'recorded', 'nominal'}
     """
@@ -193,23 +193,29 @@ class ChannelGroup(ReprMixin):
     name: str
     names: tuple[str, ...]
     t: Array
-    values: Mapping[str, Array]
-    stds: Mapping[str, float | Array] = field(default_factory=dict)
+    values_by_quantity: Mapping[str, Array]
+    stds_by_attribute: Mapping[str, float | Array] = field(default_factory=dict)
     clock: RecordedOrNominalClock = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
         _freeze_arrays(self, ("t",))
-        values = {key: read_only_array(value, f"{self.name}/{key}") for key, value in self.values.items()}
-        stds = {key: _constant(std, f"{self.name}, attribute {key}") for key, std in self.stds.items()}
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "stds", stds)
+        values = {key: read_only_array(value, f"{self.name}/{key}") for key, value in self.values_by_quantity.items()}
+        stds = {key: _constant(std, f"{self.name}, attribute {key}") for key, std in self.stds_by_attribute.items()}
+        object.__setattr__(self, "values_by_quantity", values)
+        object.__setattr__(self, "stds_by_attribute", stds)
 
     def _summary(self) -> ReprSummary:
-        return ReprSummary(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {', '.join(self.values)}")
+        return ReprSummary(
+            f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {', '.join(self.values_by_quantity)}"
+        )
 
     def _rows(self, rows: BoolArray) -> ChannelGroup:
-        return replace(self, t=self.t[rows], values={key: value[rows] for key, value in self.values.items()})
+        return replace(
+            self,
+            t=self.t[rows],
+            values_by_quantity={key: value[rows] for key, value in self.values_by_quantity.items()},
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -253,27 +259,30 @@ class Recording(ReprMixin):
         counts = " and ".join(count_with_noun(len(own), noun) for noun, own in names.items())
         rows = [("group", "names", "samples", "channels")]
         for g in self.all_groups:
-            channels = g.channels if isinstance(g, JointGroup) else getattr(g, "values", ("position",))
+            channels = g.channels if isinstance(g, JointGroup) else getattr(g, "values_by_quantity", ("position",))
             rows.append((g.name, ", ".join(g.names), _sampled(g.t), ", ".join(channels)))
         span = f", {self.duration:.4g} s" if self.all_groups else ""
         return ReprSummary(f"'{self.name}', {counts}{span}", rows)
 
     @property
-    def groups(self) -> tuple[JointGroup | PointGroup, ...]:
+    def joint_and_point_groups(self) -> tuple[JointGroup | PointGroup, ...]:
         """Groups of joints and points, joints first."""
         return ((self.joints,) if self.joints is not None else ()) + self.points
 
     @property
     def all_groups(self) -> tuple[JointGroup | PointGroup | ChannelGroup, ...]:
         """All groups: joints first, then points, then channels of further sensors."""
-        return (*self.groups, *self.channel_groups)
+        return (*self.joint_and_point_groups, *self.channel_groups)
 
     @property
     def sensor_setting_keys(self) -> tuple[str, ...]:
         """Keys that the settings may have under `sensors` for this recording, such as `joints.effort`."""
         own = [f"joints.{quantity}" for quantity in ("effort", "position") if self.joints is not None]
         own += [group.name for group in self.points]
-        return (*own, *(f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values))
+        return (
+            *own,
+            *(f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values_by_quantity),
+        )
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -451,18 +460,21 @@ def _validate_channels(group: ChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
     declared = {channel.quantity: channel for channel in declared_channel_kinds(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
-    require_data(group.values, "the group has no values", where, ", ".join(declared))
-    for noun, found, known in (("dataset", group.values, declared), ("attribute", group.stds, fields)):
+    require_data(group.values_by_quantity, "the group has no values", where, ", ".join(declared))
+    for noun, found, known in (
+        ("dataset", group.values_by_quantity, declared),
+        ("attribute", group.stds_by_attribute, fields),
+    ):
         for name in found:
             what = f"no sensor declares a {noun} '{name}' here"
             allowed = ", ".join(known) or "groups that a sensor declares"
             require_data(name in known, what, where, allowed, nearest_name_hint(name, known))
-    for quantity, values in group.values.items():
+    for quantity, values in group.values_by_quantity.items():
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
         _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
         require_data(np.isfinite(values).all(), "a value is not finite", f"{where}/{quantity}", "finite numbers")
-    for name, std in group.stds.items():
+    for name, std in group.stds_by_attribute.items():
         _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
 
 

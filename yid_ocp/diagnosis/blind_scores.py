@@ -60,12 +60,12 @@ class BlindCaseScore:
         return self.confusable or tuple(self.answer.split(" + ")[:1])
 
     @property
-    def sort(self) -> str:
+    def true_class_label(self) -> str:
         """The row of the confusion matrix: the kind of a single effect, else the category."""
         return self.truth.partition("@")[0] if self.category == "single" else self.category
 
     @property
-    def said(self) -> str:
+    def answered_class_label(self) -> str:
         """The column of the confusion matrix: kind of the first effect added, else the verdict."""
         return self.verdict if self.answer == "-" else self.answer.partition("@")[0]
 
@@ -215,9 +215,12 @@ def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
 def _confusion_matrix(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """The confusion matrix: true classes (rows), answers (columns) and counts."""
-    rows = sorted({m.sort for m in marks}, key=lambda name: (name in _CATEGORIES, name))
-    columns = sorted({m.said for m in marks}, key=lambda name: (name in _VERDICTS, name))
-    counts = [[sum((m.sort, m.said) == (row, column) for m in marks) for column in columns] for row in rows]
+    rows = sorted({m.true_class_label for m in marks}, key=lambda name: (name in _CATEGORIES, name))
+    columns = sorted({m.answered_class_label for m in marks}, key=lambda name: (name in _VERDICTS, name))
+    counts = [
+        [sum((m.true_class_label, m.answered_class_label) == (row, column) for m in marks) for column in columns]
+        for row in rows
+    ]
     return {"true": rows, "said": columns, "counts": counts}
 
 

@@ -220,7 +220,7 @@ def final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.detectability} - {effect.label for effect in fit.effects}
-    theta, _ = problem.split(problem.vector(fit.values), 0)
+    theta, _ = problem.theta_and_initial_state_offset(problem.vector(fit.values), 0)
     found = {}
     for entry, value in zip(problem.system.parameters, theta, strict=True):
         if entry.name not in problem.local_parameters and entry.name.rpartition(".")[0] not in idle:

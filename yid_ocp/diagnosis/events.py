@@ -39,7 +39,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.problem.signal_filters import effort_filter
+from yid_ocp.problem.signal_filters import two_pass_effort_filter
 from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
 
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
@@ -140,8 +140,8 @@ def find_disturbance_events(
     Jacobian where there is `smoothed`. Forces that move the model are sought where the smoother found some.
     """
     fitted = zip(problem.episodes, evaluation.episode_predictions, strict=True)
-    told = [(e, result, problem.split(x, i)[0]) for i, (e, result) in enumerate(fitted)]
-    shared = problem.split(x, 0)[0]
+    told = [(e, result, problem.theta_and_initial_state_offset(x, i)[0]) for i, (e, result) in enumerate(fitted)]
+    shared = problem.theta_and_initial_state_offset(x, 0)[0]
     told += [(e, found, shared) for e, found in problem.predict_held_out(x) if not isinstance(found, str)]
     runs = [(e, result, problem.predictor.theta_with_episode_values(e, theta)) for e, result, theta in told]
     ends = EventSet((), tuple(fall for run in runs for fall in _overspeed(problem, run, limits)))
@@ -183,7 +183,7 @@ def _overspeed(problem: EstimationProblem, run: _RecordingRollout, limits: Thres
 
 def _before_overspeed(history: ForceEstimate, ends: EventSet) -> ForceEstimate | None:
     """A history up to where its recording's motion gets too fast, less what a filter smears; None where too short."""
-    until = ends._end_of(history.recording) - effort_filter(history.filter_cutoff).settling_time
+    until = ends._end_of(history.recording) - two_pass_effort_filter(history.filter_cutoff).settling_time
     keep = np.flatnonzero(history.t <= until)
     return None if len(keep) < 10 else history.subset_at_times(keep)
 
@@ -438,7 +438,7 @@ def _counting(
     t = times_since_recording_start(episode, samples)
     t = t if t.ndim > 1 else np.broadcast_to(t[:, None], hidden.shape)
     if math.isfinite(end) and is_effort:
-        hidden |= t > end - effort_filter(cutoff).settling_time
+        hidden |= t > end - two_pass_effort_filter(cutoff).settling_time
     smear = 1 / cutoff if is_effort else 0.0
     for event in own:
         inside = (t > event.start_time - smear) & (t < event.end_time + smear)

@@ -30,7 +30,7 @@ from yid_ocp.integrator.step import Step, applied_joint_torque
 from yid_ocp.integrator.step_model import Rollout
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.system import MidpointState, System
-from yid_ocp.problem.signal_filters import effort_filter
+from yid_ocp.problem.signal_filters import two_pass_effort_filter
 
 _STANDSTILL_SPEED = 0.1  # speed below which static friction may act [rad/s or m/s]
 
@@ -77,7 +77,7 @@ class InverseDynamicsModel:
 
 def _function(system: System, time_step: float) -> ca.Function:
     """(q, v, a, z, theta) to the sum of squares of all terms, the torque needed, and what friction may hold."""
-    n, names = system.n_coordinates, tuple(system.internal_coordinates)
+    n, names = system.n_coordinates, tuple(system.internal_coordinate_symbols)
     q, v, a, z = (ca.SX.sym(name, size) for name, size in (("q", n), ("v", n), ("a", n), ("z", len(names))))
     kinematics = forward_kinematics(system.mechanism, q)
     moving = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
@@ -102,7 +102,7 @@ def _function(system: System, time_step: float) -> ca.Function:
     faster, slower = (ca.substitute(viscous, v, v + sign * _STANDSTILL_SPEED) for sign in (1, -1))
     outputs = [ca.densify(x) for x in (squares, needed, (faster - slower) / 2)]
     if names:
-        symbols = ca.vertcat(*system.internal_coordinates.values())
+        symbols = ca.vertcat(*system.internal_coordinate_symbols.values())
         outputs = [ca.substitute(x, symbols, z) for x in outputs]
     return ca.Function("torque_terms", [q, v, a, z, system.parameters.symbols], outputs)
 
@@ -222,7 +222,7 @@ class _Filter:
         delay = np.asarray(0.1 / cutoff * np.arange(-length, length + 1), float)
         impulse = np.zeros((len(delay), 1))
         impulse[length] = 1.0
-        weight = effort_filter(cutoff)(delay, impulse)[:, 0]
+        weight = two_pass_effort_filter(cutoff)(delay, impulse)[:, 0]
         return _Filter(delay, weight / weight.sum())
 
     def __call__(self, windows: _Windows, t: Array) -> Array:

@@ -120,9 +120,9 @@ class Backlash(_DistortedReading):
         return ("play",) if location in system.servos else ()
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        if not self.internal_coordinates:
+        if not self.internal_coordinate_symbols:
             return StepTerms()
-        [name] = self.internal_coordinates
+        [name] = self.internal_coordinate_symbols
         row, index = state.internal_rows[name], state.system.mechanism.joint_index(self.location)
         # its value after the step: a mean over the step would have it ring
         play = state.z[row] + state.h / 2 * state.z_rate[row]
@@ -140,13 +140,13 @@ class Backlash(_DistortedReading):
         return self["width"] / 2 * ca.tanh(effort / _PLAY_TORQUE)
 
     def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
-        for name in self.internal_coordinates if self._is_own(channel) else ():
+        for name in self.internal_coordinate_symbols if self._is_own(channel) else ():
             return output + state.z[state.internal_rows[name]]
         return super().distorted_reading(channel, output, state)
 
     def corrected_reading(self, channel: str, reading: ca.SX, effort: ca.SX) -> ca.SX:
         # a servo's coordinate follows from the motion, and its command is of the motor's side
-        return reading if self.internal_coordinates else super().corrected_reading(channel, reading, effort)
+        return reading if self.internal_coordinate_symbols else super().corrected_reading(channel, reading, effort)
 
 
 class _DistortedEffort(_DistortedReading):

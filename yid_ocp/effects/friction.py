@@ -150,10 +150,10 @@ class JointPresliding(EffectBase):
     @property
     def max_abs_unknown_initial_states(self) -> Mapping[str, float]:
         """`s` with the largest absolute value 1: its value at the start of a recording is estimated."""
-        return dict.fromkeys(self.internal_coordinates, 1.0)
+        return dict.fromkeys(self.internal_coordinate_symbols, 1.0)
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        [name] = self.internal_coordinates
+        [name] = self.internal_coordinate_symbols
         row, index = state.internal_rows[name], state.system.mechanism.joint_index(self.location)
         s, rate, width = state.z[row], state.z_rate[row], self["yield_angle"]
         turned = state.h * state.v[index]

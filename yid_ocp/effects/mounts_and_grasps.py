@@ -171,10 +171,10 @@ class GraspSlip(_GraspChange):
         return ("offset",)
 
     def _changes(self, grasp: Grasp) -> dict[str, Any]:
-        return {"axial_slip": grasp.axial_slip - self.internal_coordinates[f"{self.label}.offset"]}
+        return {"axial_slip": grasp.axial_slip - self.internal_coordinate_symbols[f"{self.label}.offset"]}
 
     def step_terms(self, state: MidpointState) -> StepTerms:
-        [name] = self.internal_coordinates
+        [name] = self.internal_coordinate_symbols
         row, grasps = state.internal_rows[name], state.system.grasps
         at = base.grasp_names(state.system).index(self.location)
         first = sum(grasp.n_constraint_equations for grasp in grasps[:at])

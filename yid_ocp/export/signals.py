@@ -84,7 +84,7 @@ def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[s
 def ros_signals_from_recording(recording: Recording) -> list[RosTopicTimeSeries]:
     """The signals of a recording: `/joint_states`, `/joint_commands`, `/external_efforts` and `/points/GROUP/POINT`."""
     found: list[RosTopicTimeSeries] = []
-    for group in recording.groups:
+    for group in recording.joint_and_point_groups:
         if isinstance(group, JointGroup):
             for topic, form, names in (
                 ("/joint_states", "{}", ("position", "velocity", "effort")),
@@ -134,7 +134,7 @@ def export_csv(recording: Recording, folder: str | os.PathLike[str]) -> tuple[Pa
     """
     folder = make_folder(folder)
     written = []
-    for group in recording.groups:
+    for group in recording.joint_and_point_groups:
         if isinstance(group, JointGroup):
             stem, columns = "joints", [f"{channel}_{name}" for channel in group.channels for name in group.names]
             table = np.column_stack([group.t, *group.channels.values()])

@@ -66,7 +66,7 @@ class ResidualDerivativesAtNodes:
     by_effort_after: Array
 
     @staticmethod
-    def along(course: NominalTrajectory) -> ResidualDerivativesAtNodes:
+    def from_nominal_trajectory(course: NominalTrajectory) -> ResidualDerivativesAtNodes:
         """The residual's derivatives from those of the sensors along a nominal trajectory."""
         step, theta = course.model_functions.step, course.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)

@@ -278,7 +278,9 @@ def linear_residual_models(
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
         groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
-        nominal = nominal_trajectory_from_prediction(problem.predictor, episode, result, problem.split(x, i)[0])
+        nominal = nominal_trajectory_from_prediction(
+            problem.predictor, episode, result, problem.theta_and_initial_state_offset(x, i)[0]
+        )
         pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
         blocks = [samples.residual_block(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
         course = _LinearizedEpisode(problem, episode, nominal)
@@ -349,7 +351,7 @@ def _recording(
     linear = partial(linearized_steps, course.problem.step, course.nominal.theta, course.nominal.rollout, loads)
     ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
     moving = np.flatnonzero(moving_observable_state_mask(course.problem.step, ends))
-    slopes = ResidualDerivativesAtNodes.along(course.nominal).select_states(moving)
+    slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course.nominal).select_states(moving)
     by_bias = _bias_slopes(course, unknowns)
     interval_of_row = np.clip(np.searchsorted(edges, slopes.node, side="right") - 1, 0, len(edges) - 2)
     rests = course.problem.options.initial_state != "fitted_to_points"

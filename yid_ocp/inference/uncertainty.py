@@ -327,7 +327,7 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
     def kind(name: str) -> str:
         return name.rpartition(".")[2]
 
-    (theta, _), entries = problem.split(x, 0), list(problem.system.parameters)
+    (theta, _), entries = problem.theta_and_initial_state_offset(x, 0), list(problem.system.parameters)
     pairs = zip(problem.unknown_names, problem.unknown_scales, strict=True)
     scales = {name.split("[")[0]: float(scale) for name, scale in pairs}
     sizes = dict(zip((entry.name for entry in entries), np.abs(theta), strict=True))
@@ -360,7 +360,7 @@ def parameter_estimates(
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else std_from_covariance(covariance, x)
-    sizes, theta = typical_parameter_magnitudes(problem, x), problem.split(x, 0)[0]
+    sizes, theta = typical_parameter_magnitudes(problem, x), problem.theta_and_initial_state_offset(x, 0)[0]
     scales, (lower, upper) = problem.unknown_scales, problem.bounds
     result: dict[str, ParameterEstimate] = {}
     free = {name: problem.unknown_names.index(name) for name in parameter_unknown_names(problem)}

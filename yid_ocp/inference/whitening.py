@@ -238,7 +238,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     """The whitening Kalman filter along a trajectory."""
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
     linear = partial(linearized_steps, step, course.theta, course.rollout)
-    slopes = ResidualDerivativesAtNodes.along(course)
+    slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course)
     ends = [*linear(chosen=slice(0, 1)), *linear(chosen=slice(count - 1, count))]
     live = moving_observable_state_mask(step, ends, slopes.visible_state_mask)
     kept = np.flatnonzero(live)
@@ -386,7 +386,9 @@ def problem_whitened_at(
 
     def one(i: int) -> tuple[Episode, WhiteningFilter | None]:
         before = _own_filter(problem.whitening_filters[i])
-        return _whitened_episode(problem.predictor, problem.episodes[i], problem.split(x, i), guesses[i], before)
+        return _whitened_episode(
+            problem.predictor, problem.episodes[i], problem.theta_and_initial_state_offset(x, i), guesses[i], before
+        )
 
     if not problem.has_process_noise:
         return problem
@@ -410,7 +412,10 @@ def problem_with_whitened_held_out(problem: EstimationProblem, x: ArrayLike) -> 
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
     """The same problem, filters relinearized from the torque offsets at `frozen` to those at `x`, weights unchanged."""
-    at = [(e, *problem.split(x, i), problem.split(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
+    at = [
+        (e, *problem.theta_and_initial_state_offset(x, i), problem.theta_and_initial_state_offset(frozen, i)[0])
+        for i, e in enumerate(problem.episodes)
+    ]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
     return problem.with_episodes(episodes, problem.held_out, made, problem.held_out_whitening_filters)
 
@@ -451,7 +456,11 @@ def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike
     found: list[tuple[Array, Array] | None] = []
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):
         whitening = _own_filter(own)
-        result = "" if whitening is None else problem.predictor.predict_episode(episode, *problem.split(x, i), False)
+        result = (
+            ""
+            if whitening is None
+            else problem.predictor.predict_episode(episode, *problem.theta_and_initial_state_offset(x, i), False)
+        )
         if whitening is None or isinstance(result, str):
             found.append(None)
         else:

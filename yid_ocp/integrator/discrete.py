@@ -222,7 +222,7 @@ class _Symbols:
 
     @staticmethod
     def from_system(system: System) -> _Symbols:
-        internal = system.internal_coordinates
+        internal = system.internal_coordinate_symbols
         n, m, nz = system.n_coordinates, system.n_constraints, len(internal)
         sizes = {"q0": n, "q1": n, "p0": n, "z0": nz, "z1": nz, "lam": m, "u": len(system.driven), "time_step": 1}
         sizes |= {"qm": n, "vm": n, "zm": nz, "z_rate": nz, "pull_rate": m}
@@ -243,7 +243,7 @@ def _summed_terms(
     system: System, at: _Symbols, kinematics: Kinematics
 ) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX], ForceWithDerivatives | None]:
     """Lagrangian, force, internal equations (in motion, at rest) and closed force of springs, inputs and effects."""
-    names = tuple(system.internal_coordinates)
+    names = tuple(system.internal_coordinate_symbols)
     rows_of = {name: i for i, name in enumerate(names)}
     state = MidpointState(system, kinematics, at.qm, at.vm, at.zm, at.z_rate, at.u, at.pull_rate, rows_of, at.h)
     energy = -system.elastic_energy(at.qm)
@@ -453,7 +453,7 @@ def nlp_stage(equations: DiscreteEquations, time_step: float) -> NlpStage:
     p1 = ca.SX.sym("p1", e.p0.numel())
     x0, x1 = ca.vertcat(e.q0, e.p0, e.z0), ca.vertcat(e.q1, p1, e.z1)
     names = [f"del[{system.mechanism.joint_names[i]}]" for i in free]
-    names += [f"internal[{name}]" for name in system.internal_coordinates]
+    names += [f"internal[{name}]" for name in system.internal_coordinate_symbols]
     names += [f"constraint[{name}]" for grasp in system.grasps for name in grasp.constraint_equation_names]
     names += [f"p1[{name}]" for name in system.mechanism.joint_names]
     rows = ca.vertcat(e.momentum_balance[free] / h, e.internal_residual, e.constraint_residual, (p1 - e.p1) / h)

@@ -208,11 +208,11 @@ class EffectMomentumShift:
 
         self._maps: CasadiLockedCache[bool, MappedFunction] = CasadiLockedCache(compiled)
         self._impulse = ca.Function("impulse", inputs, [ca.densify(ca.jacobian(momentum, e.u))])
-        at_row = {name: row for row, name in enumerate(system.internal_coordinates)}
+        at_row = {name: row for row, name in enumerate(system.internal_coordinate_symbols)}
         symbols = [before, now, last, then, e.theta, e.time_step]
         self._memories: list[tuple[list[int], _Memory]] = []
         for effect in system.effects:
-            rows = [self._kept.index(at_row[x]) for x in effect.internal_coordinates if at_row[x] in self._kept]
+            rows = [self._kept.index(at_row[x]) for x in effect.internal_coordinate_symbols if at_row[x] in self._kept]
             own = [i for i, name in enumerate(self.parameter_names) if name in effect.parameters.names]
             if rows:
                 self._memories.append((own, _Memory(step, symbols, law, rows, columns)))

@@ -174,7 +174,7 @@ class Effect:
     location: str  # name of the place where it acts
     parameters: Parameters  # named `kind@location.parameter`
     # name to the symbol that `apply_to_system` uses, `kind@location.joint`; without momentum
-    internal_coordinates: Mapping[str, ca.SX] = field(default_factory=dict)
+    internal_coordinate_symbols: Mapping[str, ca.SX] = field(default_factory=dict)
 
     def apply_to_system(self, system: System) -> System:
         """The system with the effect's changes of masses, lengths, springs, grasps, gravity or joints."""
@@ -339,9 +339,9 @@ class System(ReprMixin):
         return tuple(i for i in range(self.n_coordinates) if i not in self.prescribed_coordinate_indices)
 
     @property
-    def internal_coordinates(self) -> dict[str, ca.SX]:
+    def internal_coordinate_symbols(self) -> dict[str, ca.SX]:
         """Internal coordinates in the order of z: name to the symbol that stands for it in grasps and placements."""
-        return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinates.items()}
+        return {name: symbol for effect in self.effects for name, symbol in effect.internal_coordinate_symbols.items()}
 
     def segment_layout(self, name: str) -> SegmentLayout:
         """Layout of a segment by name; `ModelError` with the nearest name where there is none."""

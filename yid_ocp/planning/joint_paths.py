@@ -248,7 +248,7 @@ class PathSimulator:
         begin, steps, path = self.start_equilibrium.state, len(self.node_times) - 1, self.joint_positions(w)
         return simulate(self.step, self.theta, begin, steps, path=path, directions=directions)
 
-    def trajectories(self, frames: FramePositionFunction, state: Array) -> Array:
+    def frame_trajectories(self, frames: FramePositionFunction, state: Array) -> Array:
         """Positions of frames along states (N, nx), shape (N, frames, 3) [m]."""
         q = state[:, : self.step.system.n_coordinates]
         return frames.positions_and_jacobian(q, self.theta)[0].reshape(len(state), -1, 3)
@@ -309,7 +309,7 @@ class PlannedMotion:
         """Trajectories of the system's points and of the one with a target by name, each of shape (N + 1, 3) [m]."""
         system = self.simulator.step.system
         names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
-        places = self.simulator.trajectories(FramePositionFunction(system, names), self.rollout.state)
+        places = self.simulator.frame_trajectories(FramePositionFunction(system, names), self.rollout.state)
         return {name: places[:, i] for i, name in enumerate(names)}
 
     @property

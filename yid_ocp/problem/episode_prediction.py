@@ -78,7 +78,7 @@ class EpisodePredictor:
     def estimated_initial_state_indices(self) -> tuple[int, ...]:
         """Indices of the estimated components of the initial state, in the order of `initial_state_names`."""
         joints, n = self.system.mechanism.joint_index, self.system.n_coordinates
-        hidden = list(self.system.internal_coordinates)
+        hidden = list(self.system.internal_coordinate_symbols)
         split = (name.split(".", 1) for name in self.unknowns.initial_state_names)
         return tuple(
             2 * n + hidden.index(name) if kind == "z" else joints(name) + (n if kind == "p" else 0)

@@ -34,7 +34,7 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter
+from yid_ocp.problem.signal_filters import LowPassFilter, two_pass_effort_filter
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
@@ -313,7 +313,7 @@ def _samples(
         lambda group: options.sensors.get(group, SensorOptions()),
         grid.node_times,
         grid.time_step,
-        effort_filter(options.path_cutoff),
+        two_pass_effort_filter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
     )
     found = [data for kind in SENSOR_READERS for data in SENSOR_READERS[kind](around)]

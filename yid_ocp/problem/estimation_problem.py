@@ -223,9 +223,9 @@ class EstimationProblem(ReprMixin):
 
     # -- the unknown vector -------------------------------------------------------------------------------------------
 
-    def split(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
+    def theta_and_initial_state_offset(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
         """Return theta and the initial state offset of one episode from the unknown vector."""
-        return self.unknowns.split(x, episode, self.theta, self.system)
+        return self.unknowns.theta_and_initial_state_offset(x, episode, self.theta, self.system)
 
     def vector(self, values: Mapping[str, float]) -> Array:
         """Initial unknown vector with named entries replaced, clipped to the bounds, shape (nx,)."""
@@ -248,7 +248,7 @@ class EstimationProblem(ReprMixin):
         """
         x = np.asarray(x, float)
         pairs = zip(self.episodes, equilibrium_guesses or (None,) * len(self.episodes), strict=True)
-        asked = [(e, *self.split(x, i), guess) for i, (e, guess) in enumerate(pairs)]
+        asked = [(e, *self.theta_and_initial_state_offset(x, i), guess) for i, (e, guess) in enumerate(pairs)]
         results = self.predictor.predict_episodes(asked, derivatives)
         failures = [result for result in results if isinstance(result, str)]
         if failures:
@@ -297,7 +297,9 @@ class EstimationProblem(ReprMixin):
                 raw = samples.whitened_residual(result.predicted_outputs[k])
                 _, factor = huber_loss_and_residual_factors(raw, self.options.huber_threshold)
                 pulls.append(samples.whitened_residual_adjoint(factor**2 * raw))
-            own = self.predictor.cost_gradient_by_adjoint(self.episodes[i], result, *self.split(x, i), pulls)
+            own = self.predictor.cost_gradient_by_adjoint(
+                self.episodes[i], result, *self.theta_and_initial_state_offset(x, i), pulls
+            )
             gradient += self.unknowns.scatter_to_unknown_columns(own[None, :], i)[0]
         prior, prior_jacobian = self.prior_residual_and_jacobian(x)
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
@@ -344,7 +346,7 @@ class EstimationProblem(ReprMixin):
             shared = held.initial_state_shared_with
             if shared is not None:
                 episode = replace(held, fixed_initial_state=self.episodes[shared].fixed_initial_state)
-                found.append((episode, theta, self.split(x, shared)[1]))
+                found.append((episode, theta, self.theta_and_initial_state_offset(x, shared)[1]))
                 continue
             episode = self.predictor.episode_with_fitted_initial_state(held, theta)
             std = self.initial_state_prior_std
@@ -353,7 +355,7 @@ class EstimationProblem(ReprMixin):
 
     def held_out_theta(self, x: Array) -> Array:
         """theta with the shared parameters of `x`, local ones at their initial value."""
-        theta, _ = self.split(x, 0)
+        theta, _ = self.theta_and_initial_state_offset(x, 0)
         for name in self.local_parameters:
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
         return theta

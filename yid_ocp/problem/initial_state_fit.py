@@ -83,7 +83,7 @@ class InitialStateFitter:
         chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in self.fitted_parameters))
         kinematics = forward_kinematics(system.mechanism, e.q1)
         aligned = ca.vertcat(ca.SX(0, 1), *(grasp.aligned_axis_differences(kinematics) for grasp in system.grasps))
-        internal = ca.vertcat(ca.SX(0, 1), *system.internal_coordinates.values())
+        internal = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
         held = ca.vertcat(e.end_of_step_constraint_violation, ca.substitute(aligned, internal, e.z1))
         outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]
         self._phi = ca.Function("phi", [e.q1, e.z1, e.lam, e.theta, e.time_step], outputs)

@@ -148,14 +148,14 @@ class ChannelPrediction(ReprMixin):
     noise_std: Array  # of the sensor; NaN where it is not known, (M, w)
 
     @property
-    def residual(self) -> Array:
+    def predicted_minus_measured(self) -> Array:
         """Predicted minus measured, shape (M, w)."""
         return self.predicted - self.measured
 
     @property
     def rmse(self) -> float:
         """Root mean square error; for a point, of the Euclidean distance."""
-        return float(np.sqrt(np.nanmean(np.sum(self.residual**2, axis=1))))
+        return float(np.sqrt(np.nanmean(np.sum(self.predicted_minus_measured**2, axis=1))))
 
     def _summary(self) -> ReprSummary:
         samples = f"{len(self.t)} samples, rmse {self.rmse:.3g} {self.unit}"
@@ -270,7 +270,7 @@ def _channel_groups(
         choice = predictor.options.sensors.get(sensor.group_name, SensorOptions())
         stds: dict[str, Array] = {}
         for attribute, own in zip(sensor.channel.std_attribute_names, (choice.std, choice.bias_std), strict=True):
-            given = own if own is not None else original.stds.get(attribute)
+            given = own if own is not None else original.stds_by_attribute.get(attribute)
             if given is not None:
                 stds[attribute] = expand_to_joint_values(given, original.names, names, f"sensors.{sensor.group_name}")
         function = predictor.model_functions.compiled_sensor_function(sensor)
@@ -281,7 +281,9 @@ def _channel_groups(
         values = _noisy(values, np.broadcast_to(std[widen], values.shape), rng)
         values = values + _noisy(np.zeros(values.shape[1:]), np.broadcast_to(bias[widen], values.shape[1:]), rng)
         before = made.get(name, ChannelGroup(name, names, episode.grid.node_times, {}))
-        made[name] = replace(before, values={**before.values, quantity: values}, stds={**before.stds, **stds})
+        own_values = {**before.values_by_quantity, quantity: values}
+        own_stds = {**before.stds_by_attribute, **stds}
+        made[name] = replace(before, values_by_quantity=own_values, stds_by_attribute=own_stds)
     return tuple(made.values())
 
 

@@ -195,7 +195,7 @@ def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
     found = set()
     for recording in recordings:
         own = {} if recording.joints is None else {"joints": recording.joints.channels}
-        own |= {group.name: dict(group.values) for group in recording.channel_groups}
+        own |= {group.name: dict(group.values_by_quantity) for group in recording.channel_groups}
         for kind in CHANNEL_KINDS:
             channel = CHANNEL_KINDS[kind]
             if any(channel.is_in_group(group) and channel.quantity in values for group, values in own.items()):

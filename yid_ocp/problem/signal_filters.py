@@ -52,7 +52,7 @@ class LowPassFilter:
         decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * _FILTER_ORDER))
         return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay
 
-    def noise_gains(self, step: float) -> tuple[float, float, float]:
+    def noise_gains_of_value_and_rates(self, step: float) -> tuple[float, float, float]:
         """Factors from white noise's std to that of the value, its rate [1/s] and its second rate [1/s^2]."""
         if not math.isfinite(self.cutoff):
             return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
@@ -128,7 +128,7 @@ def _weights(low_pass: LowPassFilter, step: float) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def effort_filter(cutoff: float) -> LowPassFilter:
+def two_pass_effort_filter(cutoff: float) -> LowPassFilter:
     """Filter of measured and predicted efforts: two passes of the filter that smooths prescribed paths."""
     return LowPassFilter(cutoff, 2)
 

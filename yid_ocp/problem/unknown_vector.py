@@ -53,7 +53,9 @@ class UnknownVectorLayout:
         wide[:, self.unknown_indices_of_recording(recording)] = block
         return wide
 
-    def split(self, x: ArrayLike, recording: int, theta: Array, system: System) -> tuple[Array, Array]:
+    def theta_and_initial_state_offset(
+        self, x: ArrayLike, recording: int, theta: Array, system: System
+    ) -> tuple[Array, Array]:
         """Return theta with one recording's values, and its initial state offset, from the unknown vector."""
         own = np.asarray(x, float)[self.unknown_indices_of_recording(recording)]
         result = theta.copy()

@@ -166,7 +166,7 @@ def make_animation(
 
 def recording_animation(title: str, system: System, theta: Array, recording: Recording) -> Animation | None:
     """Animation of a recording alone; None where it holds no positions."""
-    clock = max((group.t for group in recording.groups), key=len)
+    clock = max((group.t for group in recording.joint_and_point_groups), key=len)
     told = ConfigurationTrajectory("measured", system, theta, clock, np.zeros((len(clock), system.n_coordinates)))
     motion = _measured_motion(told, recording, t := _frame_times(clock))
     return Animation(title, t, (motion,)) if motion.sticks or motion.point_indices else None

@@ -150,9 +150,9 @@ class RecordedChannelGroup(_RecordedGroup, Protocol):
     """A recorded group of declared channels, as in `data.recording.ChannelGroup`."""
 
     @property
-    def values(self) -> Mapping[str, Array]: ...
+    def values_by_quantity(self) -> Mapping[str, Array]: ...
     @property
-    def stds(self) -> Mapping[str, float | Array]: ...
+    def stds_by_attribute(self) -> Mapping[str, float | Array]: ...
 
 
 class _RecordingData(Protocol):
@@ -261,7 +261,7 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
     `NodeState`, the last one by the parameters `names`; v, a and lam by the recorded clock. Slopes by these have no
     columns where nothing reads them.
     """
-    rows = {name: i for i, name in enumerate(system.internal_coordinates)}
+    rows = {name: i for i, name in enumerate(system.internal_coordinate_symbols)}
     n = system.n_coordinates
     sizes = {"q": n, "v": n, "a": n, "z": len(rows), "load": n, "lam": system.n_constraints}
     at = {name: ca.SX.sym(name, size) for name, size in sizes.items()}
@@ -276,7 +276,7 @@ def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ..
             part = effect.distorted_reading(channel, part, replace(state, marked_frame=frame))
         read.append(part)
     output = ca.vertcat(*read)
-    symbols = ca.vertcat(*system.internal_coordinates.values()) if rows else ca.SX(0, 1)
+    symbols = ca.vertcat(*system.internal_coordinate_symbols.values()) if rows else ca.SX(0, 1)
     output = ca.densify(ca.substitute(output, symbols, at["z"]))
     chosen = ca.vertcat(*(system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     slopes = {name: ca.jacobian(output, symbol) for name, symbol in at.items()}
@@ -296,7 +296,7 @@ class _SmoothingFilter(Protocol):
 
     def __call__(self, t: Array, values: Array) -> Array: ...
     def decorrelation_stride(self, step: float) -> int: ...
-    def noise_gains(self, step: float) -> tuple[float, float, float]: ...
+    def noise_gains_of_value_and_rates(self, step: float) -> tuple[float, float, float]: ...
 
 
 @dataclass(frozen=True)

@@ -209,7 +209,7 @@ def _currents(around: SensorDataInputs, group: RecordedChannelGroup) -> SensorDa
         if name not in around.system.mechanism.joint_names:
             hint = nearest_name_hint(name, around.system.mechanism.joint_names)
             raise DataError(f"the model has no joint '{name}'", where=where, hint=hint)
-    stated = [group.stds.get(attribute) for attribute in _CURRENT.std_attribute_names]
+    stated = [group.stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
     constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
     bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
     if constants is None:
@@ -225,7 +225,7 @@ def _currents(around: SensorDataInputs, group: RecordedChannelGroup) -> SensorDa
     if not np.all(by_joint[0] != 0):
         raise DataError("a torque constant is zero", where=where, allowed="a number that is not zero [N m/A]")
     sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
-    values = group.values[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
+    values = group.values_by_quantity[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
     return smoothed_effort_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)
 
 
@@ -282,7 +282,7 @@ def _smoothed_effort_noise(
     Returns the standard deviation, shape (M, k), and the correlation, shape (M, k, k), None where the encoders' noise
     is not stated.
     """
-    value_gain, _, second_gain = around.effort_filter.noise_gains(period)
+    value_gain, _, second_gain = around.effort_filter.noise_gains_of_value_and_rates(period)
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     assert joints is not None
     known = encoders.std if encoders.std is not None else joints.position_std

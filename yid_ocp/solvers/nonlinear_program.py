@@ -62,7 +62,9 @@ class ProgramVectorLayout:
     lower: list[Array] = field(default_factory=list)
     upper: list[Array] = field(default_factory=list)
 
-    def extend(self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf) -> IntArray:
+    def append_values(
+        self, values: Array, lower: float | Array = -math.inf, upper: float | Array = math.inf
+    ) -> IntArray:
         """Append values with their bounds and return their indices in the vector."""
         self.values.append(values)
         self.lower.append(np.broadcast_to(lower, values.shape).astype(float))
@@ -70,17 +72,17 @@ class ProgramVectorLayout:
         self.size += len(values)
         return np.arange(self.size - len(values), self.size)
 
-    def name(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
+    def register_block(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
         """Register indices of the vector as a named block, unless there are none."""
         if index.size:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
-    def add(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IntArray:
+    def append_block(self, name: str, values: Array, rows: Sequence[str], unit: str = "") -> IntArray:
         """Append a named block, column by column, and return its indices, shape (rows, columns)."""
         table = np.asarray(values, float)
         table = table[:, None] if table.ndim == 1 else table
-        index = self.extend(table.ravel(order="F")).reshape(table.shape, order="F")
-        self.name(name, index, rows, unit)
+        index = self.append_values(table.ravel(order="F")).reshape(table.shape, order="F")
+        self.register_block(name, index, rows, unit)
         return index
 
 
@@ -127,7 +129,7 @@ class NonlinearProgram(ReprMixin):
         equalities = count_with_noun(sum(term.n_values for term in self.constraint_terms), "equation")
         return ReprSummary(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
 
-    def block(self, name: str) -> _VectorBlock:
+    def block_layout(self, name: str) -> _VectorBlock:
         """A block by its name; with one recording, `[NAME]` may be left out.
 
         Raises `SolverError` where there is none, or more than one.
@@ -143,7 +145,7 @@ class NonlinearProgram(ReprMixin):
 
     def __getitem__(self, name: str) -> ca.MX:
         """Block of variables or parameters as an MX matrix of its shape."""
-        block = self.block(name)
+        block = self.block_layout(name)
         vector = self.w if any(block is own for own in self.variables.values()) else self.p
         return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
 
@@ -312,7 +314,7 @@ class NonlinearProgram(ReprMixin):
         rows = [constraints] if isinstance(constraints, ca.MX) else list(constraints)
         column = ca.vertcat(ca.MX(0, 1), *(ca.vec(ca.densify(row)) for row in rows))
         scalar = ca.MX(objective)
-        where, bounds = "NonlinearProgram.adding", []
+        where, bounds = "NonlinearProgram.with_user_terms", []
         for symbol in ca.symvar(ca.vertcat(scalar, column)):
             if not any(ca.is_equal(symbol, vector) for vector in (self.w, self.p)):
                 message = f"the symbol '{symbol.name()}' is neither an unknown nor a parameter of the program"

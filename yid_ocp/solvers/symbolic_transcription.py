@@ -127,7 +127,9 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
         if rows:
             blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
             first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
-            begin = problem.initial_state(episode, problem.split(x, i)[0], guess=first[: problem.step.sizes["n"]])
+            begin = problem.initial_state(
+                episode, problem.theta_and_initial_state_offset(x, i)[0], guess=first[: problem.step.sizes["n"]]
+            )
             x[columns[own:]] = (first - begin.state)[rows]
     return x
 
@@ -254,15 +256,15 @@ class _Maker:
             problem, nodes, x, partial(mean_square_residual_without_efforts, problem)
         )
         x, shared = found.x, len(problem.shared_parameters)
-        theta = self._w.extend(x[:shared], low[:shared], high[:shared])
-        self._w.name("theta", theta[:, None], problem.shared_parameters)
+        theta = self._w.append_values(x[:shared], low[:shared], high[:shared])
+        self._w.register_block("theta", theta[:, None], problem.shared_parameters)
         constraints: list[ProgramTerm] = []
         residuals: list[ResidualTerm] = []
         at_ridge, columns = [theta], {k: int(place) for k, place in enumerate(theta)}
         for i, episode in enumerate(problem.episodes):
             at = problem.unknowns.unknown_indices_of_recording(i)[shared : shared + len(problem.local_parameters)]
-            local = self._w.extend(x[at], low[at], high[at])
-            self._w.name(f"local[{episode.name}]", local[:, None], problem.local_parameters)
+            local = self._w.append_values(x[at], low[at], high[at])
+            self._w.register_block(f"local[{episode.name}]", local[:, None], problem.local_parameters)
             columns |= {int(k): int(place) for k, place in zip(at, local, strict=True)}
             at_ridge.append(local)
             places, errors = self._laid_out(i, found, np.concatenate([theta, local]))
@@ -286,30 +288,32 @@ class _Maker:
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
-        theta = problem.predictor.theta_with_episode_values(episode, problem.split(found.x, i)[0])
+        theta = problem.predictor.theta_with_episode_values(
+            episode, problem.theta_and_initial_state_offset(found.x, i)[0]
+        )
         rest, sought = np.zeros(0), list(problem.model_functions.equilibrium_solver.free_coordinates)
         if (known := begin.equilibrium) is not None:
             rest = np.concatenate([known.state[sought], known.state[2 * n :], known.constraint_reactions])
         joints = system.mechanism.joint_names
         grasped = [name for grasp in system.grasps for name in grasp.constraint_equation_names]
-        at_rest = [*(joints[k] for k in sought), *system.internal_coordinates, *grasped]
-        rest_at = self._w.extend(rest)
-        self._w.name(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
+        at_rest = [*(joints[k] for k in sought), *system.internal_coordinate_symbols, *grasped]
+        rest_at = self._w.append_values(rest)
+        self._w.register_block(f"rest[{name}]", rest_at[:, None], at_rest if len(rest) else ())
         table = np.zeros((3, len(state), nx + m))
         table[0, :, :nx], table[0, :-1, nx:] = state, pull
         table[1], table[2] = -np.inf, np.inf
         for column, joint in enumerate(system.prescribed_coordinate_indices):
             table[:, :, joint] = episode.prescribed_path[:, column]
         # the last node has no multipliers
-        at = self._w.extend(*(part.ravel()[: part.size - m] for part in table))
+        at = self._w.append_values(*(part.ravel()[: part.size - m] for part in table))
         index = np.append(at, np.zeros(m, np.int64)).reshape(len(state), nx + m)
         states, multipliers = index[:, :nx], index[:-1, nx:]
         for label, part, rows in (("q", states[:, :n], joints), ("p", states[:, n : 2 * n], joints)):
-            self._w.name(f"{label}[{name}]", part.T, rows)
-        self._w.name(f"z[{name}]", states[:, 2 * n :].T, tuple(system.internal_coordinates))
-        self._w.name(f"lam[{name}]", multipliers.T, grasped)
-        theta_at = self._p.add(f"theta[{name}]", theta, system.parameters.names)
-        torque = self._p.add(f"torque[{name}]", episode.torque.T, system.driven, "N m")
+            self._w.register_block(f"{label}[{name}]", part.T, rows)
+        self._w.register_block(f"z[{name}]", states[:, 2 * n :].T, tuple(system.internal_coordinate_symbols))
+        self._w.register_block(f"lam[{name}]", multipliers.T, grasped)
+        theta_at = self._p.append_block(f"theta[{name}]", theta, system.parameters.names)
+        torque = self._p.append_block(f"torque[{name}]", episode.torque.T, system.driven, "N m")
         gain, reference = self._followed(episode)
         errors, first, priors = self._erring(episode)
         places = _Places(free, rest_at, states, multipliers, errors, first, theta_at[:, 0], torque, gain, reference)
@@ -323,8 +327,8 @@ class _Maker:
         driven, joints, n = self._problem.system.driven, self._problem.system.mechanism.joint_names, self._sizes["n"]
         followed = [f"{'q' if row < n else 'p'}.{joints[row % n]}" for row in feedback.state_indices]
         pairs = [f"{joint}, {other}" for joint in driven for other in followed]
-        gain = self._p.add(f"gain[{episode.name}]", feedback.gain.reshape(steps, -1).T, pairs)
-        return gain, self._p.add(f"reference[{episode.name}]", feedback.reference.T, followed)
+        gain = self._p.append_block(f"gain[{episode.name}]", feedback.gain.reshape(steps, -1).T, pairs)
+        return gain, self._p.append_block(f"reference[{episode.name}]", feedback.reference.T, followed)
 
     def _driven(self, episode: Episode) -> _DrivenStage:
         """The stage as a recording drives it."""
@@ -353,10 +357,10 @@ class _Maker:
         for label, std, count in wanted:
             none = np.tile(std <= 0, count)
             zero = np.zeros(nu * count)
-            at = self._w.extend(zero, np.where(none, 0.0, -np.inf), np.where(none, 0.0, np.inf))
+            at = self._w.append_values(zero, np.where(none, 0.0, -np.inf), np.where(none, 0.0, np.inf))
             places[label] = at.reshape(count, nu)
-            self._w.name(f"{label}[{name}]", places[label].T, driven)
-            weight = self._p.add(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
+            self._w.register_block(f"{label}[{name}]", places[label].T, driven)
+            weight = self._p.append_block(f"weight.{label}[{name}]", 1.0 / np.where(std > 0, std, 1.0), driven)
             data = np.zeros((count, 0), np.int64)
             term = ProgramTerm(f"{label}[{name}]", driven, itself, places[label], data, weight[:0, 0])
             priors.append(ResidualTerm(term, ca.DM.eye(nu * count), np.tile(weight[:, 0], count)))
@@ -372,10 +376,10 @@ class _Maker:
         loose = list(problem.predictor.estimated_initial_state_indices)
         fixed = [k for k in range(nx) if k not in {*problem.system.prescribed_coordinate_indices, *loose}]
         joints = problem.system.mechanism.joint_names
-        rows = [*(f"{part}.{joint}" for part in "qp" for joint in joints), *problem.system.internal_coordinates]
+        rows = [*(f"{part}.{joint}" for part in "qp" for joint in joints), *problem.system.internal_coordinate_symbols]
         first = ca.SX.sym("x0", nx)
         if episode.fixed_initial_state is not None:
-            given = self._p.add(f"start[{name}]", episode.fixed_initial_state.state, rows)
+            given = self._p.append_block(f"start[{name}]", episode.fixed_initial_state.state, rows)
             state, balance = ca.SX.sym("given", nx), ca.SX(0, 1)
             inputs = [first, state, ca.SX(0, 1)]
             at, data, shared = places.state[:1], given.T, np.zeros(0, np.int64)
@@ -396,7 +400,7 @@ class _Maker:
             v = ca.vertcat(self._freed.free, sought, first, errors)
             inputs = [v, ca.vertcat(posture, held), self._freed.nominal]
             known = [problem.system.mechanism.joint_names[k] for k in statics.known_coordinates]
-            given = self._p.add(f"posture[{name}]", episode.initial_known_coordinates, known)
+            given = self._p.append_block(f"posture[{name}]", episode.initial_known_coordinates, known)
             wrong = [places.first, places.errors[0, : 2 * nu]] if len(places.first) else []
             at = np.concatenate([places.free, places.rest, places.state[0], *wrong])[None, :]
             data, shared = np.concatenate([given[:, 0], places.torque[:, 0]])[None, :], places.theta
@@ -407,7 +411,9 @@ class _Maker:
         if not loose:
             return term, []
         offset = LocalVariableFunction("offset", inputs, ca.densify((first - state)[loose]))
-        weight = self._p.add(f"weight.start[{name}]", 1.0 / problem.initial_state_prior_std, [rows[k] for k in loose])
+        weight = self._p.append_block(
+            f"weight.start[{name}]", 1.0 / problem.initial_state_prior_std, [rows[k] for k in loose]
+        )
         named = tuple(f"offset.{rows[k]}" for k in loose)
         free = ProgramTerm(f"offset[{name}]", named, offset, at, data, shared)
         return term, [ResidualTerm(free, ca.DM.eye(len(loose)), weight[:, 0])]
@@ -424,7 +430,7 @@ class _Maker:
             # after the last step the effort is that of this step
             step = np.minimum(nodes, len(places.multipliers) - 1)
             is_last = (nodes > step).astype(float)[None, :]
-            ends = self._p.add(f"last.{sensor.group_name}[{episode.name}]", is_last, ["last"])
+            ends = self._p.append_block(f"last.{sensor.group_name}[{episode.name}]", is_last, ["last"])
             at, data = places.stages()[step], np.hstack([places.inputs()[step], ends.T])
         else:
             free = np.broadcast_to(places.free, (len(nodes), len(places.free)))
@@ -439,11 +445,11 @@ class _Maker:
         if samples.noise_correlation is not None:
             mixed = np.zeros(seen.shape)
             mixed[seen] = samples.decorrelate(samples.weight[seen] * samples.value[seen])
-            target = self._p.add(f"value.{term.name}", mixed.T, rows, "")
+            target = self._p.append_block(f"value.{term.name}", mixed.T, rows, "")
             combination = samples.decorrelate(scipy.sparse.diags_array(samples.weight[seen]) @ between)
             return ResidualTerm(term, _constant(combination), None, target.T[seen], threshold)
-        value = self._p.add(f"value.{term.name}", np.where(seen, samples.value, 0.0).T, rows, sensor.unit)
-        weight = self._p.add(f"weight.{term.name}", samples.weight.T, rows)
+        value = self._p.append_block(f"value.{term.name}", np.where(seen, samples.value, 0.0).T, rows, sensor.unit)
+        weight = self._p.append_block(f"weight.{term.name}", samples.weight.T, rows)
         return ResidualTerm(term, _constant(between), weight.T[seen], value.T[seen], threshold)
 
     def _reading(self, sensor: Sensor, episode: Episode) -> tuple[LocalVariableFunction, bool]:
@@ -511,9 +517,9 @@ class _Maker:
             if name == "weak_prior":
                 weight = weight * problem.initial_unknowns[unknown[last]]
             names = [problem.unknown_names[k] for k in unknown]
-            start = self._p.add(f"{name}.start", problem.initial_unknowns[unknown], names)
+            start = self._p.append_block(f"{name}.start", problem.initial_unknowns[unknown], names)
             rows = [names[k] for k in last]
-            weights = self._p.add(f"{name}.weight", weight, rows)
+            weights = self._p.append_block(f"{name}.weight", weight, rows)
             local = LocalVariableFunction(name, [v, about, ca.SX(0, 1)], value)
             at = np.array([[columns[int(k)]] for k in unknown])
             term = ProgramTerm(name, (name,), local, at, start, np.zeros(0, np.int64))

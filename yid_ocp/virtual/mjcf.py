@@ -95,9 +95,9 @@ class ParameterEvaluator:
 
     def is_identically_zero(self, expression: ca.SX) -> bool:
         """Whether an expression is zero for all values of its other symbols."""
-        return bool(ca.sparsify(self.with_parameter_values(expression)).is_zero())
+        return bool(ca.sparsify(self.substitute_parameter_values(expression)).is_zero())
 
-    def with_parameter_values(self, expression: ca.SX) -> ca.SX:
+    def substitute_parameter_values(self, expression: ca.SX) -> ca.SX:
         """The expression with parameters replaced by their values."""
         return ca.substitute(expression, self._symbols, ca.DM(self._theta))
 
@@ -120,7 +120,7 @@ def model_aspects_of_parameters(system: System, symbols: ca.SX) -> set[str]:
             part for grasp in held for part in (grasp.compliance, grasp.relaxation_time) if part is not None
         ),
         "sprung_joint": system.joint_compliances.values(),
-        "servo": (part for servo in system.servos.values() for part in servo.coefficients),
+        "servo": (part for servo in system.servos.values() for part in servo.gain_damping_delay_limit),
         "clock": (system.recorded_time_scale,),
     }
     return {name for name, parts in entered.items() if any(_depends(part, symbols) for part in parts)}
@@ -136,7 +136,7 @@ def effect_joint_terms_and_changed_aspects(
         size = effect.parameters[f"{effect.kind}@{effect.location}.tau_c"].symbol
         terms = {effect.location: JointDynamicsTerms(dry_friction=float(value(size)[0]))}
         aspects.add("dry_friction")
-    elif effect.internal_coordinates:
+    elif effect.internal_coordinate_symbols:
         aspects.add("memory")
     elif (found := _joint_terms(system, effect, value)) is None:
         aspects.add("force")
@@ -205,11 +205,11 @@ def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> d
     none, h = ca.SX(0, 1), ca.SX.sym("h")
     kinematics = forward_kinematics(system.mechanism, q)
     terms = effect.step_terms(MidpointState(system, kinematics, q, v, none, none, u, reaction, {}, h))
-    energy, closed = value.with_parameter_values(terms.lagrangian), terms.force_with_derivatives
+    energy, closed = value.substitute_parameter_values(terms.lagrangian), terms.force_with_derivatives
     force = ca.gradient(energy, q)
     for part in (terms.generalized_force, terms.dissipative_force, None if closed is None else closed.force):
         if part is not None:
-            force += value.with_parameter_values(ca.densify(part))
+            force += value.substitute_parameter_values(ca.densify(part))
     if ca.sparsify(ca.vertcat(energy, force)).is_zero():
         return {}
     momentum = ca.gradient(energy, v)
@@ -421,7 +421,7 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element,
         attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)
         bias, between = [-offset, 0.0, 0.0], "linear"
         if servo is not None:
-            own, damping, late, tightness = (float(value(x)[0]) for x in servo.coefficients)
+            own, damping, late, tightness = (float(value(x)[0]) for x in servo.gain_damping_delay_limit)
             damping = 0.0 if servo.motor_kind == "dc" else damping
             gain, bias, delay = own * gain, [own * bias[0], -own, -damping], delay + late
             between = "zoh" if servo.command_interpolation == "held" else "linear"

@@ -166,7 +166,7 @@ class ArmSurface:
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_image(_LOOK, state.pose, q)
         seen = np.isfinite(depth) & (cosine > _GRAZING) & (part >= 0) & self._moving[part]
-        points = _LOOK.pixel_rays[seen] * depth[seen][:, None]
+        points = _LOOK.pixel_rays_at_unit_depth[seen] * depth[seen][:, None]
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
 
     def is_near_moving_surface_off_grasps(self, points: Array, t: float, within: float) -> BoolArray:

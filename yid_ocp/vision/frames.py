@@ -75,7 +75,7 @@ class CameraIntrinsics:
         return any(self.coefficients)
 
     @property
-    def pixel_rays(self) -> Array:
+    def pixel_rays_at_unit_depth(self) -> Array:
         """Direction of every pixel with z = 1, shape (height, width, 3); NaN where the lens shows none."""
         return _rays(self)
 
@@ -87,7 +87,7 @@ class CameraIntrinsics:
         image = np.asarray(depth, float)
         seen = np.flatnonzero(self.is_depth_measured(image))
         # a third of the time that a mask over rows takes
-        points = self.pixel_rays.reshape(-1, 3).take(seen, axis=0)
+        points = self.pixel_rays_at_unit_depth.reshape(-1, 3).take(seen, axis=0)
         points *= image.ravel().take(seen)[:, None]
         return points
 
@@ -95,7 +95,7 @@ class CameraIntrinsics:
         """Whether each pixel of a depth image is measured, shape (height, width); `DataError` for another size."""
         if depth.shape != (self.height, self.width):
             raise DataError(f"the depth image has shape {depth.shape}", allowed=f"({self.height}, {self.width})")
-        return np.asarray(np.isfinite(depth) & (depth > 0) & np.isfinite(self.pixel_rays[..., 0]))
+        return np.asarray(np.isfinite(depth) & (depth > 0) & np.isfinite(self.pixel_rays_at_unit_depth[..., 0]))
 
     def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
         square = x**2 + y**2

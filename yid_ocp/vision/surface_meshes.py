@@ -207,7 +207,7 @@ class ArticulatedSurfaces:
 
         All have shape (height, width): infinite, 0 and -1 where there is nothing. `pose` (4, 4) is in the world.
         """
-        rays, camera = pinhole.pixel_rays, np.asarray(pose, float)
+        rays, camera = pinhole.pixel_rays_at_unit_depth, np.asarray(pose, float)
         size = rays.shape[:2]
         depth, cosine, owner = np.full(size, np.inf), np.zeros(size), np.full(size, -1)
         for part, placed in enumerate(self.part_poses_at(q)):
@@ -503,7 +503,7 @@ class VirtualCamera:
     """Virtual depth camera: sensor model, pose and frame timing."""
 
     pose: ArrayLike | None  # (4, 4), camera in the world (x right, y down, z ahead) [m]
-    depth_camera: DepthSensorModel = field(default_factory=DepthSensorModel)  # an Asus Xtion Pro Live where absent
+    sensor_model: DepthSensorModel = field(default_factory=DepthSensorModel)  # an Asus Xtion Pro Live where absent
     timing: FrameTiming = field(default_factory=FrameTiming)
     seed: int = 0  # of all that is drawn at random
 
@@ -515,7 +515,7 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     Where there is a robot, the paper's Y stands on a floor, and a wall stands behind Baxter. `DataError` or
     `ModelError` for no Open3D, no object, a mesh that cannot be read, or a pose that is none.
     """
-    lens, pose = camera.depth_camera.intrinsics, validated_camera_pose(camera.pose, "sequence")
+    lens, pose = camera.sensor_model.intrinsics, validated_camera_pose(camera.pose, "sequence")
     times, rng = np.asarray(t, float), np.random.default_rng(camera.seed)
     taken, stamps = camera.timing._sample_times_and_stamps(float(times[0]), float(times[-1]), rng)
     course = CubicSpline(times, np.asarray(q, float), axis=0)
@@ -530,7 +530,7 @@ def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera
     def cloud(index: int) -> Array:
         depth, cosine, _ = surfaces.render_depth_image(lens, pose, configuration[index])
         rng = np.random.default_rng([camera.seed, index])
-        return lens.points_from_depth(camera.depth_camera._simulate_depth_image(depth, cosine, rng))
+        return lens.points_from_depth(camera.sensor_model._simulate_depth_image(depth, cosine, rng))
 
     made = FrameSequence(stamps, tuple(f"frame {i}" for i in range(len(taken))), pose, cloud, lens, "virtual camera")
     return VirtualFrames(made, taken, lambda at: np.asarray(course(at)))

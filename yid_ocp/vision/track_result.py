@@ -79,15 +79,15 @@ class TrackResult:
     root_note: str  # how the root was told from other ends; empty where the model says where it is
     _place: Callable[[Array], Array]  # from a configuration to the points
 
-    def configuration_at(self, t: float) -> Array:
+    def configuration_at_time(self, t: float) -> Array:
         """Configuration at any time by a cubic spline through the good frames', constant beyond them, shape (n,)."""
         if len(self.t) < 2:
             return self.configurations[0].copy()
         return np.asarray(CubicSpline(self.t, self.configurations, axis=0)(np.clip(t, self.t[0], self.t[-1])))
 
-    def points_at(self, t: float) -> Array:
-        """Positions of the tracked points at any time, by the kinematics of `configuration_at`, shape (np, 3) [m]."""
-        return self._place(self.configuration_at(t))
+    def point_positions_at_time(self, t: float) -> Array:
+        """Positions of the tracked points at any time, at `configuration_at_time`, shape (np, 3) [m]."""
+        return self._place(self.configuration_at_time(t))
 
     @property
     def frame_drop_reason_counts(self) -> dict[str, int]:
@@ -202,7 +202,7 @@ def draw_tracked_points(track: TrackResult, file: str | os.PathLike[str]) -> Non
     figure = Figure(figsize=(9, 2.2 * len(track.point_names) + 0.8), layout="constrained")
     axes = figure.subplots(len(track.point_names), 1, sharex=True, squeeze=False)[:, 0]
     fine = np.linspace(track.t[0], track.t[-1], 400)
-    course = np.array([track.points_at(t) for t in fine])
+    course = np.array([track.point_positions_at_time(t) for t in fine])
     lost = [frame.joint_time for frame in track.frame_reports if not frame.is_good and np.isfinite(frame.joint_time)]
     for row, (panel, name) in enumerate(zip(axes, track.point_names, strict=True)):
         for axis, colour in enumerate((_BLUE, _ORANGE, _GREEN)):

@@ -59,7 +59,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
     damping, of_object = _dampings(run, joints)
     item = model.object
     with add_setting_location_to_errors(run, "model", "object"):
-        objects = [] if item is None else [(item.build(of_object, link_division), *item.placement)]
+        objects = [] if item is None else [(item.build(of_object, link_division), *item.parent_frame_and_root_pose)]
     mode = "driven" if arms_are_estimated_states(run) else arms.mode
     for i, name in enumerate(arms.passive_joints):
         if name not in joints:

@@ -313,7 +313,9 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
         return []
     found: list[Issue] = []
     for i, episode in enumerate(problem.episodes):
-        result = problem.predictor.predict_episode(episode, *problem.split(problem.initial_unknowns, i), False, None)
+        result = problem.predictor.predict_episode(
+            episode, *problem.theta_and_initial_state_offset(problem.initial_unknowns, i), False, None
+        )
         if isinstance(result, EpisodePrediction):
             found += point_checks.check_object_points_by_rollout(episode, result, size)
     return found
@@ -331,9 +333,13 @@ def _raise_for_issues(run: RunSettings, doubts: Sequence[Issue]) -> None:
 
 
 def _gravest_first(doubts: Sequence[Issue]) -> list[Issue]:
-    return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence))
+    return sorted(doubts, key=lambda doubt: (doubt.weight == "warning", -doubt.evidence_ratio))
 
 
 def issues_to_plain_data(doubts: Sequence[Issue]) -> list[dict[str, Any]]:
     """Data quality issues as JSON-ready dicts, gravest first, for the key `doubts` of a result."""
-    return [asdict(doubt) | {"sure": doubt.certainty_word, "where": doubt.where} for doubt in _gravest_first(doubts)]
+    found = []
+    for doubt in _gravest_first(doubts):
+        own = {"evidence" if key == "evidence_ratio" else key: value for key, value in asdict(doubt).items()}
+        found.append(own | {"sure": doubt.certainty_word, "where": doubt.where})
+    return found

@@ -171,7 +171,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
     """What the initial parameters make of every recording that is estimated on, or what was recorded alone."""
     scenes = []
     for i, episode in enumerate(problem.episodes):
-        shared = problem.split(problem.initial_unknowns, i)[0]
+        shared = problem.theta_and_initial_state_offset(problem.initial_unknowns, i)[0]
         if first.ok:
             prediction = first.episode_predictions[i]
             told = predicted_configuration_trajectory("with the initial values", problem, episode, prediction, shared)

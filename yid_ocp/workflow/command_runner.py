@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 EXIT_DONE, EXIT_FAILED, EXIT_WRONG_INPUT = 0, 1, 2
 """Exit codes of commands that ran to their end; the last where they were told to be strict and found something."""
-Output = TypeVar("Output")
+_CommandOutput = TypeVar("_CommandOutput")
 
 
 @dataclass(frozen=True)
-class CommandResult(Generic[Output]):
+class CommandResult(Generic[_CommandOutput]):
     """Run folder of a command, contents of its result.json, what it computed, and whether it reached its goal."""
 
     folder: Path
     result: dict[str, Any]
-    output: Output
+    output: _CommandOutput
     is_successful: bool = True
 
 

@@ -154,7 +154,7 @@ def propose_config(
     mode, why = _mode(first, recorded, bool(held))
     moving = ""
     for recording in recordings:
-        start = min(group.t[0] for group in recording.groups)
+        start = min(group.t[0] for group in recording.joint_and_point_groups)
         if not moving and (mover := _moving_joint_or_point(recording, joints, start)):
             moving = f"{mover} of {recording.name} moves at the start, which is estimated along"
     period = float(np.median(np.diff(recorded.t))) if len(recorded.t) > 1 else _MAX_TIME_STEP
@@ -173,7 +173,7 @@ def propose_config(
         _noise(first, recorded, joints),
         _time_step(period),
         min(10.0, 0.2 / period),
-        {group.name: _clock(group.t, group.clock) for group in first.groups},
+        {group.name: _clock(group.t, group.clock) for group in first.joint_and_point_groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
     )
 
@@ -274,7 +274,7 @@ def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | 
 
     What comes after it can be predicted from rest, so that it shows, held out, whether a model is right.
     """
-    first, duration = min(group.t[0] for group in recording.groups), recording.duration
+    first, duration = min(group.t[0] for group in recording.joint_and_point_groups), recording.duration
     for part in np.arange(0.75, 0.5, -0.01):
         time = first + float(part) * duration
         if not any(_moving_joint_or_point(recording, joints, at) for at in (time, time + _REST_WINDOW)):

@@ -152,7 +152,7 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
             options,
             sensors=sensors,
             prior_stds={name: share * std for name, std in options.prior_stds.items()},
-            multivariate_prior=prior.scaled_by(dict.fromkeys(prior.parameter_names, share)),
+            multivariate_prior=prior.with_parameters_scaled_by(dict.fromkeys(prior.parameter_names, share)),
             huber_threshold=options.huber_threshold / share,
             weak_prior_factor=options.weak_prior_factor**share if options.weak_prior_factor > 0 else 0.0,
             start_configuration_std=share * options.start_configuration_std,
@@ -200,7 +200,7 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]
     for episode, *outcomes in predicted:
         told = []
         for (name, fit), outcome in zip(fits.items(), outcomes, strict=False):
-            theta = fit.problem.split(fit.problem.vector(fit.values), 0)[0]
+            theta = fit.problem.theta_and_initial_state_offset(fit.problem.vector(fit.values), 0)[0]
             told.append(
                 prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
             )

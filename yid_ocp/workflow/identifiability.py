@@ -198,7 +198,8 @@ def _identifiability_result(
 
 
 def _outcome(entry: ChangedExperimentResult) -> dict[str, Any]:
-    return asdict(entry) | {"gain": entry.gain if entry.verdicts else None}
+    own = {"words" if key == "description" else key: value for key, value in asdict(entry).items()}
+    return own | {"gain": entry.gain if entry.verdicts else None}
 
 
 @dataclass(frozen=True)

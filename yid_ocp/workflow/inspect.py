@@ -106,7 +106,7 @@ def _run_inspect(
             },
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
             "nlp": nlp,
-            "dependence": {entry.parameter: {**asdict(entry), "words": entry.words} for entry in dependences},
+            "dependence": {entry.parameter: {**asdict(entry), "words": entry.description} for entry in dependences},
             "linearisation": {
                 "at": point.description,
                 "norms": {name: float(np.linalg.norm(matrix)) for name, matrix in matrices.items()},

@@ -54,7 +54,7 @@ def run_plan(
         else:
             step = compile_step_for_planning(run)
             theta, known, source = identified_parameters_with_covariance(run, step)
-            options = replace(run.plan, start_joint_positions=start_configuration(run, step))
+            options = replace(run.plan, start_joint_positions=start_joint_positions_from_run(run, step))
             with add_setting_location_to_errors(run, "plan"):
                 found = plan_motion_to_target(step, options, theta, known, progress)
         recording = _plan_as_recording(run, found)
@@ -85,7 +85,7 @@ def compile_step_for_planning(run: RunSettings) -> Step:
     return build_step(replace(run, model=model, recordings=recordings))
 
 
-def start_configuration(run: RunSettings, step: Step) -> Mapping[str, float] | None:
+def start_joint_positions_from_run(run: RunSettings, step: Step) -> Mapping[str, float] | None:
     """Joint positions at the start of the motion: from the settings, else from the first recording.
 
     None where neither says it: then it begins where the arms first grasp the undeformed object. Two arms that hold a

@@ -248,7 +248,7 @@ def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
     if farthest > _MAX_PLAUSIBLE_VALUES["points"]:
         units["points"] = "mm"
         notes.append(f"points reach {farthest:.3g}: they look like millimetres")
-    for group in recording.groups:
+    for group in recording.joint_and_point_groups:
         period = median_sample_period(group.t)
         unit = next((unit for unit, least in (("ns", 1e4), ("us", 200.0), ("ms", 0.5)) if period > least), "")
         slow = isinstance(group, PointGroup) and unit == "ms" and period < 30  # a slow camera, in seconds

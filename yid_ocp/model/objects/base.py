@@ -208,11 +208,11 @@ class ObjectKind:
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The object, to be placed by `placement`, with the damping of every coordinate and each link divided."""
+        """The flexible object, not yet placed, with each link divided into `link_division` links."""
         return flexible_object(self.model_segments(damping, link_division))
 
     @property
-    def placement(self) -> tuple[str | None, Array | None]:
+    def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
         """Frame that carries the object's root (the world when None), and the root's pose in it, shape (4, 4)."""
         return None, None
 
@@ -275,7 +275,7 @@ class MountedObject(ObjectKind):
         return flexible_object(self.model_segments(damping, link_division), gravity_fraction=self.gravity_fraction)
 
     @property
-    def placement(self) -> tuple[str | None, Array | None]:
+    def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
         return (None, None) if self.mount is None else (self.mount.parent_frame, self.mount.pose)
 
     @property

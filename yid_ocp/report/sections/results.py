@@ -232,7 +232,9 @@ def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
     entries = [(_ESTIMATED, i, *own) for i, own in enumerate(fitted)]
     for role, i, episode, prediction in entries + [(_HELD_OUT, 0, *own) for own in findings.held_out]:
         if not isinstance(prediction, str):
-            theta = problem.predictor.theta_with_episode_values(episode, problem.split(solution.x, i)[0])
+            theta = problem.predictor.theta_with_episode_values(
+                episode, problem.theta_and_initial_state_offset(solution.x, i)[0]
+            )
             yield _PredictedEpisode(role, problem, theta, episode, prediction)
 
 
@@ -300,7 +302,7 @@ def _fitted_curves(own: _PredictedEpisode) -> Iterator[tuple[str, list[TimePlotD
 def _recorded_signals(findings: ReportData) -> Iterator[tuple[str, Any]]:
     system: System | None = findings.section_data.get("system")
     recordings: Sequence[Recording] = findings.section_data.get("recordings", [])[:_MAX_LISTED_RECORDINGS]
-    for recording, group in ((own, group) for own in recordings for group in own.groups):
+    for recording, group in ((own, group) for own in recordings for group in own.joint_and_point_groups):
         if isinstance(group, JointGroup):
             for channel in _JOINT_CHANNEL_UNITS:
                 values = group.channels.get(channel)
