@@ -251,9 +251,8 @@ def _by_lateness(
     problem: EstimationProblem, x: Array, i: int, samples: Measurements, result: EpisodePrediction
 ) -> Array:
     """Whitened prediction less measurement per second that the stamps are late, shape (M, k)."""
-    theta = problem.predictor.theta_with_episode_values(
-        problem.episodes[i], problem.theta_and_initial_state_offset(x, i)[0]
-    )
+    shared, _ = problem.theta_and_initial_state_offset(x, i)
+    theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     state = result.rollout.state
     none = np.zeros((*state.shape, len(problem.unknowns.free_parameters)))
     steps = np.ones(samples.value.shape[1])

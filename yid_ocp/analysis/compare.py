@@ -285,9 +285,8 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
             problem, solution.x, evaluation.jacobian[kept], evaluation.residual[kept], 1e-10
         )
         x = np.clip(solution.x + step, *problem.bounds)
-        found = problem.predictor.predict_episode(
-            problem.episodes[i], *problem.theta_and_initial_state_offset(x, i), False
-        )
+        parts = problem.theta_and_initial_state_offset(x, i)
+        found = problem.predictor.predict_episode(problem.episodes[i], *parts, False)
         if isinstance(found, str):
             return np.inf
         for samples, predicted in zip(problem.episodes[i].measurements, found.predicted_outputs, strict=True):

@@ -377,11 +377,8 @@ class CandidateExperimentBuilder:
         layout = self.build_experiment(others)
         if isinstance(layout, str):
             raise SolverError(layout)
-        problem, n, (theta, offset) = (
-            layout.problem,
-            system.n_coordinates,
-            layout.problem.theta_and_initial_state_offset(layout.x, 0),
-        )
+        problem, n = layout.problem, system.n_coordinates
+        theta, offset = problem.theta_and_initial_state_offset(layout.x, 0)
         start = problem.initial_state(problem.episodes[0], theta, offset)
         if start.failure_message:
             raise SolverError(start.failure_message)

@@ -85,9 +85,7 @@ def linearise_step_equations(
 
 def system_with_numeric_parameters(system: System, theta: Array) -> System:
     """The system with numeric parameter values in place of symbols, internal coordinates at zero."""
-    inner = (
-        ca.vertcat(*system.internal_coordinate_symbols.values()) if system.internal_coordinate_symbols else ca.SX(0, 1)
-    )
+    inner = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
     symbols = ca.vertcat(system.parameters.symbols, inner)
     values = np.concatenate([theta, np.zeros(inner.numel())])
 

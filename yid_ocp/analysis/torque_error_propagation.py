@@ -59,9 +59,8 @@ def point_sensitivities_and_joint_information(
             shown.append((samples.sensor, block.reshape(len(samples.value), -1, len(x))))
         else:
             told.append(block)
-    course = nominal_trajectory_from_prediction(
-        problem.predictor, episode, result, problem.theta_and_initial_state_offset(x, i)[0]
-    )
+    theta, _ = problem.theta_and_initial_state_offset(x, i)
+    course = nominal_trajectory_from_prediction(problem.predictor, episode, result, theta)
     units = [finest[sensor.group_name] for sensor, block in shown for _ in range(block.shape[1])]
     by_state = []
     for sensor, _ in shown:

@@ -206,16 +206,12 @@ class ChannelGroup(ReprMixin):
         object.__setattr__(self, "stds_by_attribute", stds)
 
     def _summary(self) -> ReprSummary:
-        return ReprSummary(
-            f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {', '.join(self.values_by_quantity)}"
-        )
+        quantities = ", ".join(self.values_by_quantity)
+        return ReprSummary(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {quantities}")
 
     def _rows(self, rows: BoolArray) -> ChannelGroup:
-        return replace(
-            self,
-            t=self.t[rows],
-            values_by_quantity={key: value[rows] for key, value in self.values_by_quantity.items()},
-        )
+        values = {key: value[rows] for key, value in self.values_by_quantity.items()}
+        return replace(self, t=self.t[rows], values_by_quantity=values)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -279,10 +275,8 @@ class Recording(ReprMixin):
         """Keys that the settings may have under `sensors` for this recording, such as `joints.effort`."""
         own = [f"joints.{quantity}" for quantity in ("effort", "position") if self.joints is not None]
         own += [group.name for group in self.points]
-        return (
-            *own,
-            *(f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values_by_quantity),
-        )
+        own += [f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values_by_quantity]
+        return tuple(own)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -460,21 +454,19 @@ def _validate_channels(group: ChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
     declared = {channel.quantity: channel for channel in declared_channel_kinds(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
-    require_data(group.values_by_quantity, "the group has no values", where, ", ".join(declared))
-    for noun, found, known in (
-        ("dataset", group.values_by_quantity, declared),
-        ("attribute", group.stds_by_attribute, fields),
-    ):
+    own, stds = group.values_by_quantity, group.stds_by_attribute
+    require_data(own, "the group has no values", where, ", ".join(declared))
+    for noun, found, known in (("dataset", own, declared), ("attribute", stds, fields)):
         for name in found:
             what = f"no sensor declares a {noun} '{name}' here"
             allowed = ", ".join(known) or "groups that a sensor declares"
             require_data(name in known, what, where, allowed, nearest_name_hint(name, known))
-    for quantity, values in group.values_by_quantity.items():
+    for quantity, values in own.items():
         parts = len(declared[quantity].components)
         shape = (len(group.t), len(group.names), *([parts] if parts else []))
         _check_shape(values, shape, f"{where}/{quantity}", "(M, k, 3)" if parts else "(M, k)")
         require_data(np.isfinite(values).all(), "a value is not finite", f"{where}/{quantity}", "finite numbers")
-    for name, std in group.stds_by_attribute.items():
+    for name, std in stds.items():
         _validate_std(std, len(group.names), name, f"{where}, attribute {name}", "one number or (k,)")
 
 

@@ -215,12 +215,10 @@ def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
 def _confusion_matrix(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """The confusion matrix: true classes (rows), answers (columns) and counts."""
-    rows = sorted({m.true_class_label for m in marks}, key=lambda name: (name in _CATEGORIES, name))
-    columns = sorted({m.answered_class_label for m in marks}, key=lambda name: (name in _VERDICTS, name))
-    counts = [
-        [sum((m.true_class_label, m.answered_class_label) == (row, column) for m in marks) for column in columns]
-        for row in rows
-    ]
+    pairs = [(m.true_class_label, m.answered_class_label) for m in marks]
+    rows = sorted({true for true, _ in pairs}, key=lambda name: (name in _CATEGORIES, name))
+    columns = sorted({answered for _, answered in pairs}, key=lambda name: (name in _VERDICTS, name))
+    counts = [[pairs.count((row, column)) for column in columns] for row in rows]
     return {"true": rows, "said": columns, "counts": counts}
 
 

@@ -70,9 +70,7 @@ def _exported_step_functions(symbols: StepSymbols) -> tuple[ca.Function, ...]:
     rigid = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
     places = [kinematics.frame_position(name) for name in system.point_frames]
     mechanics = [mass_matrix(rigid, system.mechanism), rigid.lagrangian_by_q, rigid.lagrangian_by_v]
-    internal = (
-        ca.vertcat(*system.internal_coordinate_symbols.values()) if system.internal_coordinate_symbols else ca.SX(0, 1)
-    )
+    internal = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
     still = [ca.substitute(x, internal, ca.SX.zeros(internal.numel())) for x in (*places, *mechanics)]
     if places:
         outputs = [name.replace(":", "_").replace("%", "") for name in system.point_frames]

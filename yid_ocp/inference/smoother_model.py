@@ -278,9 +278,8 @@ def linear_residual_models(
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
         groups = problem.residual_rows.measurements[i]
         observed = columns[groups[0].start : groups[-1].stop]
-        nominal = nominal_trajectory_from_prediction(
-            problem.predictor, episode, result, problem.theta_and_initial_state_offset(x, i)[0]
-        )
+        theta, _ = problem.theta_and_initial_state_offset(x, i)
+        nominal = nominal_trajectory_from_prediction(problem.predictor, episode, result, theta)
         pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
         blocks = [samples.residual_block(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
         course = _LinearizedEpisode(problem, episode, nominal)

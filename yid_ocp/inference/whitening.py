@@ -386,9 +386,8 @@ def problem_whitened_at(
 
     def one(i: int) -> tuple[Episode, WhiteningFilter | None]:
         before = _own_filter(problem.whitening_filters[i])
-        return _whitened_episode(
-            problem.predictor, problem.episodes[i], problem.theta_and_initial_state_offset(x, i), guesses[i], before
-        )
+        own = problem.theta_and_initial_state_offset(x, i)
+        return _whitened_episode(problem.predictor, problem.episodes[i], own, guesses[i], before)
 
     if not problem.has_process_noise:
         return problem
@@ -412,10 +411,8 @@ def problem_with_whitened_held_out(problem: EstimationProblem, x: ArrayLike) -> 
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
     """The same problem, filters relinearized from the torque offsets at `frozen` to those at `x`, weights unchanged."""
-    at = [
-        (e, *problem.theta_and_initial_state_offset(x, i), problem.theta_and_initial_state_offset(frozen, i)[0])
-        for i, e in enumerate(problem.episodes)
-    ]
+    parts = problem.theta_and_initial_state_offset
+    at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
     return problem.with_episodes(episodes, problem.held_out, made, problem.held_out_whitening_filters)
 
@@ -456,11 +453,8 @@ def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike
     found: list[tuple[Array, Array] | None] = []
     for i, (episode, own) in enumerate(zip(problem.episodes, problem.whitening_filters, strict=True)):
         whitening = _own_filter(own)
-        result = (
-            ""
-            if whitening is None
-            else problem.predictor.predict_episode(episode, *problem.theta_and_initial_state_offset(x, i), False)
-        )
+        parts = problem.theta_and_initial_state_offset(x, i)
+        result = "" if whitening is None else problem.predictor.predict_episode(episode, *parts, False)
         if whitening is None or isinstance(result, str):
             found.append(None)
         else:

@@ -297,9 +297,8 @@ class EstimationProblem(ReprMixin):
                 raw = samples.whitened_residual(result.predicted_outputs[k])
                 _, factor = huber_loss_and_residual_factors(raw, self.options.huber_threshold)
                 pulls.append(samples.whitened_residual_adjoint(factor**2 * raw))
-            own = self.predictor.cost_gradient_by_adjoint(
-                self.episodes[i], result, *self.theta_and_initial_state_offset(x, i), pulls
-            )
+            theta, offset = self.theta_and_initial_state_offset(x, i)
+            own = self.predictor.cost_gradient_by_adjoint(self.episodes[i], result, theta, offset, pulls)
             gradient += self.unknowns.scatter_to_unknown_columns(own[None, :], i)[0]
         prior, prior_jacobian = self.prior_residual_and_jacobian(x)
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation

@@ -281,9 +281,11 @@ def _channel_groups(
         values = _noisy(values, np.broadcast_to(std[widen], values.shape), rng)
         values = values + _noisy(np.zeros(values.shape[1:]), np.broadcast_to(bias[widen], values.shape[1:]), rng)
         before = made.get(name, ChannelGroup(name, names, episode.grid.node_times, {}))
-        own_values = {**before.values_by_quantity, quantity: values}
-        own_stds = {**before.stds_by_attribute, **stds}
-        made[name] = replace(before, values_by_quantity=own_values, stds_by_attribute=own_stds)
+        by_quantity, by_attribute = (
+            {**before.values_by_quantity, quantity: values},
+            {**before.stds_by_attribute, **stds},
+        )
+        made[name] = replace(before, values_by_quantity=by_quantity, stds_by_attribute=by_attribute)
     return tuple(made.values())
 
 

@@ -138,9 +138,8 @@ class Solution(ReprMixin):
         if found.ok:
             return found.episode_predictions
         predict, pairs = problem.predictor.predict_episode, enumerate(problem.episodes)
-        return tuple(
-            predict(episode, *problem.theta_and_initial_state_offset(self.x, i), False) for i, episode in pairs
-        )
+        parts = problem.theta_and_initial_state_offset
+        return tuple(predict(episode, *parts(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:
         """Measured and predicted samples of every channel of the recordings at the estimate; empty without one."""

@@ -62,9 +62,8 @@ def guess_unknowns_and_node_states(
         moved = np.where(problem.positive_unknowns_mask, np.clip(factor * x, lower, upper), x)
         begins, states, multipliers, total = [], [], [], 0.0
         for i, episode in enumerate(problem.episodes):
-            theta = problem.predictor.theta_with_episode_values(
-                episode, problem.theta_and_initial_state_offset(moved, i)[0]
-            )
+            shared, _ = problem.theta_and_initial_state_offset(moved, i)
+            theta = problem.predictor.theta_with_episode_values(episode, shared)
             begins.append(problem.initial_state(episode, theta))
             found: list[tuple[Array, Array]] = []
             if not begins[-1].failure_message:
@@ -87,9 +86,8 @@ def guess_unknowns_and_node_states(
 
 def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, trajectory: Array, x: Array) -> float:
     """Mean square whitened residual of a trajectory (N + 1, nx) of recording `i`, without effort channels."""
-    theta = problem.predictor.theta_with_episode_values(
-        problem.episodes[i], problem.theta_and_initial_state_offset(x, i)[0]
-    )
+    shared, _ = problem.theta_and_initial_state_offset(x, i)
+    theta = problem.predictor.theta_with_episode_values(problem.episodes[i], shared)
     slopes = np.zeros((*trajectory.shape, len(problem.unknowns.free_parameters)))
     parts = [np.zeros(1)]
     for samples in problem.episodes[i].measurements:

@@ -357,9 +357,8 @@ class _ShootingIntervals:
                 raise SolverError(message, where=episode.name, hint="use gauss_newton")
             self.node_steps.append(np.unique(np.append(np.arange(0, steps + 1, node_interval), steps)))
         # equilibria are looked for near those of the problem's start, whatever the point
-        thetas = (
-            problem.theta_and_initial_state_offset(problem.initial_unknowns, i)[0] for i in range(len(problem.episodes))
-        )
+        x = problem.initial_unknowns
+        thetas = (problem.theta_and_initial_state_offset(x, i)[0] for i in range(len(problem.episodes)))
         starts = map(problem.initial_state, problem.episodes, thetas)
         found = [None if start.failure_message else start.equilibrium for start in starts]
         n = problem.step.sizes["n"]
@@ -375,9 +374,8 @@ class _ShootingIntervals:
         return x, list(found.node_states)
 
     def _misfit(self, i: int, nodes: Array, x: Array) -> float:
-        theta = self.problem.predictor.theta_with_episode_values(
-            self.problem.episodes[i], self.problem.theta_and_initial_state_offset(x, i)[0]
-        )
+        shared, _ = self.problem.theta_and_initial_state_offset(x, i)
+        theta = self.problem.predictor.theta_with_episode_values(self.problem.episodes[i], shared)
         rollouts = [self._rollout(i, j, nodes[j], theta, None) for j in range(len(nodes) - 1)]
         trajectory = np.vstack([*(rollout.state[:-1] for rollout in rollouts), rollouts[-1].state[-1:]])
         return mean_square_residual_without_efforts(self.problem, i, trajectory, x)

@@ -127,9 +127,8 @@ def problem_unknowns_from_program(problem: EstimationProblem, program: Nonlinear
         if rows:
             blocks = (program.variables.get(f"{part}[{episode.name}]") for part in "qpz")
             first = w[np.concatenate([block.index[:, 0] for block in blocks if block is not None])]
-            begin = problem.initial_state(
-                episode, problem.theta_and_initial_state_offset(x, i)[0], guess=first[: problem.step.sizes["n"]]
-            )
+            theta, _ = problem.theta_and_initial_state_offset(x, i)
+            begin = problem.initial_state(episode, theta, guess=first[: problem.step.sizes["n"]])
             x[columns[own:]] = (first - begin.state)[rows]
     return x
 
@@ -288,9 +287,8 @@ class _Maker:
         problem, episode = self._problem, self._problem.episodes[i]
         system, name, (n, nx, m) = problem.system, episode.name, (self._sizes[key] for key in ("n", "nx", "m"))
         begin, state, pull = found.initial_states[i], found.node_states[i], found.multipliers[i]
-        theta = problem.predictor.theta_with_episode_values(
-            episode, problem.theta_and_initial_state_offset(found.x, i)[0]
-        )
+        shared, _ = problem.theta_and_initial_state_offset(found.x, i)
+        theta = problem.predictor.theta_with_episode_values(episode, shared)
         rest, sought = np.zeros(0), list(problem.model_functions.equilibrium_solver.free_coordinates)
         if (known := begin.equilibrium) is not None:
             rest = np.concatenate([known.state[sought], known.state[2 * n :], known.constraint_reactions])
@@ -411,9 +409,8 @@ class _Maker:
         if not loose:
             return term, []
         offset = LocalVariableFunction("offset", inputs, ca.densify((first - state)[loose]))
-        weight = self._p.append_block(
-            f"weight.start[{name}]", 1.0 / problem.initial_state_prior_std, [rows[k] for k in loose]
-        )
+        weights = 1.0 / problem.initial_state_prior_std
+        weight = self._p.append_block(f"weight.start[{name}]", weights, [rows[k] for k in loose])
         named = tuple(f"offset.{rows[k]}" for k in loose)
         free = ProgramTerm(f"offset[{name}]", named, offset, at, data, shared)
         return term, [ResidualTerm(free, ca.DM.eye(len(loose)), weight[:, 0])]

@@ -313,9 +313,8 @@ def _object_point_issues(problem: EstimationProblem) -> list[Issue]:
         return []
     found: list[Issue] = []
     for i, episode in enumerate(problem.episodes):
-        result = problem.predictor.predict_episode(
-            episode, *problem.theta_and_initial_state_offset(problem.initial_unknowns, i), False, None
-        )
+        own = problem.theta_and_initial_state_offset(problem.initial_unknowns, i)
+        result = problem.predictor.predict_episode(episode, *own, False, None)
         if isinstance(result, EpisodePrediction):
             found += point_checks.check_object_points_by_rollout(episode, result, size)
     return found

@@ -129,10 +129,8 @@ def _split(
     if time is None:
         return made
     [whole] = recordings
-    first, last = (
-        min(g.t[0] for g in whole.joint_and_point_groups),
-        max(g.t[-1] for g in whole.joint_and_point_groups),
-    )
+    clocks = [group.t for group in whole.joint_and_point_groups]
+    first, last = min(t[0] for t in clocks), max(t[-1] for t in clocks)
     parts: dict[Path, Recording | None] = {}
     for role, begin, end in (("estimate", first, time), ("held_out", time, last)):
         name, note = f"{whole.name}_{role}", f"of {whole.source or whole.name}, from {begin:.6g} s to {end:.6g} s"

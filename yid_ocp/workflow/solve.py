@@ -239,9 +239,8 @@ def _refined_problem(
     step = build_step(replace(run, problem=replace(run.problem, use_compiler=compiled)), system)
     factors = {name: float(divided_link_parameter_scale(run, name, 2)) for name in system.parameters.names}
     priors = {name: std * factors.get(name, 1.0) for name, std in options.prior_stds.items()}
-    options = replace(
-        options, prior_stds=priors, multivariate_prior=options.multivariate_prior.with_parameters_scaled_by(factors)
-    )
+    joint = options.multivariate_prior.with_parameters_scaled_by(factors)
+    options = replace(options, prior_stds=priors, multivariate_prior=joint)
     made = EstimationProblem(step, recordings, problem.free, options)
     joints = discretisation.fine_joints_by_coarse_joint(problem.system, system)
     return discretisation.FinerDiscretisationProblem(made, factors, joints)

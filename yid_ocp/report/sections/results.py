@@ -232,9 +232,8 @@ def _predicted_episodes(findings: ReportData) -> Iterator[_PredictedEpisode]:
     entries = [(_ESTIMATED, i, *own) for i, own in enumerate(fitted)]
     for role, i, episode, prediction in entries + [(_HELD_OUT, 0, *own) for own in findings.held_out]:
         if not isinstance(prediction, str):
-            theta = problem.predictor.theta_with_episode_values(
-                episode, problem.theta_and_initial_state_offset(solution.x, i)[0]
-            )
+            shared, _ = problem.theta_and_initial_state_offset(solution.x, i)
+            theta = problem.predictor.theta_with_episode_values(episode, shared)
             yield _PredictedEpisode(role, problem, theta, episode, prediction)
 
 
