@@ -170,7 +170,7 @@ class NaturalFrequencies:
 
 def step_map_natural_frequencies(
     system: System,
-    posture: Mapping[str, float],
+    configuration: Mapping[str, float],
     theta: Array,
     time_step: float,
     force_split: ForceSplit = "symmetric",
@@ -179,15 +179,15 @@ def step_map_natural_frequencies(
 ) -> NaturalFrequencies:
     """Natural frequencies of a system's step map about an equilibrium, from the eigenvalues of A_k without damping.
 
-    The driven and prescribed coordinates `posture` [rad or m] are held still; rest is sought from `guess` (n,). The
-    midpoint rule lowers a frequency f to atan(pi f h)/(pi h); the force split (`compile_step`) affects growth alone.
+    The driven and prescribed coordinates `configuration` [rad or m] are held still; rest is sought from `guess` (n,).
+    The midpoint rule lowers a frequency f to atan(pi f h)/(pi h); the force split affects growth alone.
     """
     still = replace(system, driven=(), servos={}, prescribed=(*system.driven, *system.prescribed))
     if not still.unprescribed_coordinate_indices:
         held = "every coordinate is driven or prescribed: with these held still nothing can swing"
         return NaturalFrequencies(np.zeros(0), message=held)
     step = compile_step(still, time_step, force_split, constraint_force, use_compiler=False)
-    known = np.array([posture[name] for name in still.prescribed])
+    known = np.array([configuration[name] for name in still.prescribed])
     rest = EquilibriumSolver(step).solve(known, theta, guess=guess)
     if not rest.is_converged:
         return NaturalFrequencies(np.zeros(0), message=rest.message)
@@ -210,20 +210,20 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
     return values[np.abs(values) > 0.2]
 
 
-def min_closure_error_by_grasp(system: System, posture: Mapping[str, float], theta: Array) -> dict[str, float]:
+def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
     """Smallest remaining gap of each grasp [m], by name: the robot's joints are fixed, the object may bend.
 
-    `posture` are driven and prescribed coordinates [rad or m]; lengths are taken from `theta`.
+    `configuration` holds driven and prescribed coordinates [rad or m]; lengths are taken from `theta`.
     """
     if not system.grasps:
         return {}
     q, numeric = ca.SX.sym("q", system.n_coordinates), system_with_numeric_parameters(system, theta)
     kinematics = forward_kinematics(numeric.mechanism, q)
     phi = ca.vertcat(*(grasp.constraint_residual(kinematics)[:3] for grasp in numeric.grasps))
-    known = [system.mechanism.joint_index(name) for name in posture]
+    known = [system.mechanism.joint_index(name) for name in configuration]
     free = [i for i in range(system.n_coordinates) if i not in known]
     full = np.zeros(system.n_coordinates)
-    full[known] = list(posture.values())
+    full[known] = list(configuration.values())
     function = ca.Function("phi", [q], [phi, ca.jacobian(phi, q)[:, free]])
 
     def phi_at(x: Array, part: int) -> Array:

@@ -5,9 +5,10 @@ amplitudes of candidate j and P = I - J_theta J_theta^+:
 
     G_j = J_j' P J_j,  s_j = -J_j' P r,  LM_j = s_j' S_j^-1 s_j,
 
-S_j = G_j for white noise of unit standard deviation, and the sum of the scores' autocovariances for a coloured one,
-taken as it would be with the candidate's step done (Bartlett's weights, Newey and West 1987, doi:10.2307/1913610). The
-decrease of r'r that the linear model promises is s_j' G_j^-1 s_j, less where the amplitude would leave its bounds.
+S_j = G_j for white noise of unit standard deviation, and the sum of the scores' autocovariances for autocorrelated
+noise, taken as it would be with the candidate's step done (Bartlett's weights, Newey and West 1987,
+doi:10.2307/1913610). The decrease of r'r that the linear model promises is s_j' G_j^-1 s_j, less where the amplitude
+would leave its bounds.
 Shape parameters are taken over a grid, the best value as the best of that many tries (Davies 1987,
 doi:10.1093/biomet/74.1.33, bounded by Bonferroni).
 """
@@ -38,7 +39,7 @@ class _EffectSignature:
     effect: EffectBase
     shape_values: dict[str, float]
     projected_sensitivity: Array  # X = P J_j, shape (nr, p), by its amplitudes
-    score_noise_covariance: Array  # shape (p, p): covariance of X'r under the noise's own colour
+    score_noise_covariance: Array  # shape (p, p): covariance of X'r under the noise's own autocorrelation
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,9 @@ def linearize_candidates(
         edges = np.cumsum([len(effect.amplitude_names) for effect in chosen])[:-1]
         for effect, part in zip(chosen, np.split(moved, edges, axis=1), strict=True):
             columns = np.ascontiguousarray(part)
-            signatures.append(_EffectSignature(effect, grids[effect.label][k], columns, _coloured(columns, series)))
+            signatures.append(
+                _EffectSignature(effect, grids[effect.label][k], columns, _covariance_of_scores(columns, series))
+            )
     return AllCandidatesLinearization(residual, tuple(signatures))
 
 
@@ -150,20 +153,20 @@ def _pinv(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
 
 
-def _coloured(columns: Array, series: Sequence[ResidualChannelSamples]) -> Array:
-    """X' Omega X under the noise's known colour."""
+def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannelSamples]) -> Array:
+    """X' Omega X under the noise's known autocorrelation."""
     import scipy.signal  # slow to import
 
     total = np.zeros((columns.shape[1], columns.shape[1]))
     least = 1e-6 * float(np.max(np.abs(columns), initial=0.0))
     for s in series:
-        x, colour = columns[s.residual_indices], s.noise_autocorrelation
+        x, rho = columns[s.residual_indices], s.noise_autocorrelation
         if not np.any(np.abs(x) > least):
             continue
         seen = x
-        if len(colour) > 1:
-            both = np.concatenate([colour[:0:-1], colour])[:, None]
-            seen = scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(colour) - 1 :][: len(x)]
+        if len(rho) > 1:
+            both = np.concatenate([rho[:0:-1], rho])[:, None]
+            seen = scipy.signal.oaconvolve(x, both, mode="full", axes=0)[len(rho) - 1 :][: len(x)]
         total += x.T @ seen
     return (total + total.T) / 2
 

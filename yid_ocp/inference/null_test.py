@@ -1,8 +1,8 @@
 """Null test: whether a residual is larger than noise alone explains.
 
-Under the null hypothesis the whitened residual r is noise of unit standard deviation whose colour rho is known (white,
-or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a chi-squared
-variable with n/(1 + 2 sum rho_l^2) degrees of freedom; a free parameter takes one of them.
+Under the null hypothesis the whitened residual r is noise of unit standard deviation with a known autocorrelation rho
+(white, or that of the smoothing filter). Then r'r/n has the variance 2/n (1 + 2 sum rho_l^2), which is that of a
+chi-squared variable with n/(1 + 2 sum rho_l^2) degrees of freedom; a free parameter takes one of them.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class NullTestResult:
     """Result of the null test: chi2 per degree of freedom, and the probability of one this large under noise alone."""
 
     chi2_per_dof: float
-    degrees_of_freedom: float  # effective ones, of coloured noise
+    degrees_of_freedom: float  # effective ones, of autocorrelated noise
     p_value: float
     channel_chi2: dict[str, float]  # mean square of each channel's residual
     windows: tuple[_ResidualWindow, ...]
@@ -98,9 +98,9 @@ def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedCha
     )
 
 
-def _variance_inflation(colour: Array) -> float:
+def _variance_inflation(autocorrelation: Array) -> float:
     """Variance inflation 1 + 2 sum rho_l^2 of a mean square of autocorrelated noise."""
-    return float(1 + 2 * np.sum(colour[1:] ** 2))
+    return float(1 + 2 * np.sum(autocorrelation[1:] ** 2))
 
 
 def chi2_p_value(chi2: float, degrees: float) -> float:
@@ -206,16 +206,16 @@ def residual_channel_samples(problem: EstimationProblem) -> tuple[ResidualChanne
             t = times_since_recording_start(episode, samples)
             place = np.full(samples.used_output_mask.shape, -1)
             place[samples.used_output_mask] = np.arange(rows.start, rows.stop)
-            colour = np.ones(1)
+            autocorrelation = np.ones(1)
             if samples.sensor.effort_joints:
                 low_pass, step = two_pass_effort_filter(problem.options.path_cutoff), episode.grid.time_step
                 stride = low_pass.decorrelation_stride(step)
-                colour = _filtered_noise_autocorrelation(low_pass, step)[::stride]
+                autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[::stride]
             for column, channel in enumerate(samples.output_channel_names):
                 seen = samples.used_output_mask[:, column]
                 if seen.any():
                     text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
-                    series.append(ResidualChannelSamples(*text, t[seen], place[seen, column], colour))
+                    series.append(ResidualChannelSamples(*text, t[seen], place[seen, column], autocorrelation))
     return tuple(series)
 
 

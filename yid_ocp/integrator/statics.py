@@ -80,7 +80,7 @@ class EquilibriumSolver:
 
     def solve(
         self,
-        posture: ArrayLike,
+        configuration: ArrayLike,
         theta: ArrayLike,
         torque: ArrayLike | None = None,
         guess: ArrayLike | None = None,
@@ -90,19 +90,19 @@ class EquilibriumSolver:
 
         Parameters
         ----------
-        posture : array_like, shape (nk,)
+        configuration : array_like, shape (nk,)
             Known coordinates, driven then prescribed [rad or m].
         torque : array_like, shape (nu,), optional
-            Measured torque at the posture [N m]; the holding spring then only makes up for noise. Of servos what they
-            are commanded: the posture is then where the search begins. Where a motor is off (`MOTOR_OFF_COMMAND`) the
-            joint is held at its posture and let go as the motion begins.
+            Measured torque there [N m]; the holding spring then only makes up for noise. Of servos what they are
+            commanded: the configuration is then where the search begins. Where a motor is off (`MOTOR_OFF_COMMAND`) the
+            joint is held where it is and let go as the motion begins.
         guess : array_like, shape (n,), optional
             Configuration to start from; the undeformed object when absent.
         names : sequence of str
             Parameters by which to differentiate.
         """
         step, system = self.step, self.step.system
-        given = checked_float_array("posture", posture, (len(self.known_coordinates),))
+        given = checked_float_array("configuration", configuration, (len(self.known_coordinates),))
         theta = checked_float_array("theta", theta, (len(system.parameters),))
         stiffness = holding_spring_stiffness(system, torque is not None)
         nu, nz = step.sizes["nu"], step.sizes["nz"]
@@ -129,7 +129,7 @@ class EquilibriumSolver:
         if failed and guess is None:
             lowest = self._lowest_energy(theta, hold)
             if lowest is not None:
-                return self.solve(posture, theta, torque, lowest, names)
+                return self.solve(configuration, theta, torque, lowest, names)
         q = self._configuration(w, given)
         give = hold.give(q, system)
         state, by_theta, by_posture = self._differentiate(w, theta, hold, h, tuple(names))

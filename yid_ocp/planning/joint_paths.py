@@ -344,12 +344,12 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
     return chosen
 
 
-def solve_start_equilibrium(step: Step, theta: Array, posture: Array, guess: Array | None = None) -> Equilibrium:
+def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, guess: Array | None = None) -> Equilibrium:
     """Solve for the equilibrium at which a motion begins, near a configuration where one is given.
 
     Raises `ModelError` where there is none, for example because a grasp cannot be closed.
     """
-    rest = EquilibriumSolver(step).solve(posture, theta, guess=guess)
+    rest = EquilibriumSolver(step).solve(configuration, theta, guess=guess)
     if not rest.is_converged:
         allowed, where = "a posture at which every grasp holds the object at rest", "plan.start_joint_positions"
         hint = f"give {where} or a recording, which begins where the object is held; or correct model.grasp"

@@ -102,7 +102,7 @@ class InitialStateFitter:
         self._load = ca.Function("load", e.arguments, loads)
 
     def fit_to_points(
-        self, posture: Array, samples: Sequence[Measurements], theta: Array, window: float, path: Array
+        self, configuration: Array, samples: Sequence[Measurements], theta: Array, window: float, path: Array
     ) -> FixedInitialState:
         """Fit the configuration to the points of the first frame and the momentum to their change within the window.
 
@@ -130,7 +130,7 @@ class InitialStateFitter:
         ratio = np.where(stiffness > 0, np.maximum(stiffness / typical, _MIN_STIFFNESS_RATIO), 1.0)
         weight = np.sqrt(ratio) / _BEND_STD
         guess = rest.copy()
-        guess[self._known] = posture
+        guess[self._known] = configuration
         guess[list(system.prescribed_coordinate_indices)] = path[first]
         found = [(guess, trial, np.inf) for trial in self._trials(theta[index])]
         for stage, softness in enumerate(_NOISE_FACTORS):

@@ -92,7 +92,7 @@ class Measurements:
 
     @property
     def output_channel_names(self) -> tuple[str, ...]:
-        """ChannelKind name of each of the k outputs."""
+        """Channel name of each of the k outputs."""
         return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
     @property
