@@ -11,7 +11,7 @@ _MAX_TABLE_ROWS = 30  # largest number of table rows in a notebook; further rows
 
 @dataclass(frozen=True)
 class ReprSummary:
-    """The representation of an object: one line without its class, and a notebook's table with its head first."""
+    """Texts that represent an object: one line without its class name, and rows of a notebook table, header first."""
 
     one_line: str
     table_rows: Sequence[Sequence[str]] = ()

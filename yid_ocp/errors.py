@@ -20,7 +20,7 @@ class YidError(Exception):
         super().__init__(what)
 
     def four_parts(self) -> dict[str, str]:
-        """What, where, allowed and hint as they are shown; what was not said is said in general."""
+        """What, where, allowed and hint as they are shown, with general texts for parts that were not given."""
         said = {
             "what": self.what,
             "where": self.where or "the command as it was given",
@@ -60,7 +60,7 @@ class ModelError(YidError):
 
 
 class SolverError(YidError):
-    """A solver does not support what was requested."""
+    """A solver cannot do what was asked: the method does not support it, or no usable solution was found."""
 
 
 class OutputError(YidError):

@@ -26,7 +26,7 @@ NULL_PROGRESS = Progress()
 
 @dataclass(frozen=True)
 class LoggingProgress(Progress):
-    """Progress as log messages."""
+    """A progress receiver that writes reports to a logger."""
 
     log: logging.Logger
 
@@ -40,7 +40,7 @@ class LoggingProgress(Progress):
 
 
 class ParallelProgress:
-    """Progress of a stage whose `total` parts run in parallel, `first` to begin with; counts them as they finish."""
+    """Counter of a stage's `total` parallel parts, `first` to begin with; reports each count to a progress receiver."""
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()

@@ -35,7 +35,7 @@ def source_hash(folder: Path) -> str:
 
 @functools.cache
 def package_source_hash() -> str:
-    """`source_hash` of this package at the first call in this process."""
+    """SHA-256 of this package's source files as they were at the first call in this process; 64 hexadecimal digits."""
     return source_hash(Path(__file__).parent)
 
 

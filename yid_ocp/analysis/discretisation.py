@@ -274,7 +274,7 @@ class AlternatingErrorGrowth:
 
     @property
     def keeps_errors_below_resolution(self) -> bool:
-        """Whether rounding errors stay below sensor resolution."""
+        """Whether an alternating error grows by at most six decades: rounding stays below what sensors resolve."""
         return self.growth_decades <= _MAX_GROWTH_DECADES
 
     @property

@@ -40,7 +40,7 @@ class FrictionLawFit:
 
 
 def recordings_by_motion_kind(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
-    """Recordings by kind of motion: names up to a number, or each by itself; without those whose motors are off."""
+    """Names of recordings by kind of motion, a name up to its number, or each by itself; none whose motors are off."""
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
     names = [name for name in joints if not problem.system.servos or name in commanded]
@@ -55,7 +55,7 @@ def recordings_by_motion_kind(problem: EstimationProblem) -> dict[str, tuple[str
 def fit_friction_law(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> FrictionLawFit:
-    """Errors of a law, with its `solution` on all recordings of `problem`, on every kind of motion left out in turn."""
+    """The fit of a law, `solution`, to all recordings, with its errors on every kind of motion left out in turn."""
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
@@ -173,7 +173,7 @@ def _load_function(problem: EstimationProblem) -> ca.Function:
 
 
 def problem_estimating_on_held_out_too(problem: EstimationProblem) -> EstimationProblem:
-    """The problem that estimates on its held-out recordings too."""
+    """The problem with its held-out recordings among those to estimate on."""
     added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)
     filters = (*problem.whitening_filters, *problem.held_out_whitening_filters)
     return problem.with_episodes((*problem.episodes, *added), (), filters, ())

@@ -68,7 +68,7 @@ class ParameterProfileLikelihood:
 def compute_profile_likelihood_interval(
     problem: EstimationProblem, x: Array, index: int, std: float, evaluation: Evaluation
 ) -> ParameterProfileLikelihood:
-    """Profile-likelihood interval of one unknown: min over all others of chi2(x) - chi2(best) = 3.84.
+    """Profile likelihood of one unknown and its 95 % interval, where chi2, least over all others, has risen by 3.84.
 
     Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
     Unknowns that are positive by nature move in their logarithm. The weak prior does not count. An end is open where

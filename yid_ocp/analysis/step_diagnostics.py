@@ -526,7 +526,7 @@ def _nlp_sparsity_masks(stage: _NlpStage, steps: int) -> tuple[BoolArray, BoolAr
 
 
 def kkt_sparsity_pattern(stage: _NlpStage, steps: int) -> SparsityPattern:
-    """The KKT matrix [[H, J'], [J, 0]] of the first steps of a recording, as if every node were measured."""
+    """Sparsity of the KKT matrix [[H, J'], [J, 0]] of a recording's first steps, as if every node were measured."""
     jacobian, hessian, measured = _nlp_sparsity_masks(stage, steps)
     blank = np.zeros((len(jacobian), len(jacobian)), bool)
     mask = np.vstack([np.hstack([hessian | measured, jacobian.T]), np.hstack([jacobian, blank])])

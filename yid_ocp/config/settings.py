@@ -453,7 +453,7 @@ class RunSettings:
     key_locations: Mapping[tuple[str | int, ...], str] = field(default_factory=dict, compare=False, repr=False)
 
     def describe_location(self, *path: str | int) -> str:
-        """Text with file, line and key of a setting, for the `describe_location` of an error."""
+        """Text with file, line and key of a setting, for the `where` of an error."""
         key = ".".join(str(part) for part in path)
         for count in range(len(path), 0, -1):
             if path[:count] in self.key_locations:

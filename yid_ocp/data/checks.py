@@ -40,7 +40,7 @@ class _RecordingParts(NamedTuple):
 
 
 def split_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
-    """Split a recording at gaps in the joints, or else in the `driving` points that clamps follow.
+    """Parts between gaps in the joints, or else in the `driving` points that clamps follow, and one issue for each gap.
 
     Where a rollout may not start `anywhere`, in motion too, later parts are kept only where they start at rest.
     """

@@ -219,7 +219,7 @@ class _PredictionErrors:
 
 @dataclass(frozen=True)
 class EffectRemovalAndAdditionTest:
-    """Prediction errors with the effects removed, and with the effects added."""
+    """Prediction errors on reference recordings with the effects removed, and on the diagnosed ones with them added."""
 
     # made without the effects: by the diagnosed model less its effects, against the nominal model as it was fitted
     effects_removed: _PredictionErrors
@@ -227,7 +227,7 @@ class EffectRemovalAndAdditionTest:
     effects_added: _PredictionErrors
 
     def to_dict(self) -> dict[str, Any]:
-        """As in `yid-diagnosis/2`."""
+        """The test as a dictionary, `counterfactual` of `yid-diagnosis/2`."""
         return {"removed": self.effects_removed.to_dict(), "added": self.effects_added.to_dict()}
 
 

@@ -142,12 +142,12 @@ class CaseGroundTruth:
     experiment: str = ""  # in which it was made
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
+        """The label as a JSON-compatible dictionary."""
         return asdict(self)
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> CaseGroundTruth:
-        """From JSON."""
+        """The label of which `to_dict` made the dictionary."""
         injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
         return CaseGroundTruth(**{**data, "injected": injected})
 
@@ -284,7 +284,7 @@ class BlindCaseGenerator:
         ]
 
     def load_candidate_sensitivities(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Load detectable sizes computed by another process, from `candidate_sensitivities_to_json`."""
+        """Take the candidates' sensitivities that `candidate_sensitivities_to_json` returned in another process."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))

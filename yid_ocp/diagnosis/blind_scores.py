@@ -56,17 +56,17 @@ class BlindCaseScore:
 
     @property
     def named_effect_labels(self) -> tuple[str, ...]:
-        """Labels the diagnosis names: the confusable set, or the first effect added."""
+        """Labels of the effects that the diagnosis names: the confusable set, or the first effect added."""
         return self.confusable or tuple(self.answer.split(" + ")[:1])
 
     @property
     def true_class_label(self) -> str:
-        """The row of the confusion matrix: the kind of a single effect, else the category."""
+        """Name of the case's row in the confusion matrix: the kind of a single effect, else the category."""
         return self.truth.partition("@")[0] if self.category == "single" else self.category
 
     @property
     def answered_class_label(self) -> str:
-        """The column of the confusion matrix: kind of the first effect added, else the verdict."""
+        """Name of the answer's column in the confusion matrix: the kind of the first effect added, else the verdict."""
         return self.verdict if self.answer == "-" else self.answer.partition("@")[0]
 
 

@@ -348,7 +348,7 @@ def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
 def recommended_experiment_text(
     verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], seen: Sequence[CandidateDetectability]
 ) -> str:
-    """Return the recommended next recording as text."""
+    """Return the sentence that recommends the next recording, by verdict, place of the gap and confusable effects."""
     rivals = next((entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1), ())
     if rivals and verdict != "insufficient_data":
         return _separating_experiment(rivals)

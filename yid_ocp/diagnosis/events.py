@@ -79,7 +79,7 @@ class DisturbanceEvent:
         return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
 
     def to_dict(self) -> dict[str, Any]:
-        """As in result.json."""
+        """The event as a dictionary, an entry of `events` in result.json."""
         names = "recording location channel kind from=start_time to=end_time impulse peak=peak_value unit"
         return attributes_to_json(self, f"{names} std=impulse_std")
 

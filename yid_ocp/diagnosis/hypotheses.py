@@ -141,7 +141,7 @@ class AllCandidatesProblem:
 
     @property
     def nominal_free_parameters(self) -> tuple[str, ...]:
-        """Parameters that the nominal problem frees."""
+        """Names of the parameters that are free in the nominal problem."""
         return self.problem.free
 
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:

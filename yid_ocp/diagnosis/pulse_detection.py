@@ -141,7 +141,7 @@ class ForceEstimate:
 
     @property
     def time_spacing(self) -> float:
-        """From point to point [s]."""
+        """Median time between neighbouring points [s]."""
         return float(np.median(np.diff(self.t)))
 
     def subset_at_times(self, keep: IntArray) -> ForceEstimate:
@@ -180,7 +180,7 @@ class DetectedForcePulse:
 
     @property
     def impulse(self) -> float:
-        """Integral over time."""
+        """Integral of the pulse over time, with its sign [unit of the history times s]."""
         return self.peak_value * self.impulse_per_unit_peak
 
     def filtered_force_at(self, t: Array, cutoff: float = math.inf) -> Array:

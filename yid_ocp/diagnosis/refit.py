@@ -56,12 +56,12 @@ class HeldOutLoss:
 
     @property
     def chi2_per_sample(self) -> float:
-        """chi2/n."""
+        """Sum of whitened squares divided by the number of held-out samples, chi2/n; 1 is noise alone."""
         return self.total_chi2 / max(float(self.block_sample_counts.sum()), 1.0)
 
     @property
     def excess_chi2(self) -> float:
-        """G."""
+        """Held-out gap G = max(0, chi2/n - 1)."""
         return max(0.0, self.chi2_per_sample - 1.0)
 
 
@@ -103,7 +103,7 @@ class RefitStore(Protocol):
         """The refit of this name, None where it is not known."""
 
     def put(self, name: str, refitted: StoredFit) -> None:
-        """Keep a refit."""
+        """Keep a refit under a name."""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class ParameterTransferCheck:
 
     @property
     def both_estimates_text(self) -> str:
-        """Both estimates, in words."""
+        """Text of both estimates with their standard deviations and unit."""
         here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
@@ -203,7 +203,7 @@ def find_unknown_verdict_reason(
 def explained_fraction_of_smoother_chi2(
     nominal: RefittedModel, added: Sequence[SelectedEffect], smoothed: SmootherResult | None
 ) -> float:
-    """Return the decrease of r'r by the effects over that by the smoother, both less degrees of freedom; else one."""
+    """Return the effects' decrease of r'r as a fraction of the smoother's, both less degrees of freedom; else one."""
     if smoothed is None or not added:
         return 1.0
     last = added[-1].refitted_model

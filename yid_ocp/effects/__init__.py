@@ -41,7 +41,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
 
 
 def required_signal_kinds() -> frozenset[str]:
-    """`_SENSOR_KINDS` and what effects of one's own require."""
+    """Kinds of recorded signals that effects can require, such as `joints.effort`, plug-in effects included."""
     return frozenset(_SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
 
 

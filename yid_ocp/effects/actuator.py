@@ -302,7 +302,7 @@ class SupplyVoltage(_ServoChange):
 
 @EFFECTS.register("back_emf")
 class BackEmf(_ServoChange):
-    """A direct-current motor's torque against its speed, kt^2/R, multiplied by scale."""
+    """A direct-current motor's braking torque per speed (kt^2/R, from its counter-voltage) multiplied by scale."""
 
     equation = "torque = clip(gain (u - q)) - scale damping v"
     required_excitation = "how fast it moves"

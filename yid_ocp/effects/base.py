@@ -79,7 +79,7 @@ class ReportedParameter:
 
 @dataclass(frozen=True)
 class EffectBase(Effect):
-    """The base of all kinds of effects, which changes nothing; a kind declares itself and overrides what it does."""
+    """Base class of all effects, which by default changes nothing; a kind overrides the methods of what it changes."""
 
     definitions: tuple[ParameterDefinition, ...] = ()  # those of `parameters`, at this location
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm

@@ -189,7 +189,7 @@ _UNUSED = FormatSupport("native", "it enters nothing in this model")
 
 
 def format_support_by_effect(system: System, values: Mapping[str, float], form: str) -> dict[str, FormatSupport]:
-    """Whether an export format (`mjcf`, `urdf`, `sdf`) can express each effect of a system, by effect label."""
+    """Support of an export format (`mjcf`, `urdf`, `sdf`) for each effect of a system, by effect label."""
     value, found = ParameterEvaluator(system, values), dict[str, FormatSupport]()
     theta = dict(zip(system.parameters.names, system.parameters.vector(values), strict=True))
     for effect in system.effects:
@@ -207,7 +207,7 @@ def format_support_by_effect(system: System, values: Mapping[str, float], form: 
 def format_support_by_parameter(
     system: System, effects: Mapping[str, FormatSupport], form: str
 ) -> dict[str, FormatSupport]:
-    """Whether an export format can express each parameter; an effect's parameters are as the effect."""
+    """Support of an export format for each parameter, by name; that of an effect's is the effect's."""
     found = {}
     for entry in system.parameters:
         owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_of_parameters(system, entry.symbol))

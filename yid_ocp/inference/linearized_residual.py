@@ -42,7 +42,7 @@ class NominalTrajectory:
 def nominal_trajectory_from_prediction(
     predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
 ) -> NominalTrajectory:
-    """Trajectory of an episode about which its residual is linearized."""
+    """Nominal trajectory of an episode from its prediction, about which the residual is linearized."""
     own, rest, sizes = predictor.theta_with_episode_values(episode, theta), result.equilibrium, predictor.step.sizes
     by_angles = by_torque = np.zeros((sizes["nx"], sizes["nu"]))
     if rest is not None:

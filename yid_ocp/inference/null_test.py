@@ -53,7 +53,7 @@ class ResidualChannelSamples:
 
 @dataclass(frozen=True)
 class AssumedChannelNoiseLevel:
-    """Median standard deviation of the noise of one channel's samples, after smoothing where they are smoothed."""
+    """Median standard deviation that a problem assumes for the noise of one channel, smoothed like its samples."""
 
     channel: str
     unit: str
@@ -84,7 +84,7 @@ class NullTestResult:
 
 
 def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
-    """Noise levels that the problem assumes, channel by channel."""
+    """Noise levels that the problem assumes (stated, not measured), one for each channel."""
     found: dict[str, list[Array]] = {}
     units: dict[str, str] = {}
     for episode in problem.episodes:

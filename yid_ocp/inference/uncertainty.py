@@ -71,7 +71,7 @@ class ParameterEstimate:
 
     @property
     def confidence_interval_ends(self) -> tuple[float, float]:
-        """Both ends of the 95 % interval, infinite where there is none."""
+        """Ends of the 95 % interval: as stated, infinite where open; else 1.96 standard deviations away."""
         if self.interval is None:
             return self.value - 1.96 * self.std, self.value + 1.96 * self.std
         lower, upper = self.interval
@@ -313,7 +313,7 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
 
 
 def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
-    """Whether the standard deviation describes the uncertainty, so that no profile likelihood is needed."""
+    """Whether a parameter is identifiable with a standard deviation of at most 10 %, which needs no profile."""
     return entry.verdict == "identifiable" and entry.std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry.value)
 
 

@@ -106,7 +106,7 @@ class _ThetaColumns:
 
 
 class CompiledKernel:
-    """Step kernel in generated C, of the methods of `InterpretedKernel`; threads may share it."""
+    """Step kernel in generated C with the same methods as `InterpretedKernel`; threads may share it."""
 
     def __init__(self, model: StepModel, library: ctypes.CDLL) -> None:
         self._model = model

@@ -114,13 +114,13 @@ class DiscreteEquations:
 
     @property
     def residual(self) -> ca.SX:
-        """Residual of the step's unknowns: free rows of the balance, internal and constraint equations."""
+        """Residual of the step, zero at its solution: free rows of the balance, internal and constraint equations."""
         balance = self.momentum_balance[list(self.system.unprescribed_coordinate_indices), 0]
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
     def impulses_of_force_with_derivatives(self) -> tuple[ca.SX, ca.SX] | None:
-        """Impulses of the closed-form force in `momentum_balance` and `p1`, shape (n, 1) [N m s]; None without one."""
+        """Impulses of the closed-form force in `momentum_balance` and in `p1`, shape (n, 1) [N m s], or None."""
         if self.closed_form_force is None:
             return None
         force, (left, right) = self.closed_form_force.force, self.closed_form_force_shares

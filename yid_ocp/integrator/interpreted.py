@@ -36,7 +36,7 @@ _PointEvaluator = Callable[[Array], Array]
 
 
 class InterpretedKernel:
-    """Step kernel in CasADi's interpreter and NumPy, of the methods of `CompiledKernel`; threads may share it.
+    """Step kernel in CasADi's interpreter and NumPy with the same methods as `CompiledKernel`; threads may share it.
 
     A point is a column of all `DiscreteEquations.arguments`. The outputs are the rows of the balance, internal and
     constraint equations, then p1, then the effort of prescribed coordinates.

@@ -41,7 +41,7 @@ class Kinematics:
         return self._columns(frame, lambda screw: screw[3:] + ca.cross(screw[:3], point))
 
     def angular_jacobian(self, frame: str | Frame) -> ca.SX:
-        """Angular velocity of a frame per configuration rate, in the world, shape (3, n)."""
+        """Jacobian of a frame's angular velocity, in world axes, by the configuration rates, shape (3, n)."""
         return self._columns(frame, lambda screw: screw[:3])
 
     def _frame(self, frame: str | Frame) -> Frame:
@@ -190,7 +190,7 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
 
 
 def mass_matrix(rigid: RigidBodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
-    """M = L_vv of the bodies, shape (n, n), from the closed form of `RigidBodyLagrangianDerivatives`."""
+    """Mass matrix M = L_vv of the bodies, shape (n, n), from the closed form of `RigidBodyLagrangianDerivatives`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 

@@ -20,7 +20,7 @@ from yid_ocp.model.rotations import snap_near_integer_entries
 
 @dataclass(frozen=True)
 class Placement:
-    """A rigid transform, shapes (3, 3) and (3, 1) [m], whose entries may depend on parameters."""
+    """Rigid transform of a child frame to its parent: rotation (3, 3), translation (3, 1) [m]; parameters may enter."""
 
     rotation: ca.SX
     translation: ca.SX

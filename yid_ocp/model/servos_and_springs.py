@@ -30,7 +30,7 @@ _MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]
 
 @dataclass(frozen=True)
 class _MotorFrictionData:
-    """Constants at the output shaft, identified with one friction law; those of another do not go with them."""
+    """Motor and friction constants identified together under one friction law, not to be mixed with another's."""
 
     torque_constant: float  # kt [N m/A]
     resistance: float  # R [ohm]
@@ -97,7 +97,7 @@ MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = {
 
 @dataclass(frozen=True)
 class MotorOptions:
-    """What turns a servo's command into torque."""
+    """Kind of the motor that turns a servo's command into torque, and the preset with its published data."""
 
     kind: Annotated[
         _MotorKind,

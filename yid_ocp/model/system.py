@@ -70,7 +70,7 @@ class Grasp:
         return tuple(f"{self.name}.{part}" for part in _GRASP_EQUATION_NAMES[self.kind])
 
     def constraint_residual(self, kinematics: Kinematics) -> ca.SX:
-        """Constraint residual phi(q), shape (equations, 1): positions [m], then direction or orientation [rad]."""
+        """Constraint residual phi(q), (equations, 1): holder minus held position [m], direction or rotation [rad]."""
         holder = kinematics.frame_pose(self.holder_frame) @ Placement(self.held_orientation, self.holder_offset)
         held = kinematics.frame_pose(self.held_frame)
         rows = [holder.translation - (held.translation - held.rotation[:, 2] * self.axial_slip)]
@@ -193,7 +193,7 @@ class Effect:
         return reading
 
     def added_channel_delay(self, channel: str, camera: bool) -> ca.SX:
-        """How long before its recorded time a sample was true [s]; `channel` as in `distorted_reading`.
+        """Delay added [s]: how long before its recorded time a sample was true; `channel` as in `distorted_reading`.
 
         A recorded torque that drives the model is `torque.JOINT`: it acts so much later than it was recorded.
         """
@@ -430,7 +430,7 @@ def _check_names(
 
 
 def floating_clamp(name: str, frame: str | None = None) -> Mechanism:
-    """A massless mechanism of one frame, called `frame` or as the clamp; its joints are `NAME_x` ... `NAME_rz`."""
+    """A massless mechanism of six joints, `NAME_x` ... `NAME_rz`, that move a frame, called `frame` or as the clamp."""
     kinds: tuple[tuple[str, Literal["revolute", "prismatic"]], ...] = (("", "prismatic"), ("r", "revolute"))
     joints = tuple(
         Joint(f"{name}_{prefix}{letter}", kind, 3 * block + a - 1, Placement.identity(), axis)

@@ -45,7 +45,7 @@ TaskProgressCallback = Callable[[int, int, str], None]
 
 @dataclass(frozen=True)
 class Task:
-    """Arguments of one function call."""
+    """Arguments of one call of a task function, and a name for display."""
 
     name: str  # for display only; it does not decide what is resumed
     arguments: Mapping[str, Any]  # text, numbers, None, lists and mappings of them, and `Path` for what is read

@@ -225,7 +225,7 @@ class InlineExecutor(Executor):
     """An executor that runs each call at once in the calling process, for work too small for a process."""
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """A completed future."""
+        """A completed future with the call's result or its exception."""
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))

@@ -231,7 +231,7 @@ class PathSimulator:
         return self.moved_joint_start_positions + self._basis @ w
 
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
-        """Simulate the path of coefficients (K, nc), with derivatives by named parameters, then by the coefficients."""
+        """Rollout of the path of coefficients (K, nc), with sensitivities to named parameters, then coefficients."""
         directions = None
         if slopes or names:
             size = w.size if slopes else 0
@@ -423,7 +423,7 @@ def solve_equilibrium_at_target(
 
 
 def memoize_last_call(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
-    """The function with its last value kept: searches ask for residual and slope of a point one after the other."""
+    """The function with its latest value cached: searches ask for residual and Jacobian of one point in turn."""
     last: list[tuple[Array, _Value]] = []
 
     def at(x: Array) -> _Value:

@@ -150,7 +150,7 @@ class PlanResidualsAndLimits:
         return found
 
     def limit_rows_and_values(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
-        """Every kind of limit with its rows of `limited_quantity_values`."""
+        """Pairs of the limit rows of a kind and their values, from values in the order of `limit_rows`."""
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
@@ -302,7 +302,7 @@ class DOptimalityCriterion:
 
 @dataclass(frozen=True)
 class EffectDiscriminationCriterion:
-    """Criterion of how far each effect's change of the readings is from what another and the unknowns can imitate.
+    """Criterion of how far the readings' change by each effect is from all that another effect can imitate.
 
     d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
     -1/2 log sum_ij 1 / (1 + d_ij^2).
@@ -321,7 +321,7 @@ class EffectDiscriminationCriterion:
         return found
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """As `DOptimalityCriterion.value_and_gradient_by_sensitivities`."""
+        """Criterion [nat] at sensitivities (nr, columns) to relative changes, and its gradient by them if asked for."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)

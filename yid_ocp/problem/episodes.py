@@ -191,7 +191,7 @@ class Episode:
 
     @property
     def feedback_with_smoothed_reference(self) -> TrackingFeedback | None:
-        """Tracking filter with the smoothed motion as its reference where that is known."""
+        """Tracking filter, gains and reference, which is the motion that the smoother found where that is known."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback
         return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)

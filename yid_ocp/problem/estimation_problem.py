@@ -204,7 +204,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def rms_noise_of_data_residuals(self) -> float:
-        """Noise std of the data residuals: 1 where they are whitened, else the points' RMS noise [m]."""
+        """One number for the noise of all data residuals: 1 where they are whitened, else the points' RMS noise [m]."""
         if self.options.weighting != "paper":
             return 1.0
         found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.measurements]
@@ -353,7 +353,7 @@ class EstimationProblem(ReprMixin):
         return found
 
     def held_out_theta(self, x: Array) -> Array:
-        """theta with the shared parameters of `x`, local ones at their initial value."""
+        """Parameter vector theta with the shared parameters of `x`; local parameters keep their initial value."""
         theta, _ = self.theta_and_initial_state_offset(x, 0)
         for name in self.local_parameters:
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
@@ -390,7 +390,7 @@ class EstimationProblem(ReprMixin):
         return self._changed(free=tuple(names))
 
     def with_parameter_values(self, values: Mapping[str, float]) -> EstimationProblem:
-        """The same problem with other parameter values; filters and initial states are unchanged."""
+        """The same problem with other initial values of free and values of fixed parameters; filters are unchanged."""
         theta = self.theta.copy()
         for name, value in values.items():
             theta[self.system.parameters.index(name)] = value

@@ -274,7 +274,7 @@ def estimated_constant_errors(slopes: Array, residual: Array) -> Array:
 
 
 def measurement_sensitivities_to_biases(samples: Sequence[Measurements]) -> Array:
-    """Sensitivities of whitened measurements to constant sensor errors [standard deviations], shape (r, m).
+    """Derivatives of whitened measurements by constant sensor errors of one standard deviation, shape (r, m).
 
     Those of the residual, prediction minus measurement, have the opposite sign.
     """

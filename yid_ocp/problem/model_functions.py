@@ -226,7 +226,7 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 @dataclass(frozen=True)
 class TimeGridStateValues:
-    """Values of `model.NodeState` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m), by the recorded clock."""
+    """Values of `NodeState` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m); rates by the recorded clock."""
 
     q: Array
     v: Array
@@ -338,7 +338,7 @@ class ModelFunctions:
 
     @property
     def momentum_shift(self) -> EffectMomentumShift:
-        """Momenta that effects add to those that the tracking filter follows."""
+        """Function of the momenta that effects add to driven joints: the shift of the tracking reference."""
         return self._momentum(None)
 
     def compiled_sensor_function(

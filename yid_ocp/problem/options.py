@@ -31,7 +31,7 @@ class MultivariateGaussianPrior:
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def with_parameters_scaled_by(self, factors: Mapping[str, float]) -> MultivariateGaussianPrior:
-        """Prior of the parameters multiplied by given factors; parameters without a factor are unchanged."""
+        """Prior of the parameters when each is multiplied by its factor; parameters without a factor are unchanged."""
         by = np.array([factors.get(name, 1.0) for name in self.parameter_names])
         return MultivariateGaussianPrior(self.parameter_names, self.covariance * np.outer(by, by))
 

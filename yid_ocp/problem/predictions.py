@@ -180,7 +180,7 @@ def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[Ch
 def rmse_unit_and_count_by_channel(
     results: Sequence[EpisodePrediction], episodes: Sequence[Episode]
 ) -> dict[str, dict[str, Any]]:
-    """Root mean square error of every channel: {channel: {rmse, unit, n}}.
+    """Root mean square error, unit and number of samples of every channel: {channel: {rmse, unit, n}}.
 
     For points the error of a sample is the Euclidean distance.
     """

@@ -53,7 +53,7 @@ class LowPassFilter:
         return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay
 
     def noise_gains_of_value_and_rates(self, step: float) -> tuple[float, float, float]:
-        """Factors from white noise's std to that of the value, its rate [1/s] and its second rate [1/s^2]."""
+        """Stds of the filtered value, its rate [1/s] and second rate [1/s^2] for white noise of unit std."""
         if not math.isfinite(self.cutoff):
             return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
         response = self._response(step)

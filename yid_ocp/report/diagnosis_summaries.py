@@ -200,7 +200,7 @@ def _rate(own: Mapping[str, Any]) -> str:
 
 @register_summary("yid-batch/1")
 def batch_summary(result: Mapping[str, Any]) -> SummaryParts:
-    """Summary of many runs."""
+    """Summary of the runs of a batch side by side: estimates, drift and outlying runs."""
     runs = result["runs"]
     found: dict[str, list[Mapping[str, Any]]] = {}
     for entry in runs:
@@ -253,7 +253,7 @@ def _batch_rows(runs: Sequence[Mapping[str, Any]], heads: Mapping[str, str]) -> 
 
 @register_summary("yid-history/1")
 def history_summary(result: Mapping[str, Any]) -> SummaryParts:
-    """Summary of runs of one model, one after the other."""
+    """Summary of how estimates drifted over runs of one model, and which runs disagree with the others."""
     runs = [entry["name"] for entry in result["runs"]]
     rows: TableRows = [("parameter", *runs, "together", "unit", "p", "")]
     for name, entry in result["parameters"].items():

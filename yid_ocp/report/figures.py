@@ -236,7 +236,7 @@ def relative_excess_costs(costs: Sequence[float]) -> list[float]:
 
 
 def asymmetric_error_bars(values: Sequence[float], low: Sequence[float], high: Sequence[float]) -> dict[str, Any]:
-    """Error bars of values from `low` to `high`."""
+    """Error-bar settings of plotly for values with lower ends `low` and upper ends `high`."""
     above, below = np.maximum(np.subtract(high, values), 0.0), np.maximum(np.subtract(values, low), 0.0)
     return {"type": "data", "symmetric": False, "array": above.tolist(), "arrayminus": below.tolist()}
 
@@ -345,7 +345,7 @@ def _heat_figure(figure: Figure, rows: Sequence[str], columns: Sequence[str], pa
 
 
 def confusion_matrix_figure(rows: Sequence[str], columns: Sequence[str], counts: Array) -> Figure:
-    """Confusion-matrix figure of counts of what was said of what is true, colored by the fraction of their row."""
+    """Confusion-matrix figure of counts, truth by row and first answer by column, colored by share of the row."""
     parts = counts / np.maximum(counts.sum(1, keepdims=True), 1.0)
     figure = _heat_figure(_styled_figure(200 + 24 * len(rows), "said first", "true"), rows, columns, parts, -50)
     text = [[f"{n:.0f}" if n else "" for n in line] for line in counts]

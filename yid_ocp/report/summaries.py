@@ -465,7 +465,7 @@ def simulate_summary(result: Mapping[str, Any]) -> SummaryParts:
 
 @register_summary("yid-track/1")
 def track_summary(result: Mapping[str, Any]) -> SummaryParts:
-    """Summary of points tracked in images."""
+    """Summary of points tracked in the frames of a depth camera."""
     truth = result["truth_errors"]
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
     rows: TableRows = [("point", "frames", "± std [mm]", *heads)]

@@ -89,7 +89,7 @@ class ChannelKind:
         return f"{self.quantity}_std", f"{self.quantity}_bias_std"
 
     def is_in_group(self, name: str) -> bool:
-        """Whether a recording's group of this name holds the channel."""
+        """Whether a group of this name is one for the channel, `GROUP` or `GROUP_NAME`; only the name is looked at."""
         return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
 
@@ -98,7 +98,7 @@ CHANNEL_KINDS: Registry[ChannelKind] = Registry("recorded channel")
 
 
 def declared_channel_kinds(group: str) -> tuple[ChannelKind, ...]:
-    """Channels that a sensor declares for a group of a recording other than joints and points."""
+    """Kinds of channels that sensors declare for a recording's group of this name; none for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.is_in_group(group))
 
@@ -236,7 +236,7 @@ class Sensor(ABC):
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
-        """Names of joints whose predicted effort it reads, filtered like the path; none for other sensors."""
+        """Names of the joints whose effort, filtered like the path, the sensor reads; empty where it reads none."""
         return ()
 
     @property

@@ -130,7 +130,7 @@ class NonlinearProgram(ReprMixin):
         return ReprSummary(f"{count_with_noun(len(self.initial_guess), 'variable')}, {equalities}", rows)
 
     def block_layout(self, name: str) -> _VectorBlock:
-        """A block by its name; with one recording, `[NAME]` may be left out.
+        """Indices, row names and unit of a named block; with one recording, `[NAME]` may be left out.
 
         Raises `SolverError` where there is none, or more than one.
         """

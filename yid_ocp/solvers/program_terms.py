@@ -20,7 +20,7 @@ from yid_ocp.parallel import CASADI_LOCK
 
 
 class ThreadSafeCachedProperty(cached_property[Any]):
-    """A cached property, computed once under CasADi's lock, so by one thread at a time."""
+    """A cached property that one thread computes, under CasADi's lock, while others wait."""
 
     def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
         with CASADI_LOCK:
@@ -191,7 +191,7 @@ class ResidualTerm:
 
 @dataclass(frozen=True)
 class GaussNewtonHessianRidge:
-    """Regularization of the Gauss-Newton Hessian by factor * mean square residual / max(|w_i|, scale_i)^2.
+    """Curvature added to the Gauss-Newton Hessian, not the cost: factor * mean square residual / max(|w_i|, scale_i)^2.
 
     Along unknowns that the data hardly inform the curvature that Gauss-Newton leaves out may be as large as its own.
     The factor is a number, or a function of the unknowns that gives one, which may change from iterate to iterate.

@@ -70,7 +70,7 @@ _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 @dataclass(frozen=True)
 class JointDynamicsTerms:
-    """Terms at one joint in SI units of its coordinate: the force is constant - stiffness q - cubic q^3 - damping v."""
+    """Terms at one joint, in SI units: force = constant - stiffness q - cubic q^3 - damping v - friction."""
 
     stiffness: float = 0.0
     constant_force: float = 0.0
@@ -94,7 +94,7 @@ class ParameterEvaluator:
         return np.array(ca.densify(ca.Function("value", [self._symbols], [expression])(self._theta))).ravel(order="F")
 
     def is_identically_zero(self, expression: ca.SX) -> bool:
-        """Whether an expression is zero for all values of its other symbols."""
+        """Whether an expression, with the parameters at their values, is zero for all values of its other symbols."""
         return bool(ca.sparsify(self.substitute_parameter_values(expression)).is_zero())
 
     def substitute_parameter_values(self, expression: ca.SX) -> ca.SX:

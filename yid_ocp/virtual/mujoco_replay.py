@@ -48,7 +48,7 @@ class ReplayMismatch:
 
 
 def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[str, ReplayMismatch]:
-    """Replay a recording with the MJCF text of a system, from `mujoco_xml` with actuators.
+    """Replay a recording with a system's MJCF text (`mujoco_xml` with actuators) and return the deviations by channel.
 
     Driven joints get the recorded torque as the control of their actuators, and beside it a weak pull to the recorded
     angles (`REPLAY_FEEDBACK_BANDWIDTH`), without which any error of a torque lets an arm drift away. Position servos

@@ -254,7 +254,7 @@ class RobustCostQuadraticModel:
 
 
 def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostQuadraticModel:
-    """Robust cost over all points of all frames, scaled by their median error."""
+    """Quadratic model of the robust cost over all points of all frames, scaled by their median error."""
     jacobian, residuals, patches = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     sigma = max(_TO_SIGMA * float(np.median(np.abs(residuals))) if len(residuals) else reach, _LEAST_SIGMA)
     square = (residuals / min(_CUT * sigma, reach)) ** 2
@@ -360,7 +360,7 @@ def _add_costs(
 
 @dataclass(frozen=True)
 class SurfaceVisibility:
-    """Shares of the arm's surface that should be seen, in so many samples."""
+    """Shares of the arm's surface in view that a cloud contains, that is occluded, or that is seen through."""
 
     there: float  # a cloud has it
     covered: float  # something is before it
@@ -371,7 +371,7 @@ class SurfaceVisibility:
 def surface_visibility(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], state: CameraState, within: float
 ) -> SurfaceVisibility:
-    """Fractions of the arm's visible surface that have a point of the frames within a distance [m], or have none."""
+    """Shares of the arm's surface in view with a point of the frames within a distance [m], or with none, and why."""
     counts = np.zeros(4)
     for glimpse in glimpses:
         points, _ = arm.visible_surface_points(state, glimpse.stamp)

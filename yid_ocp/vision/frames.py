@@ -242,7 +242,7 @@ class OcclusionMap:
     _kept: list[tuple[Array, Array, float, cKDTree, Array]] = field(default_factory=list, repr=False)
 
     def is_hidden(self, places: Array, radius: Array, margin: float) -> BoolArray:
-        """Whether something nearer stands before world places (S, 3) or throws its shadow on them, or the picture ends.
+        """Whether world places (S, 3) are occluded, lie in the shadow of something nearer, or are outside the image.
 
         What is nearer to the camera than a place by more than its radius (S,), by which it reaches about its line of
         sight, and a margin stands before it, all in [m].

@@ -81,7 +81,7 @@ class _Centerline:
 
 
 def trace_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
-    """Trace the centerline of an object in a cloud; without nodes where the cloud has too few points.
+    """Centerline of the object in a cloud, a tree of nodes with its loops; empty for too few points.
 
     `diameter` is that of its thickest tube [m]; parts further apart than `gap` [m] do not hang together.
     """

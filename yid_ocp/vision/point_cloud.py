@@ -31,7 +31,7 @@ _TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distributio
 
 @dataclass(frozen=True, eq=False)
 class WeightedCloud:
-    """Point cloud with weights."""
+    """Point cloud in which each point stands for a number of the camera's points."""
 
     points: Array  # (N, 3), in the world [m]
     point_weights: Array  # (N,), how many of the camera's points each one stands for
@@ -264,7 +264,7 @@ class SkeletonOptions:
 
 @dataclass(frozen=True, eq=False)
 class CloudSkeleton:
-    """Nodes of a cloud and the graph between them."""
+    """Skeleton of a cloud: nodes, spanning forest between them, and the node to which each point belongs."""
 
     nodes: Array  # (K, 3), centroids of the kept segments, in the order of the walk [m]
     node_of_point: IntArray  # (N,), node to which each point of the cloud belongs, -1 for none

@@ -38,7 +38,7 @@ _TO_SIGMA = 1.4826
 
 @dataclass(frozen=True, eq=False)
 class BackgroundPoints:
-    """Background points that do not belong to the object."""
+    """Points of the static scene, which are left out of clouds, and the distance that counts as one of them."""
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3), in the world [m]
     match_distance: float = 0.0  # distance at which a point belongs to it [m]
@@ -81,7 +81,7 @@ class BackgroundPoints:
 
 @dataclass(frozen=True, eq=False)
 class ForeignObject:
-    """Foreign object seen in several frames."""
+    """What is neither robot nor modelled object, seen in several frames: place, size, motion and advice."""
 
     centre: Array  # (3,), in the world, in the median frame [m]
     size: Array  # (3,) [m]
@@ -228,7 +228,7 @@ class TubeDimensionCheck:
         return tuple(lines)
 
     def point_std(self, points: Array) -> Array:
-        """Standard deviations of points (np, 3) by wrong and uncertain sizes, of slopes (np, 3, 2 s) [m].
+        """Stds (np, 3) [m] of points due to wrong or uncertain tube dimensions, from the points' slopes (np, 3, 2 s).
 
         The whole displacement of what is doubted and yet used, and what remains uncertain of what is estimated.
         """

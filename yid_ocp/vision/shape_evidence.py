@@ -50,7 +50,7 @@ class TubeLinks:
 def tube_link_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Nearest place on tubes of links (K, 2, 3) and radii (K,) for points (N, 3) that lie at a share of the radius [m].
+    """Projections of points (N, 3), which lie at a share of the radius (K,) [m], on tubes of links (K, 2, 3).
 
     Index of the link and place along it from 0 to 1, both (N,), unit vectors (N, 3) from the centre line to the points,
     and distances (N,) from it [m].
@@ -127,7 +127,7 @@ class ShapePointClassification(ShapeFitQuality):
 
 @dataclass(frozen=True, eq=False)
 class ProcessedFrameCloud:
-    """Processed points of one frame with the camera and occlusion that they were seen with."""
+    """Filtered points and skeleton nodes of one frame, with the camera's position and the occlusion map."""
 
     points: Array  # (N, 3), surface points in the world [m]
     point_weights: Array  # (N,)
@@ -336,7 +336,7 @@ def nearest_surface_residuals(
 
 
 def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
-    """Residuals along the lines of sight, where the camera's noise is; parameters as of `nearest_surface_residuals`.
+    """Depth errors of points, along the sight, from the tubes' surface; parameters as of `nearest_surface_residuals`.
 
     Across the sight a point stands where its pixel does, by u from the axis; towards the camera the surface lies at
     sqrt(r^2 - u^2). The nearest way turns with the noise, which does little to where a tube is found, but makes it

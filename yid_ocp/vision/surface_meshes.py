@@ -405,7 +405,7 @@ _PERIOD_JITTER = 0.25  # share of its mean by which a period varies either way
 
 @dataclass(frozen=True)
 class DepthSensorModel:
-    """Geometry and errors of a structured-light depth camera; the defaults are an Asus Xtion Pro Live."""
+    """Sensor model of a structured-light depth camera; the defaults are an Asus Xtion Pro Live."""
 
     intrinsics: CameraIntrinsics = XTION_INTRINSICS
     baseline: float = 0.075  # between projector and camera, along x [m]

@@ -93,7 +93,7 @@ run = command_with_settings(run_solve)
 def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> CableMemoryDecision:
-    """Solve by the run's solver, every iterate logged and shown; without cable memory where it is not supported."""
+    """Solution by the run's solver, every iterate logged, and the decision whether a cable keeps its memory."""
     progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
 
     def iterate(entry: Iterate) -> None:

@@ -204,7 +204,7 @@ class ObjectKind:
     kind: Annotated[str, OptionInfo("what the object is")]
 
     def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Segments, parents first, with the damping of every joint and each link divided, their stiffness kept."""
+        """Segments of the object, parents first; `link_division` divides each link at unchanged stiffness."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:

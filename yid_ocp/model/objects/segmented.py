@@ -50,7 +50,7 @@ class SegmentSettings:
     link_length_parameters: Annotated[bool, OptionInfo("whether every link has a length parameter of its own")] = False
 
     def segment(self, name: str, damping: float, link_division: int) -> Segment:
-        """The segment of a name, with the damping of every joint and each link divided, its stiffness kept."""
+        """The `Segment` of a given name; `link_division` divides each link at unchanged stiffness of the segment."""
         if self.length is None and self.link_lengths is None:
             hint = "set length or link_lengths"
             raise ModelError(f"segment '{name}' has no length", where=f"segments.{name}", hint=hint)
