@@ -287,7 +287,10 @@ def test_a_recording_that_its_torques_as_they_are_cannot_follow_has_the_reason_i
 
     def known(ok):
         found = SimpleNamespace(ok=ok, episode_predictions=("plain a", "plain b") if ok else ())
-        how = {"split": lambda x, i: (f"theta {'ab'[i]}", "offset"), "evaluate": lambda x, derivatives, warm: found}
+        how = {
+            "theta_and_initial_state_offset": lambda x, i: (f"theta {'ab'[i]}", "offset"),
+            "evaluate": lambda x, derivatives, warm: found,
+        }
         plain = SimpleNamespace(episodes=("a", "b"), predictor=SimpleNamespace(predict_episode=run), **how)
         return SimpleNamespace(has_process_noise=True, problem_whitened_by_sensor_noise=lambda: plain)
 
