@@ -37,8 +37,7 @@ from yid_ocp.errors import ModelError
 from yid_ocp.files import json_sha256, write_json
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
-from yid_ocp.report.summaries import solve_summary
-from yid_ocp.report.terminal import aligned_table_lines, summary_terminal_lines
+from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, aligned_table_lines, summary_terminal_lines
 from yid_ocp.sensors.base import EffortKind
 from yid_ocp.version import source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
@@ -212,7 +211,9 @@ def solve_twin(config: Path, recording: Path, settings: Sequence[str]) -> dict[s
             for name, entry in result["parameters"].items()
             if entry["free"]
         },
-        "diagnose": any("diagnose" in line for line in summary_terminal_lines(solve_summary(result))),
+        "diagnose": any(
+            "diagnose" in line for line in summary_terminal_lines(SUMMARY_BY_FORMAT[result["format"]](result))
+        ),
     }
 
 

@@ -15,8 +15,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.report.diagnosis_summaries import _planning_command
-from yid_ocp.report.summaries import plan_summary
-from yid_ocp.report.terminal import summary_terminal_lines
+from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, summary_terminal_lines
 from yid_ocp.workflow.plan import (
     compile_step_for_planning,
     discrimination_plan_settings,
@@ -180,7 +179,7 @@ def test_the_run_folder_says_what_is_told_and_what_limits_it(informing, tmp_path
     planned = read_recording(tmp_path / "out" / "recording.h5")
     np.testing.assert_allclose(planned.joints.position, outcome.output.joint_positions)
     assert '<section id="information">' in (tmp_path / "out" / "report.html").read_text()
-    words = "\n".join(summary_terminal_lines(plan_summary(result)))
+    words = "\n".join(summary_terminal_lines(SUMMARY_BY_FORMAT[result["format"]](result)))
     for name, known in outcome.output.parameter_precisions.items():
         assert result["parameters"][name]["std_relative_after"] == pytest.approx(known.std_planned)
         assert f"± {100 * known.std_planned:.2g} %" in words
@@ -202,7 +201,7 @@ def test_a_diagnosis_hands_over_its_parameters_and_effects(informing, tmp_path):
     assert outcome.result["from"]["parameters"] == {"elbow.stiffness": 4.0, "elbow.damping": 0.2}
     assert {(entry["effect"], entry["explained_by"]) for entry in outcome.result["distances"]} == {PAIR, PAIR[::-1]}
     assert all(entry["after"] > entry["before"] for entry in outcome.result["distances"])
-    assert PAIR[0] in "\n".join(summary_terminal_lines(plan_summary(outcome.result)))
+    assert PAIR[0] in "\n".join(summary_terminal_lines(SUMMARY_BY_FORMAT[outcome.result["format"]](outcome.result)))
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,7 @@ def warranted_law(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[s
 
 
 @dataclass(frozen=True)
-class FrictionTorqueCloud:
+class _FrictionTorqueCloud:
     """Friction torque of one joint at M points of the recordings' measured motion."""
 
     joint: str
@@ -109,7 +109,7 @@ class FrictionTorqueCloud:
 
 def friction_torque_clouds(
     problem: EstimationProblem, solution: Solution, friction_parameters: Sequence[str]
-) -> tuple[FrictionTorqueCloud, ...]:
+) -> tuple[_FrictionTorqueCloud, ...]:
     """Friction torque of every driven joint with friction; none where a model has constraints or internal coordinates.
 
     What the discrete equations lack along the smoothed measured angles with the friction at zero, and what the fitted
@@ -146,7 +146,7 @@ def friction_torque_clouds(
         rows = np.concatenate(found, axis=1)
         keep = np.unique(np.linspace(0, rows.shape[1] - 1, min(rows.shape[1], _MAX_CLOUD_POINTS)).astype(int))
         speed, load, measured, predicted = rows[:, keep]
-        clouds.append(FrictionTorqueCloud(name, speed, load, -measured, -predicted))
+        clouds.append(_FrictionTorqueCloud(name, speed, load, -measured, -predicted))
     return tuple(clouds)
 
 

@@ -55,7 +55,7 @@ class BlindCaseScore:
     p_value: float = math.nan  # of the null test on the held-out recordings
 
     @property
-    def named_effect_labels(self) -> tuple[str, ...]:
+    def _named_effect_labels(self) -> tuple[str, ...]:
         """Labels of the effects that the diagnosis names: the confusable set, or the first effect added."""
         return self.confusable or tuple(self.answer.split(" + ")[:1])
 
@@ -166,7 +166,7 @@ def ensemble_success_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
         "kind_first": [m.kind_first for m in seen],
         "kind_in_two": [m.kind_second for m in seen],
         "location_first": [m.location_first for m in seen],
-        "sets_cover": [m.truth in m.named_effect_labels for m in named],
+        "sets_cover": [m.truth in m._named_effect_labels for m in named],
         "unknown_recall": [m.verdict == "unknown" for m in strange],
         **{f"unknown_{sort}": [m.verdict == "unknown" for m in by[sort]] for sort in _OUT_OF_LIBRARY_CATEGORIES},
         "unknown_location": [m.location_first for m in strange if m.gap],
@@ -189,7 +189,7 @@ def ensemble_success_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
         "intervals": intervals,
         "detection": {size: {"cases": own["gap"]["of"], **_rates(own)} for size, own in detected.items()},
         "detection_intervals": detected,
-        "set_size": mean([len(m.named_effect_labels) for m in named]),
+        "set_size": mean([len(m._named_effect_labels) for m in named]),
         "closure_of_best": mean([m.closure / m.best for m in singles if m.best > 0 and math.isfinite(m.closure)]),
         "parameter_error": None if not errors else float(np.median([e for e, _ in errors])),
         "seconds": mean([m.seconds for m in marks if math.isfinite(m.seconds)]),

@@ -71,7 +71,7 @@ class FilterStateTransition:
         """States after the step, from those before it, as columns (nx, c)."""
         return np.vstack([self.state_rows @ columns, self.decay[:, None] * columns[len(self.state_rows) :]])
 
-    def propagate_costate_back(self, costate: Array) -> Array:
+    def _propagate_costate_back(self, costate: Array) -> Array:
         """Costates before the step, from those after it, by the transposed map, as columns (nx, c)."""
         ns = len(self.state_rows)
         earlier = self.state_rows.T @ costate[:ns]
@@ -108,14 +108,14 @@ class KalmanStep:
 
         The smoothed state is the filter's prediction + P costate.
         """
-        pulled = self.transition.propagate_costate_back(costate)
+        pulled = self.transition._propagate_costate_back(costate)
         noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
         return noise, pulled + self.observation.T @ noise
 
     def costate_covariance_before_step(self, information: Array) -> Array:
         """Covariance (nx, nx) of the costate before the step, from that after it."""
         shaped, projected = self.normalized_observation_matrix, self.projected_covariance
-        pulled = self.transition.propagate_costate_back(self.transition.propagate_costate_back(information).T)
+        pulled = self.transition._propagate_costate_back(self.transition._propagate_costate_back(information).T)
         pulled -= (pulled @ projected.T) @ shaped
         found = shaped.T @ shaped + pulled - shaped.T @ (projected @ pulled)
         return (found + found.T) / 2

@@ -124,7 +124,7 @@ class InputErrorModel:
             self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
         )
 
-    def truncated_to_steps(self, steps: int) -> InputErrorModel:
+    def _truncated_to_steps(self, steps: int) -> InputErrorModel:
         """The same error model restricted to the first `steps` steps of the rollout."""
         names = ["sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise"]
         names += [] if self.smoothed_reference is None else ["smoothed_reference"]
@@ -275,7 +275,7 @@ def truncate_episode(episode: Episode, steps: int) -> Episode:
         torque=episode.torque[:steps],
         measurements=tuple(samples),
         tracking_feedback=loop and replace(loop, gain=loop.gain[:steps], reference=loop.reference[:steps]),
-        input_errors=errors and errors.truncated_to_steps(steps),
+        input_errors=errors and errors._truncated_to_steps(steps),
         **{name: getattr(episode, name)[: steps + 1] for name in at_nodes},
     )
 

@@ -42,7 +42,7 @@ _MAX_INSPECTED_PARAMETERS = 12  # free parameters of which `inspect` speaks; res
 
 
 @register_summary("yid-solve/1")
-def solve_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _solve_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of a fit."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
@@ -134,7 +134,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 
 @register_summary("yid-compare/1")
-def compare_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _compare_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of several methods on one problem."""
     methods: dict[str, Any] = result["methods"]
     judged, disturbed = result["judged"], result["disturbed"]
@@ -210,7 +210,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 
 
 @register_summary("yid-identifiability/1")
-def identifiability_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _identifiability_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of what recordings tell of each parameter."""
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
@@ -257,7 +257,7 @@ def _relative(value: float | None) -> str:
 
 
 @register_summary("yid-friction/1")
-def friction_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _friction_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of which friction law the recordings warrant."""
     unit, best = result["unit"], result["warranted"]
     rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "")]
@@ -277,7 +277,7 @@ def friction_summary(result: Mapping[str, Any]) -> SummaryParts:
 
 
 @register_summary("yid-plan/1")
-def plan_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _plan_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of a planned motion."""
     rows: TableRows = [("joint", "travel [rad or m]", "largest velocity, of its limit", "largest effort, of its limit")]
     for name, own in result["joints"].items():
@@ -341,7 +341,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryParts:
 
 
 @register_summary("yid-check/1")
-def check_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _check_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of a model and its recordings before a run."""
     model = result["model"]
     yield (
@@ -395,7 +395,7 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
 
 
 @register_summary("yid-inspect/1")
-def inspect_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _inspect_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of a model's equations and linearised step."""
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
@@ -453,7 +453,7 @@ def _patterns(result: Mapping[str, Any]) -> SummaryParts:
 
 
 @register_summary("yid-simulate/1")
-def simulate_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _simulate_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of a simulation."""
     if result["status"] == "failed":
         yield SummaryStatement(f"failed: {result['message']}", "verdict")
@@ -464,7 +464,7 @@ def simulate_summary(result: Mapping[str, Any]) -> SummaryParts:
 
 
 @register_summary("yid-track/1")
-def track_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _track_summary(result: Mapping[str, Any]) -> SummaryParts:
     """Summary of points tracked in the frames of a depth camera."""
     truth = result["truth_errors"]
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
