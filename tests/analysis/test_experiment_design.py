@@ -190,7 +190,7 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
     base = RecordedExperiment(
         SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=made.get("second")
     )
-    assert CandidateExperimentBuilder(base).applicable_mechanical_changes() == possible.split()
+    assert CandidateExperimentBuilder(base).applicable_experiment_changes() == possible.split()
 
 
 @pytest.fixture(scope="module")

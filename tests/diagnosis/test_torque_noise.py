@@ -17,7 +17,7 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_ef
 from yid_ocp.diagnosis.refit import refit_with_effects
 from yid_ocp.diagnosis.screening import linearize_candidates
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
-from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, linear_residual_models
+from yid_ocp.inference.smoother_model import _CORRELATION_TIME, _MIN_INTERVAL, recording_models_with_unknown_forces
 from yid_ocp.inference.uncertainty import unknowns_covariance_factor
 from yid_ocp.inference.whitening import (
     problem_relinearized_at_torque_bias,
@@ -300,7 +300,7 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     problem = problem_of(step, [recorded(step, 1)])
     weighted = problem_whitened_by_sensor_noise(problem)
     x = problem.initial_unknowns
-    model = linear_residual_models(weighted, x, weighted.evaluate(x))[0]
+    model = recording_models_with_unknown_forces(weighted, x, weighted.evaluate(x))[0]
     decay = math.exp(-_MIN_INTERVAL / _CORRELATION_TIME)
     column = model.unknown_names.index("shoulder")
     # the integral over a long time has the variance of white noise that is held over each sample
@@ -309,4 +309,4 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     assert lasting == pytest.approx(WHITE**2 * TIME_STEP, rel=0.02)
     assert np.count_nonzero(model.torque_noise_variance) == 1
     calm = problem_without_input_errors(problem)
-    assert not linear_residual_models(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()
+    assert not recording_models_with_unknown_forces(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()

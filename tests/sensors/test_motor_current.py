@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_problems import PENDULUM
 
-from yid_ocp.data import ChannelGroup, JointGroup, Recording, read_recording, write_recording
+from yid_ocp.data import JointGroup, Recording, SensorChannelGroup, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import System
@@ -40,7 +40,7 @@ def made(urdf_folder) -> Recording:
     current = effort / list(CONSTANTS.values())
     current += NOISE * np.random.default_rng(0).standard_normal(current.shape)
     names, values = ("elbow", "shoulder"), {"current": current[:, ::-1]}
-    motors = ChannelGroup("motors_left", names, T, values, {"current_std": NOISE})
+    motors = SensorChannelGroup("motors_left", names, T, values, {"current_std": NOISE})
     return Recording(JointGroup(PENDULUM, T, q, position_std=0.0), name="arm", channel_groups=(motors,))
 
 

@@ -14,7 +14,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.linearized_residual import is_stationary_point, predicted_cost_reduction
 from yid_ocp.problem.unknown_vector import soft_logarithm_and_slope
 from yid_ocp.solvers import GaussNewton, base
-from yid_ocp.solvers.base import IterationRecorder, Solution, Status, projected_gradient_norm, solve
+from yid_ocp.solvers.base import AcceptedIterateRecorder, Solution, Status, projected_gradient_norm, solve
 from yid_ocp.solvers.gradient_methods import _PATIENCE_STEPS
 
 INSIDE = [((1, 1), (3, -4), 8.0), ((1, 1), (5, -1), 5.0)]
@@ -30,7 +30,7 @@ def test_a_gradient_that_pushes_against_a_bound_does_not_count(x, gradient, expe
 
 def test_a_recorder_keeps_points_as_they_were_and_tells_them():
     told, x = [], np.array([1.0])
-    recorder = IterationRecorder(told.append)
+    recorder = AcceptedIterateRecorder(told.append)
     recorder.n_evaluations = 3
     recorder.record_iterate(9.0, x, 0.5, "first")
     x[0] = 2.0

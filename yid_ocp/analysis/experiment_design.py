@@ -218,7 +218,7 @@ class CandidateExperiment:
         return self._known[key]
 
 
-MECHANICAL_EXPERIMENT_CHANGES: Mapping[str, str] = {
+EXPERIMENT_CHANGE_NAMES: Mapping[str, str] = {
     "weld": "weld grasps in place of points",
     "second_arm": "a second arm",
     "motion": "another motion",
@@ -239,7 +239,7 @@ class CandidateExperimentBuilder:
         """The experiment with a set of mechanical changes, or a message why it cannot be built."""
         if mechanics not in self._layouts:
             if mechanics:
-                words = " and ".join(MECHANICAL_EXPERIMENT_CHANGES[name] for name in sorted(mechanics))
+                words = " and ".join(EXPERIMENT_CHANGE_NAMES[name] for name in sorted(mechanics))
                 self._progress.begin_stage(f"working out {words}")
             try:
                 self._layouts[mechanics] = self._build(mechanics)
@@ -247,7 +247,7 @@ class CandidateExperimentBuilder:
                 self._layouts[mechanics] = error.what
         return self._layouts[mechanics]
 
-    def applicable_mechanical_changes(self) -> list[str]:
+    def applicable_experiment_changes(self) -> list[str]:
         """Names of the mechanical changes that apply to the system."""
         setting, system, episodes = self.setting, self.setting.problem.system, self.setting.problem.episodes
         moves = bool(system.driven) and not system.servos

@@ -39,7 +39,7 @@ class FrictionLawFit:
     is_converged: bool
 
 
-def recordings_by_motion_kind(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
+def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
     """Names of recordings by kind of motion, a name up to its number, or each by itself; none whose motors are off."""
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}

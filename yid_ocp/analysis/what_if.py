@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    MECHANICAL_EXPERIMENT_CHANGES,
+    EXPERIMENT_CHANGE_NAMES,
     CandidateExperiment,
     CandidateExperimentBuilder,
     FrameObservationSchedule,
@@ -46,7 +46,7 @@ class ExperimentChange:
 
     name: str
     description: str
-    mechanical_change: str = ""  # key of `MECHANICAL_EXPERIMENT_CHANGES`, empty where only sensors change
+    mechanical_change: str = ""  # key of `EXPERIMENT_CHANGE_NAMES`, empty where only sensors change
     camera_frame: str = ""  # that the camera sees besides; empty for none
     arm_frame: str = ""  # that an arm measures besides; empty for none
     camera_rate: float | None = None  # [Hz]
@@ -229,8 +229,8 @@ class _Outcomes:
         views = setting.existing_sensor_observations(episode)
         groups = ("" if group is None else group.name for group in (camera, arm))
         looked, felt = ({view.frame for view in views if view.point_group == name} for name in groups)
-        names = self.builder.applicable_mechanical_changes()
-        changes = [ExperimentChange(name, MECHANICAL_EXPERIMENT_CHANGES[name], name) for name in names]
+        names = self.builder.applicable_experiment_changes()
+        changes = [ExperimentChange(name, EXPERIMENT_CHANGE_NAMES[name], name) for name in names]
         for sight in observable_frames(setting.problem.system):
             name, words = sight.name, sight.description
             if name not in looked | felt:

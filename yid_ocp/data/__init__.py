@@ -10,10 +10,10 @@ from yid_ocp.data.readers.csv import CsvOptions as CsvOptions
 from yid_ocp.data.readers.csv import read_csv as read_csv
 from yid_ocp.data.readers.lerobot import read_lerobot_episode as read_lerobot_episode
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS as JOINT_CHANNEL_UNITS
-from yid_ocp.data.recording import ChannelGroup as ChannelGroup
 from yid_ocp.data.recording import JointGroup as JointGroup
 from yid_ocp.data.recording import PointGroup as PointGroup
 from yid_ocp.data.recording import Recording as Recording
+from yid_ocp.data.recording import SensorChannelGroup as SensorChannelGroup
 from yid_ocp.data.recording import validate_recording as validate_recording
 from yid_ocp.data.recording_hdf5 import read_recording as read_recording
 from yid_ocp.data.recording_hdf5 import write_recording as write_recording

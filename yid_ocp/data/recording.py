@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError, nearest_name_hint
-from yid_ocp.sensors.base import EffortKind, declared_channel_kinds
+from yid_ocp.sensors.base import EffortKind, channel_kinds_of_group
 
 RecordedOrNominalClock = Literal["recorded", "nominal"]
 
@@ -170,7 +170,7 @@ class PointGroup(ReprMixin):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ChannelGroup(ReprMixin):
+class SensorChannelGroup(ReprMixin):
     """Values of channels that sensors declare (`sensors.ChannelKind`), on one clock.
 
     Arrays are copied, made float64 and read-only.
@@ -209,7 +209,7 @@ class ChannelGroup(ReprMixin):
         quantities = ", ".join(self.values_by_quantity)
         return ReprSummary(f"{self.name}, {', '.join(self.names)}, {_sampled(self.t)}: {quantities}")
 
-    def _rows(self, rows: BoolArray) -> ChannelGroup:
+    def _rows(self, rows: BoolArray) -> SensorChannelGroup:
         values = {key: value[rows] for key, value in self.values_by_quantity.items()}
         return replace(self, t=self.t[rows], values_by_quantity=values)
 
@@ -220,7 +220,7 @@ class Recording(ReprMixin):
 
     Attributes
     ----------
-    points, channel_groups : tuple of PointGroup, tuple of ChannelGroup
+    points, channel_groups : tuple of PointGroup, tuple of SensorChannelGroup
         What cameras, motion capture or an arm measured of points, and other sensors of anything; on their own clocks.
     name, sha256 : str, str or None
         Short name, the stem of the file, and hash of the file read.
@@ -241,7 +241,7 @@ class Recording(ReprMixin):
     true_parameters: Mapping[str, float] = field(default_factory=dict)
     marker_reference_pose: Array | None = None
     notes: tuple[str, ...] = ()
-    channel_groups: tuple[ChannelGroup, ...] = ()
+    channel_groups: tuple[SensorChannelGroup, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "true_parameters", dict(self.true_parameters))
@@ -266,7 +266,7 @@ class Recording(ReprMixin):
         return ((self.joints,) if self.joints is not None else ()) + self.points
 
     @property
-    def all_groups(self) -> tuple[JointGroup | PointGroup | ChannelGroup, ...]:
+    def all_groups(self) -> tuple[JointGroup | PointGroup | SensorChannelGroup, ...]:
         """All groups: joints first, then points, then channels of further sensors."""
         return (*self.joint_and_point_groups, *self.channel_groups)
 
@@ -311,7 +311,7 @@ class Recording(ReprMixin):
         require_data(start < stop and kept, what, f"recording '{self.name}'", f"start < stop, {allowed}")
         joints = next((group for group in kept if isinstance(group, JointGroup)), None)
         points = tuple(group for group in kept if isinstance(group, PointGroup))
-        channels = tuple(group for group in kept if isinstance(group, ChannelGroup))
+        channels = tuple(group for group in kept if isinstance(group, SensorChannelGroup))
         straight = self.marker_reference_pose if points and points[0].name == self.points[0].name else None
         return replace(self, joints=joints, points=points, channel_groups=channels, marker_reference_pose=straight)
 
@@ -381,7 +381,7 @@ def _constant(value: ArrayLike, where: str) -> float | Array:
     return float(array) if array.ndim == 0 else array
 
 
-def _freeze_arrays(group: JointGroup | PointGroup | ChannelGroup, names: Iterable[str]) -> None:
+def _freeze_arrays(group: JointGroup | PointGroup | SensorChannelGroup, names: Iterable[str]) -> None:
     """Make read-only arrays of the named fields that are not None, while a group is made."""
     for name in names:
         if getattr(group, name) is not None:
@@ -450,9 +450,9 @@ def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
     require_data(largest <= _LARGEST_DISTANCE, what, where, allowed, hint + remedy)
 
 
-def _validate_channels(group: ChannelGroup, where: str) -> None:
+def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
-    declared = {channel.quantity: channel for channel in declared_channel_kinds(group.name)}
+    declared = {channel.quantity: channel for channel in channel_kinds_of_group(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.stds_by_attribute
     require_data(own, "the group has no values", where, ", ".join(declared))
@@ -502,7 +502,7 @@ def _check_pose(pose: Array, where: str) -> None:
     require_data(np.linalg.det(rotation) > 0, "the pose is a reflection", where, allowed)
 
 
-def _check_names_and_clock(group: JointGroup | PointGroup | ChannelGroup, where: str) -> None:
+def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, where: str) -> None:
     place, allowed = f"{where}, names", "one for every column, each once"
     require_data(group.names, "the group has no names", where, allowed, "write the attribute `names`")
     allowed, hint = "one sample or more", "record again, or leave the group out"

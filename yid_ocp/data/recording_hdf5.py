@@ -27,17 +27,17 @@ from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
     PER_JOINT_ATTRIBUTE_NAMES,
     POINT_GROUP_NAME_PATTERN,
-    ChannelGroup,
     JointGroup,
     PointGroup,
     Recording,
+    SensorChannelGroup,
     read_only_array,
     require_data,
     validate_recording,
 )
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.sensors import CHANNEL_KINDS
-from yid_ocp.sensors.base import declared_channel_kinds
+from yid_ocp.sensors.base import channel_kinds_of_group
 
 _RECORDING_FORMAT = "yid-recording/1"
 
@@ -86,7 +86,7 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
             attributes = [name for name in _POINT_ATTRIBUTES if name != "std"]
             _write_group(file.create_group(group.name), vars(group), _POINT_UNITS, attributes)
         for channels in recording.channel_groups:
-            units = {"t": "s"} | {c.quantity: c.unit for c in declared_channel_kinds(channels.name)}
+            units = {"t": "s"} | {c.quantity: c.unit for c in channel_kinds_of_group(channels.name)}
             content, stds = {**vars(channels), **channels.values_by_quantity}, channels.stds_by_attribute
             _write_group(file.create_group(channels.name), {**content, **stds}, units, ("names", "clock", *stds))
         if recording.marker_reference_pose is not None:
@@ -119,7 +119,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     further = sorted({CHANNEL_KINDS[kind].group for kind in CHANNEL_KINDS} - {"joints", "points"})
     allowed = ", ".join(["joints, points, points_<name>", *(f"{name}, {name}_<name>" for name in further), _STRAIGHT])
     for name in map(str, file):
-        where, declared = f"{origin}: {name}", declared_channel_kinds(name)
+        where, declared = f"{origin}: {name}", channel_kinds_of_group(name)
         legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) or declared
         hint = "" if legal else nearest_name_hint(name, ("joints", "points", *further, _STRAIGHT))
         require_data(legal, f"the format has no group '{name}'", origin, allowed, hint)
@@ -137,7 +137,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
             found = _read_group(group, where, {"t": "s", **units}, known, ("names",), needed={"t"})
             parts = ({key: found[key] for key in keys if key in found} for keys in (units, fields, ("clock",)))
             values, stds, clock = parts
-            channels.append(ChannelGroup(name, found["names"], found["t"], values, stds, **clock))
+            channels.append(SensorChannelGroup(name, found["names"], found["t"], values, stds, **clock))
         else:
             required = ("names", "sensor", "frame")
             points.append(PointGroup(name, **_read_group(group, where, _POINT_UNITS, _POINT_ATTRIBUTES, required)))

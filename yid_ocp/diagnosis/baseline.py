@@ -85,7 +85,7 @@ def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> E
             )
         if name in problem.options.local_parameters:
             what = f"'{name}' has a value of its own in every recording, so a baseline says nothing of it"
-            raise ConfigError(what, where=f"parameters.{name}.local", hint="leave `local` out")
+            raise ConfigError(what, where=f"parameters.{name}.per_recording", hint="leave `per_recording` out")
     values = dict(zip(parameters.names, map(float, problem.theta), strict=True))
     values |= dict(zip(names, map(float, baseline.values), strict=True))
     prior = MultivariateGaussianPrior(names, nearby_positive_definite_covariance(baseline.covariance))
@@ -141,7 +141,7 @@ class BaselineData:
         return BaselineComparison(self.baseline_runs, baseline.is_fit_adequate, labels, *between, tuple(shifts))
 
     def has_changed_parameters(self, fit: RefittedModel, limits: Thresholds) -> bool:
-        """Whether any parameter of a fit changed significantly since the earlier runs."""
+        """Whether any parameter of `fit` differs significantly from the earlier runs."""
         found = self.compare_with_baseline(fit, limits)
         return found is not None and bool(found.changed_parameters)
 

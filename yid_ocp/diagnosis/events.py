@@ -33,7 +33,7 @@ from yid_ocp.effects.base import arm_joint_names
 from yid_ocp.files import attributes_to_json
 from yid_ocp.inference.null_test import benjamini_hochberg_mask, times_since_recording_start
 from yid_ocp.inference.smoother import SmootherResult, force_log_likelihood_coefficients
-from yid_ocp.inference.smoother_model import linear_residual_models, sensor_bias_location
+from yid_ocp.inference.smoother_model import recording_models_with_unknown_forces, sensor_bias_location
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
@@ -251,7 +251,7 @@ def _driving_forces(
     if not any(sought.values()):
         return found
     with threadpoolctl.threadpool_limits(1):
-        models = linear_residual_models(problem, x, evaluation, limits, _FORCE_INTERVAL)
+        models = recording_models_with_unknown_forces(problem, x, evaluation, limits, _FORCE_INTERVAL)
         for model, run in zip(models, runs, strict=False):
             if not sought[model.recording]:
                 continue

@@ -30,7 +30,7 @@ from yid_ocp.inference.smoother_model import (
     LinearResidualModel,
     SmoothedUnknownGroup,
     SmootherThresholds,
-    linear_residual_models,
+    recording_models_with_unknown_forces,
 )
 from yid_ocp.inference.whitening import FilterStateTransition, KalmanStep, kalman_step_and_covariance
 from yid_ocp.parallel import map_in_threads
@@ -331,7 +331,7 @@ def select_and_smooth_unknowns(
     """Choose the groups of unknowns with the largest evidence at a whitened problem's fit `x`, and estimate them."""
     # matrices of this size are multiplied faster by one thread
     with threadpoolctl.threadpool_limits(1):
-        models = linear_residual_models(problem, x, evaluation, limits)
+        models = recording_models_with_unknown_forces(problem, x, evaluation, limits)
         sources = tuple(dict.fromkeys(source for model in models for source in model.unknown_groups))
         none = dict.fromkeys(sources, 0.0)
         nothing = _run(models, none)

@@ -232,7 +232,7 @@ def std_from_covariance(covariance: Array, x: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Names and covariance of parameters for result.json: correlations of `matrix` (n, n), deviations `std`.
+    """Names and covariance matrix for result.json, from the correlations in `matrix` (n, n) and the deviations `std`.
 
     Those that are not finite and positive are left out: nothing is known of their parameters.
     """

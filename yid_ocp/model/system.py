@@ -204,7 +204,7 @@ class Effect:
         return ca.SX(0)
 
 
-class SystemOptions(TypedDict, total=False):
+class SystemBuildArguments(TypedDict, total=False):
     """What `System.build` takes beside mechanism and effects."""
 
     objects: Sequence[tuple[FlexibleObject, str | None, ArrayLike | None]]
@@ -259,9 +259,9 @@ class System(ReprMixin):
 
     @staticmethod
     def build(
-        mechanism: Mechanism | None = None, *, effects: Sequence[Effect] = (), **options: Unpack[SystemOptions]
+        mechanism: Mechanism | None = None, *, effects: Sequence[Effect] = (), **options: Unpack[SystemBuildArguments]
     ) -> System:
-        """A system from a robot (none for an object alone), effects, and what `SystemOptions` lists.
+        """A system from a robot (none for an object alone), effects, and what `SystemBuildArguments` lists.
 
         `ModelError` of a name that does not exist or is used twice, no joint, a joint both driven and prescribed.
         """

@@ -30,7 +30,7 @@ _PlanGoal = Literal["place", "path", "box", "information"]
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
-    """Limits of the motion; joints also keep the position, velocity and effort limits of the URDF."""
+    """Limits of a planned motion: parts of the URDF's velocity and effort limits, acceleration and spring angles."""
 
     velocity_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("part of the URDF's velocity limits that is used")] = (
         0.9

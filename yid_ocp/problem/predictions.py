@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.recording import ChannelGroup, JointGroup, PointGroup, Recording, validate_recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup, validate_recording
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.errors import DataError, SolverError, nearest_name_hint
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
@@ -258,9 +258,9 @@ def _channel_groups(
     outcome: EpisodePrediction,
     theta: Array,
     rng: np.random.Generator | None,
-) -> tuple[ChannelGroup, ...]:
+) -> tuple[SensorChannelGroup, ...]:
     """What sensors of declared channels read at every node."""
-    made: dict[str, ChannelGroup] = {}
+    made: dict[str, SensorChannelGroup] = {}
     for sensor in (samples.sensor for samples in episode.measurements):
         name, _, quantity = sensor.group_name.rpartition(".")
         original = next((group for group in episode.recording.channel_groups if group.name == name), None)
@@ -280,7 +280,7 @@ def _channel_groups(
         widen = (slice(None), *[None] * (values.ndim - 2))
         values = _noisy(values, np.broadcast_to(std[widen], values.shape), rng)
         values = values + _noisy(np.zeros(values.shape[1:]), np.broadcast_to(bias[widen], values.shape[1:]), rng)
-        before = made.get(name, ChannelGroup(name, names, episode.grid.node_times, {}))
+        before = made.get(name, SensorChannelGroup(name, names, episode.grid.node_times, {}))
         by_quantity, by_attribute = (
             {**before.values_by_quantity, quantity: values},
             {**before.stds_by_attribute, **stds},

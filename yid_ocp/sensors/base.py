@@ -97,7 +97,7 @@ CHANNEL_KINDS: Registry[ChannelKind] = Registry("recorded channel")
 """Kinds of recorded values; those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
-def declared_channel_kinds(group: str) -> tuple[ChannelKind, ...]:
+def channel_kinds_of_group(group: str) -> tuple[ChannelKind, ...]:
     """Kinds of channels that sensors declare for a recording's group of this name; none for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.is_in_group(group))
@@ -147,7 +147,7 @@ class RecordedJoints(Protocol):
 
 
 class RecordedChannelGroup(_RecordedGroup, Protocol):
-    """A recorded group of declared channels, as in `data.recording.ChannelGroup`."""
+    """A recorded group of declared channels, as in `data.recording.SensorChannelGroup`."""
 
     @property
     def values_by_quantity(self) -> Mapping[str, Array]: ...

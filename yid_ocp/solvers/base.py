@@ -214,7 +214,7 @@ _DEFAULT_SOLVER = "gauss_newton"
 
 
 @dataclass
-class IterationRecorder:
+class AcceptedIterateRecorder:
     """Records accepted iterates, counts evaluations and time, and calls the callback."""
 
     callback: IterationCallback | None

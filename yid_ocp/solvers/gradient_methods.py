@@ -23,10 +23,10 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.evaluation import EvaluateFunction, Evaluation
 from yid_ocp.solvers.base import (
     SOLVERS,
+    AcceptedIterateRecorder,
     CheckedSolver,
     Iterate,
     IterationCallback,
-    IterationRecorder,
     SolverResult,
     Status,
     projected_gradient_norm,
@@ -78,7 +78,7 @@ class GaussNewton(CheckedSolver):
         """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may replace its evaluation."""
         evaluate = evaluate or problem.evaluate
         (lower, upper), scale = problem.bounds, problem.unknown_scales
-        recorder, x = IterationRecorder(callback), start.copy()
+        recorder, x = AcceptedIterateRecorder(callback), start.copy()
         now = evaluate(x)
         recorder.n_evaluations += 1
         if not now.ok or now.jacobian is None:
@@ -165,7 +165,7 @@ class SingleShooting(CheckedSolver):
     ) -> SolverResult:
         """Minimize the problem's cost from `start` by L-BFGS-B."""
         (lower, upper), scale = problem.bounds, problem.unknown_scales
-        recorder = IterationRecorder(callback)
+        recorder = AcceptedIterateRecorder(callback)
         cost, gradient, first = problem.cost_and_gradient(start)
         recorder.n_evaluations += 1
         if not first.ok:
@@ -237,7 +237,7 @@ class SteepestDescent(CheckedSolver):
         self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
     ) -> SolverResult:
         """Minimize the problem's cost from `start` by projected steepest descent."""
-        (lower, upper), recorder, x = problem.bounds, IterationRecorder(callback), start.copy()
+        (lower, upper), recorder, x = problem.bounds, AcceptedIterateRecorder(callback), start.copy()
         cost, gradient, evaluation = problem.cost_and_gradient(x)
         recorder.n_evaluations += 1
         if not evaluation.ok:

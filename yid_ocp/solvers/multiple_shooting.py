@@ -21,9 +21,9 @@ from yid_ocp.problem.episodes import InitialState
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.solvers.base import (
     SOLVERS,
+    AcceptedIterateRecorder,
     CheckedSolver,
     IterationCallback,
-    IterationRecorder,
     SolverResult,
     Status,
     projected_gradient_norm,
@@ -117,7 +117,7 @@ class MultipleShooting(CheckedSolver):
     ) -> SolverResult:
         """Minimize the problem's cost from `start` with IPOPT, or by condensed Gauss-Newton steps."""
         if self.condensing:
-            return self._by_condensing(problem, start, IterationRecorder(callback))
+            return self._by_condensing(problem, start, AcceptedIterateRecorder(callback))
         told: tuple[str, ...] = ()
         if self.hessian not in ("gauss_newton", "exact"):
             hint = "limited-memory updates cannot learn thousands of node states in a few dozen iterations"
@@ -130,9 +130,9 @@ class MultipleShooting(CheckedSolver):
             told = f"node_interval = {self.node_interval} without condensing", "node_interval", "1", hint
         if told:
             raise SolverError(told[0], where=f"solver.{told[1]}", allowed=told[2], hint=told[3])
-        return self._by_ipopt(problem, start, IterationRecorder(callback))
+        return self._by_ipopt(problem, start, AcceptedIterateRecorder(callback))
 
-    def _by_ipopt(self, problem: EstimationProblem, start: Array, recorder: IterationRecorder) -> SolverResult:
+    def _by_ipopt(self, problem: EstimationProblem, start: Array, recorder: AcceptedIterateRecorder) -> SolverResult:
         program = transcribe(problem, start)
         assert program.ridge is not None
         ridge = _AdaptiveRidge(program.ridge.scale, program.w.numel())
@@ -183,7 +183,9 @@ class MultipleShooting(CheckedSolver):
             return Status.ITERATION_LIMIT, f"{limit}; raise solver.max_iterations"
         return Status.STALLED, f"IPOPT: {returned}, {closed}; start nearer, or use gauss_newton"
 
-    def _by_condensing(self, problem: EstimationProblem, start: Array, recorder: IterationRecorder) -> SolverResult:
+    def _by_condensing(
+        self, problem: EstimationProblem, start: Array, recorder: AcceptedIterateRecorder
+    ) -> SolverResult:
         intervals = _ShootingIntervals(problem, self.node_interval or _CONDENSING_NODE_INTERVAL)
         x, nodes = intervals.initial_guess(start)
 
@@ -262,7 +264,7 @@ class _Watch(ca.Callback):
         program: NonlinearProgram,
         functions: ca.Function,
         ridge: _AdaptiveRidge,
-        recorder: IterationRecorder,
+        recorder: AcceptedIterateRecorder,
     ) -> None:
         ca.Callback.__init__(self)
         self.recorder, self.best, self._ridge = recorder, program.initial_guess, ridge

@@ -172,7 +172,7 @@ class NonlinearProgram(ReprMixin):
     @ThreadSafeCachedProperty
     def g(self) -> ca.MX:
         """Symbolic constraint functions g(w, p), shape (ng, 1)."""
-        terms = (term.values(self.w, self.p) for term in self.constraint_terms)
+        terms = (term.symbolic_outputs(self.w, self.p) for term in self.constraint_terms)
         return ca.vertcat(ca.MX(0, 1), *terms, *(extra.constraints for extra in self.user_terms))
 
     @property
@@ -190,7 +190,7 @@ class NonlinearProgram(ReprMixin):
 
     @ThreadSafeCachedProperty
     def _residuals(self) -> list[ca.MX]:
-        return [term.values(self.w, self.p) for term in self.residual_terms]
+        return [term.symbolic_outputs(self.w, self.p) for term in self.residual_terms]
 
     @ThreadSafeCachedProperty
     def _slopes(self) -> list[ca.MX]:

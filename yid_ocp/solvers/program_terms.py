@@ -97,7 +97,7 @@ class ProgramTerm:
         mapped = function.map(f"{function.name()}_{count}", "serial", count, [2], [])
         return mapped(*local, p[self.shared_data_indices.tolist()], *more)
 
-    def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
+    def symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """The local function's ny outputs at all K places, one place after another, shape (ny K, 1)."""
         return ca.vec(self._map_over_places(self.local_function.value, w, p))
 
@@ -148,9 +148,9 @@ class ResidualTerm:
         factors = p[self.weight_indices[np.array(row, int)].tolist()]
         return ca.MX(combination.sparsity(), factors * ca.MX(ca.DM(combination.nonzeros())))
 
-    def values(self, w: ca.MX, p: ca.MX) -> ca.MX:
+    def symbolic_outputs(self, w: ca.MX, p: ca.MX) -> ca.MX:
         """Residuals r at the program's unknowns w and parameters p, shape (nr, 1)."""
-        matrix, value = self.residual_jacobian_by_term_values(p), self.term.values(w, p)
+        matrix, value = self.residual_jacobian_by_term_values(p), self.term.symbolic_outputs(w, p)
         result = value if matrix is None else ca.mtimes(matrix, value)
         if self.target_indices is None:
             return result

@@ -28,7 +28,7 @@ from yid_ocp.version import installed_versions
 from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print, workers_from_arguments
 from yid_ocp.workflow.diagnose import run_diagnose
 from yid_ocp.workflow.run_folder import local_time_text
-from yid_ocp.workflow.run_history import estimate_history_result, read_estimates, require_same_model
+from yid_ocp.workflow.run_history import estimate_history_to_dict, read_estimates, require_same_model
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import run_solve
 
@@ -196,7 +196,7 @@ def _history(folders: Sequence[Path]) -> dict[str, Any] | None:
         return None
     try:
         require_same_model(folders)
-        return estimate_history_result(assess_drift_and_outlier_runs([read_estimates(folder) for folder in folders]))
+        return estimate_history_to_dict(assess_drift_and_outlier_runs([read_estimates(folder) for folder in folders]))
     except YidError:
         return None
 

@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.pinocchio_comparison import compare_system_with_pinocchio, compare_urdf_with_pinocchio
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data.recording import ChannelGroup, JointGroup, PointGroup
+from yid_ocp.data.recording import JointGroup, PointGroup, SensorChannelGroup
 from yid_ocp.integrator.step import Step
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem
@@ -143,7 +143,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
     return entry
 
 
-def _group(group: JointGroup | PointGroup | ChannelGroup) -> dict[str, Any]:
+def _group(group: JointGroup | PointGroup | SensorChannelGroup) -> dict[str, Any]:
     steps = np.diff(group.t)
     rate = 1.0 / float(np.median(steps)) if len(steps) else 0.0
     gap = float(np.max(steps, initial=0.0))

@@ -59,7 +59,7 @@ def run_diagnose(
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step")
         runs = run_history.baseline_estimates(run)
-        without, said = run_history.load_reference_recordings(run)
+        without, said = run_history.load_recordings_without_effect(run)
         if said:
             folder.log_event("message", level="WARNING", source="baseline", text=said)
         run = run_history.settings_with_baseline_effects(run, runs)

@@ -35,7 +35,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             progress.begin_stage(f"fitting the law '{law}', each kind of motion left out in turn")
             settings = replace(run, model=replace(run.model, friction=FrictionSettings(law=law, joints=joints)))
             problem = friction_ladder.problem_estimating_on_held_out_too(build_problem(settings))
-            kinds = friction_ladder.recordings_by_motion_kind(problem)
+            kinds = friction_ladder.recording_names_by_name_stem(problem)
             if len(kinds) < 2:
                 allowed = "two recordings or more in which the motors are on"
                 hint = "list more under recordings.estimate or recordings.held_out"

@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     with stderr_progress_display(arguments) as progress:
         made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
-    segments, grasps = item.settings.model_segments(), _grasps(arguments.grasp)
+    segments, grasps = item.settings.build_segments(), _grasps(arguments.grasp)
     asked = {"holder": arguments.holder, "grasps": grasps, "standing": item.stands_in_world}
     proposal = propose_config(robot, recordings, segments, **asked)
     made = _split(made, recordings, proposal, out)
@@ -289,7 +289,7 @@ def _object(item: InitObjectConfiguration, proposal: ConfigProposal) -> Iterator
         yield _line("  ", "damping", f"{{object: {max(dampings):.2g}}}", "where the search for it starts [N m^2 s]")
     else:
         yield _line("  ", "damping", "0.05", "viscous, of every coordinate [N m s/rad]")
-    tips = [f"w_{segment.name}" for segment in item.settings.model_segments()]
+    tips = [f"w_{segment.name}" for segment in item.settings.build_segments()]
     marked = [place.frame for places in proposal.point_placements.values() for place in places if place.frame]
     wanted = dict.fromkeys([*tips, *marked, *grasps.values()])
     if set(wanted) > set(tips):

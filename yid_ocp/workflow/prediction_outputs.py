@@ -65,7 +65,9 @@ def _clearly_better_baseline(entry: Mapping[str, Any], channels: Sequence[str]) 
     return (best, rms[best], error) if best is not None and error > _WORSE_RATIO * rms[best] else None
 
 
-def entries_worse_than_baseline(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[dict[str, Any]]:
+def channels_worse_than_naive_guess(
+    entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]
+) -> list[dict[str, Any]]:
     """Channels of `prediction_error_entry` entries that a baseline without a model predicts clearly better."""
     worse = []
     for entry in entries:
@@ -80,7 +82,7 @@ def entries_worse_than_baseline(entries: Sequence[Mapping[str, Any]], units: Map
 def worse_than_baseline_issues(entries: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> list[Issue]:
     """Issues for sensors that a model-free baseline predicts better than the model, over all their channels.
 
-    Single channels that say little of what the model is about may well be worse; see `entries_worse_than_baseline`.
+    Single channels that say little of what the model is about may well be worse; see `channels_worse_than_naive_guess`.
     """
     found = []
     for entry in entries:

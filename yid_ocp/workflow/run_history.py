@@ -199,7 +199,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
     return replace(settings_with_effect_values(run, added), parameters={**run.parameters, **freed})
 
 
-def load_reference_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
+def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
     """Recordings made without the sought effect, those of the settings or of the baseline; why there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.reference_recordings):
@@ -255,11 +255,11 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     with atomic_run_folder(settings, out, "report") as folder:
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in paths}
         folder.log_command_start(["report", *map(str, paths)])
-        written = folder.write_result_and_report(settings, progress, estimate_history_result(found), "history.json")
+        written = folder.write_result_and_report(settings, progress, estimate_history_to_dict(found), "history.json")
     return CommandResult(folder.path, written, None)
 
 
-def estimate_history_result(found: EstimateHistory) -> dict[str, Any]:
+def estimate_history_to_dict(found: EstimateHistory) -> dict[str, Any]:
     """Parameter estimates over several runs as a `yid-history/1` result, without inputs and versions."""
     parameters = {}
     for entry in found.parameter_drifts:

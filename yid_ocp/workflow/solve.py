@@ -143,7 +143,7 @@ def solve_result(
 ) -> dict[str, Any]:
     """Contents of a `yid-solve/1` result.json, without inputs and versions."""
     errors, units, residuals = _prediction_errors(problem, solution, held_out, cable)
-    worse = prediction_outputs.entries_worse_than_baseline(errors, units)
+    worse = prediction_outputs.channels_worse_than_naive_guess(errors, units)
     return {
         "format": _RESULT_FORMAT,
         "status": solution.status.value,

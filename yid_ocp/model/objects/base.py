@@ -192,7 +192,7 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
 class ObjectKind:
     """A kind of flexible object, whose fields are its settings; one class in one file, registered in `OBJECT_KINDS`.
 
-    A class overrides `kind`, and `model_segments` or `build`, and what else differs; one that is a system of its own is
+    A class overrides `kind`, and `build_segments` or `build`, and what else differs; one that is a system of its own is
     a `ClampedObject` as well.
     """
 
@@ -203,13 +203,13 @@ class ObjectKind:
 
     kind: Annotated[str, OptionInfo("what the object is")]
 
-    def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """Segments of the object, parents first; `link_division` divides each link at unchanged stiffness."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
         """The flexible object, not yet placed, with each link divided into `link_division` links."""
-        return flexible_object(self.model_segments(damping, link_division))
+        return flexible_object(self.build_segments(damping, link_division))
 
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
@@ -224,13 +224,13 @@ class ObjectKind:
     @property
     def links_per_segment_or_total(self) -> int | None:
         """Number of links per segment, in total where segments differ; None without divisible links."""
-        counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.model_segments()]
+        counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.build_segments()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
         """Factor on a per-joint parameter that keeps a segment's stiffness when each link is divided."""
         owner, _, quantity = parameter.rpartition(".")
-        per_joint = {segment.name for segment in self.model_segments() if not segment.stiffness_per_curvature}
+        per_joint = {segment.name for segment in self.build_segments() if not segment.stiffness_per_curvature}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
     def input_file_paths(self) -> dict[str, str]:
@@ -272,7 +272,7 @@ class MountedObject(ObjectKind):
     mount: Annotated[MountSettings | None, OptionInfo("where its root sits; the world's origin when absent")] = None
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        return flexible_object(self.model_segments(damping, link_division), gravity_fraction=self.gravity_fraction)
+        return flexible_object(self.build_segments(damping, link_division), gravity_fraction=self.gravity_fraction)
 
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:

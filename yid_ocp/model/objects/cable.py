@@ -41,7 +41,7 @@ from yid_ocp.model.mechanism import Frame, LinkChain, Mechanism, Placement
 from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectKind
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
-from yid_ocp.model.system import Grasp, System, SystemOptions, floating_clamp
+from yid_ocp.model.system import Grasp, System, SystemBuildArguments, floating_clamp
 from yid_ocp.options import OptionInfo
 
 _Vector3 = tuple[float, float, float]
@@ -154,7 +154,7 @@ def cable_system(
         rotation = symbolic_rotation_from_axis_angle(AXIS_UNIT_VECTORS["z"], end_roll.symbol)
     hung = (_with_vertices(item, cable, lengths), _START_EDGE_FRAME, None)
     held = Grasp(END_CLAMP, END_CLAMP, _LAST_EDGE_FRAME, options.end_clamp_kind, rotation)
-    known: SystemOptions = {"objects": [hung], "grasps": [held], "prescribed": clamps.joint_names, "damping": {}}
+    known: SystemBuildArguments = {"objects": [hung], "grasps": [held], "prescribed": clamps.joint_names, "damping": {}}
     known |= {"gravity": options.gravity, "point_frames": cable.vertices}
     return System.build(clamps, **known)
 

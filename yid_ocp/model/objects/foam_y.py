@@ -63,7 +63,7 @@ model:
     kind: Annotated[Literal["foam_y"], OptionInfo("what the object is")] = "foam_y"
     links: Annotated[int, Ge(1), Le(64), OptionInfo("rigid links of every tube")] = 4
 
-    def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         """The three tubes; the nominal stiffness per joint is that of four links, whatever `links` says."""
         n = link_division
         links = self.links * n
@@ -73,4 +73,4 @@ model:
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
         root = _FOOT_POSE if self.mount is None else None
-        return flexible_object(self.model_segments(damping, link_division), root, "y_object", self.gravity_fraction)
+        return flexible_object(self.build_segments(damping, link_division), root, "y_object", self.gravity_fraction)

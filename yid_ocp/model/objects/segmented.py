@@ -22,7 +22,7 @@ _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT gr
 
 
 @dataclass(frozen=True, kw_only=True)
-class SegmentSettings:
+class FlexibleSegmentSettings:
     """One segment (tube, branch or beam) as a chain of rigid links; its stiffness and damping are in `parameters`."""
 
     length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed beside link_lengths", "m")] = None
@@ -86,17 +86,17 @@ class SegmentSettings:
 # -- the command line of `init` ---------------------------------------------------------------------------------------
 
 
-def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> SegmentSettings:
+def _init_segment(links: int, length: float, mass: float, radius: float | None, **more: Any) -> FlexibleSegmentSettings:
     """A segment as `init` writes it; a flat one bends across its thinner side alone, about the other axis."""
     section = more.get("cross_section_size")
     axes = "xy" if section is None else "y" if section[0] <= section[1] else "x"
     more |= {"length": length, "mass": mass, "radius": radius, "links": links, "joint_axes": axes}
-    return SegmentSettings(stiffness_per_curvature=True, clamped_at_base=more.get("parent") is None, **more)
+    return FlexibleSegmentSettings(stiffness_per_curvature=True, clamped_at_base=more.get("parent") is None, **more)
 
 
-def _init_object(word: str, segments: Mapping[str, SegmentSettings]) -> InitObjectConfiguration:
+def _init_object(word: str, segments: Mapping[str, FlexibleSegmentSettings]) -> InitObjectConfiguration:
     item = SegmentedObject(segments=segments)
-    return InitObjectConfiguration(item, base.bending_start_values(item.model_segments(), _RIGIDITY_RATIO[word]))
+    return InitObjectConfiguration(item, base.bending_start_values(item.build_segments(), _RIGIDITY_RATIO[word]))
 
 
 def _cable(numbers: Mapping[str, Any], links: int) -> InitObjectConfiguration:
@@ -141,9 +141,9 @@ def _section(numbers: Mapping[str, Any]) -> tuple[float, float] | None:
     return x, y
 
 
-def _grown(branches: Sequence[tuple[str, SegmentSettings]]) -> dict[str, SegmentSettings]:
+def _grown(branches: Sequence[tuple[str, FlexibleSegmentSettings]]) -> dict[str, FlexibleSegmentSettings]:
     """The branches by name, each with a name of its own and on one that comes before it."""
-    made: dict[str, SegmentSettings] = {}
+    made: dict[str, FlexibleSegmentSettings] = {}
     for name, branch in branches:
         if name in made:
             raise ConfigError(f"two branches are called '{name}'", where="--branch", allowed="a name for each")
@@ -154,7 +154,7 @@ def _grown(branches: Sequence[tuple[str, SegmentSettings]]) -> dict[str, Segment
     return made
 
 
-def _branch(text: str, links: int) -> tuple[str, SegmentSettings]:
+def _branch(text: str, links: int) -> tuple[str, FlexibleSegmentSettings]:
     said, equals, numbers = text.partition("=")
     name, at, parent = said.partition("@")
     count = len(numbers.split(","))
@@ -200,9 +200,9 @@ stiffness_per_curvature: true, clamped_at_base: true}
 
     kind: Annotated[Literal["segments"], OptionInfo("what the object is")] = "segments"
     mount: Annotated[base.MountSettings, OptionInfo("where its root sits")] = field(default_factory=base.MountSettings)
-    segments: Annotated[Mapping[str, SegmentSettings], OptionInfo("by name, parents first")] = field(
+    segments: Annotated[Mapping[str, FlexibleSegmentSettings], OptionInfo("by name, parents first")] = field(
         default_factory=dict
     )
 
-    def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         return [s.segment(name, damping, link_division) for name, s in self.segments.items()]

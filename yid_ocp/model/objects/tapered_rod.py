@@ -26,7 +26,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitObjectConfigurat
         "a tapered rod", numbers, base.SIZE_DESCRIPTIONS | _FURTHER_NUMBERS
     )
     item = TaperedRod(length=length, mass=mass, base_radius=radius, tip_radius=tip, links=links, joint_axes="xy")
-    return InitObjectConfiguration(item, base.bending_start_values(item.model_segments(), 1.0))
+    return InitObjectConfiguration(item, base.bending_start_values(item.build_segments(), 1.0))
 
 
 @OBJECT_KINDS.register("tapered_rod")
@@ -59,7 +59,7 @@ parameters:
     links: Annotated[int, Ge(1), Le(64), OptionInfo("number of equal links")] = 8
     joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
 
-    def model_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
+    def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
         rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_per_curvature=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]
