@@ -345,6 +345,10 @@ def test_bags_that_are_none_and_no_rosbags(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the system cannot limit memory")
 def test_what_a_bag_unpacks_to_is_limited(tmp_path: Path) -> None:
+    import resource
+
+    if resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
+        pytest.skip("memory is limited from outside, which stays as it is")
     bag = OpenBag(write_bag(tmp_path, "mcap", arm_and_camera()))
     with pytest.raises(DataError, match="MemoryError"), bag.read_errors_as_data_errors():
         bytearray(2 << 30)
