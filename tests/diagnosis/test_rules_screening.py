@@ -12,7 +12,7 @@ from made_series import series
 
 from yid_ocp.diagnosis import screening
 from yid_ocp.diagnosis.screening import (
-    _coloured,
+    _covariance_of_scores,
     _newey_west_covariance,
     _shape_grid,
     candidate_detectability,
@@ -64,7 +64,7 @@ def test_the_noise_of_a_signature_has_the_colour_of_its_rows(colour):
     columns = np.random.default_rng(1).standard_normal((30, 2))
     parts = [series(range(10, 30), colour=colour), series(range(8))]
     expected = columns[10:].T @ toeplitz(colour, 20) @ columns[10:] + columns[:8].T @ columns[:8]
-    found = _coloured(columns, parts)
+    found = _covariance_of_scores(columns, parts)
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
     np.testing.assert_array_equal(found, found.T)
 
