@@ -12,13 +12,12 @@ import numpy as np
 import scipy.special
 
 from yid_ocp.arrays import Array
-from yid_ocp.errors import ConfigError, DataError, nearest_name_hint
+from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
     CHANNEL_KINDS,
     SENSOR_READERS,
     ChannelKind,
-    RecordedChannelGroup,
     RecordedJoints,
     RecordedPointGroup,
     Sensor,
@@ -33,15 +32,11 @@ JOINT_EFFORT_GROUP_NAME = "joints.effort"
 JOINT_POSITION_GROUP_NAME = "joints.position"
 _EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(ChannelKind("joints", "effort", "N m"))
 _POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(ChannelKind("joints", "position", "rad"))
-_TORQUE_CONSTANT = "torque_constant"
-_CURRENT = CHANNEL_KINDS.register("motors.current")(
-    ChannelKind("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
-)
 NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate a noise level: they remove motion slow against sampling
 
 
 @dataclass(frozen=True)
-class _JointSensor(Sensor):
+class JointSensor(Sensor):
     """A sensor of named joints with one output per joint and no points."""
 
     frame_names = point_names = ()
@@ -59,7 +54,7 @@ class _JointSensor(Sensor):
 
 
 @dataclass(frozen=True)
-class PositionSensor(_JointSensor):
+class PositionSensor(JointSensor):
     """Encoders of named driven joints."""
 
     channel = _POSITION
@@ -71,7 +66,7 @@ class PositionSensor(_JointSensor):
 
 
 @dataclass(frozen=True)
-class EffortSensor(_JointSensor):
+class EffortSensor(JointSensor):
     """Efforts of named prescribed joints, predicted by the discrete inverse dynamics."""
 
     channel = _EFFORT
@@ -84,27 +79,6 @@ class EffortSensor(_JointSensor):
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         return self.select_sensor_joint_rows(state.load, state)
-
-
-@dataclass(frozen=True)
-class _MotorCurrentSensor(_JointSensor):
-    """Motor currents of named prescribed joints, current = joint effort / torque constant."""
-
-    channel = _CURRENT
-    naive_prediction = "zero"
-    has_paper_weight = False
-    torque_constants: tuple[float, ...]  # joint torque per current, gears included, of each joint [N m/A]
-
-    @property
-    def effort_joints(self) -> tuple[str, ...]:
-        return self.joint_names
-
-    @property
-    def effort_per_unit_reading(self) -> Array:
-        return np.array(self.torque_constants)
-
-    def ideal_reading(self, state: NodeState) -> ca.SX:
-        return self.select_sensor_joint_rows(state.load, state) / ca.DM(self.torque_constants)
 
 
 def is_point_group_measured_by_arm(group: RecordedPointGroup) -> bool:
@@ -156,7 +130,7 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
 
 def smoothed_effort_data(
     around: SensorDataInputs,
-    sensor: _JointSensor,
+    sensor: JointSensor,
     t: Array,
     values: Array,
     std: Array,
@@ -192,41 +166,6 @@ def smoothed_effort_data(
     if correlation is not None:
         correlation = correlation * np.outer(np.sign(unit), np.sign(unit))
     return SensorData(sensor, times[kept], measured[kept], total / np.abs(unit), (1, steps - 1), bias, correlation)
-
-
-@SENSOR_READERS.register("motors.current")
-def _read_motor_currents(around: SensorDataInputs) -> list[SensorData]:
-    groups = (group for group in around.recording.channel_groups if _CURRENT.is_in_group(group.name))
-    return [found for group in groups if (found := _currents(around, group)) is not None]
-
-
-def _currents(around: SensorDataInputs, group: RecordedChannelGroup) -> SensorData | None:
-    key, where = f"{group.name}.{_CURRENT.quantity}", f"{around.recording.name}: {group.name}"
-    choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
-    if choice.use is False or not names or around.recording.joints is None:
-        return None
-    for name in group.names:
-        if name not in around.system.mechanism.joint_names:
-            hint = nearest_name_hint(name, around.system.mechanism.joint_names)
-            raise DataError(f"the model has no joint '{name}'", where=where, hint=hint)
-    stated = [group.stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
-    constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
-    bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
-    if constants is None:
-        what, hint = "the motors' torque constants are not given", "[N m/A], torque at the joint over current"
-        raise DataError(what, where=where, hint=f"set sensors.{key}.constants: {{{_TORQUE_CONSTANT}: ...}} {hint}")
-    if std is None:
-        what = "the noise level of the motor currents is neither recorded nor given"
-        raise DataError(what, where=where, hint=f"set sensors.{key}.std [A]")
-    by_joint = [
-        expand_to_joint_values(given, group.names, names, f"sensors.{key}.{setting}")
-        for given, setting in ((constants, "constants"), (std, "std"), (bias, "bias_std"))
-    ]
-    if not np.all(by_joint[0] != 0):
-        raise DataError("a torque constant is zero", where=where, allowed="a number that is not zero [N m/A]")
-    sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
-    values = group.values_by_quantity[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
-    return smoothed_effort_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)
 
 
 # -- noise levels -----------------------------------------------------------------------------------------------------

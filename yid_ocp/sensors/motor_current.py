@@ -1,0 +1,83 @@
+"""Motor currents of prescribed joints: the predicted joint effort over a torque constant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.arrays import Array
+from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.model.system import NodeState
+from yid_ocp.sensors.base import (
+    CHANNEL_KINDS,
+    SENSOR_READERS,
+    ChannelKind,
+    RecordedChannelGroup,
+    SensorData,
+    SensorDataInputs,
+    expand_to_joint_values,
+)
+from yid_ocp.sensors.joints import JointSensor, smoothed_effort_data
+
+_TORQUE_CONSTANT = "torque_constant"
+_CURRENT = CHANNEL_KINDS.register("motors.current")(
+    ChannelKind("motors", "current", "A", constants={_TORQUE_CONSTANT: "N m/A"})
+)
+
+
+@dataclass(frozen=True)
+class _MotorCurrentSensor(JointSensor):
+    """Motor currents of named prescribed joints, current = joint effort / torque constant."""
+
+    channel = _CURRENT
+    naive_prediction = "zero"
+    has_paper_weight = False
+    torque_constants: tuple[float, ...]  # joint torque per current, gears included, of each joint [N m/A]
+
+    @property
+    def effort_joints(self) -> tuple[str, ...]:
+        return self.joint_names
+
+    @property
+    def effort_per_unit_reading(self) -> Array:
+        return np.array(self.torque_constants)
+
+    def ideal_reading(self, state: NodeState) -> ca.SX:
+        return self.select_sensor_joint_rows(state.load, state) / ca.DM(self.torque_constants)
+
+
+@SENSOR_READERS.register("motors.current")
+def _read_motor_currents(around: SensorDataInputs) -> list[SensorData]:
+    groups = (group for group in around.recording.channel_groups if _CURRENT.is_in_group(group.name))
+    return [found for group in groups if (found := _currents(around, group)) is not None]
+
+
+def _currents(around: SensorDataInputs, group: RecordedChannelGroup) -> SensorData | None:
+    key, where = f"{group.name}.{_CURRENT.quantity}", f"{around.recording.name}: {group.name}"
+    choice, names = around.sensor_usage(key), tuple(n for n in around.system.prescribed if n in group.names)
+    if choice.use is False or not names or around.recording.joints is None:
+        return None
+    for name in group.names:
+        if name not in around.system.mechanism.joint_names:
+            hint = nearest_name_hint(name, around.system.mechanism.joint_names)
+            raise DataError(f"the model has no joint '{name}'", where=where, hint=hint)
+    stated = [group.stds_by_attribute.get(attribute) for attribute in _CURRENT.std_attribute_names]
+    constants, std = choice.constants.get(_TORQUE_CONSTANT), stated[0] if choice.std is None else choice.std
+    bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
+    if constants is None:
+        what, hint = "the motors' torque constants are not given", "[N m/A], torque at the joint over current"
+        raise DataError(what, where=where, hint=f"set sensors.{key}.constants: {{{_TORQUE_CONSTANT}: ...}} {hint}")
+    if std is None:
+        what = "the noise level of the motor currents is neither recorded nor given"
+        raise DataError(what, where=where, hint=f"set sensors.{key}.std [A]")
+    by_joint = [
+        expand_to_joint_values(given, group.names, names, f"sensors.{key}.{setting}")
+        for given, setting in ((constants, "constants"), (std, "std"), (bias, "bias_std"))
+    ]
+    if not np.all(by_joint[0] != 0):
+        raise DataError("a torque constant is zero", where=where, allowed="a number that is not zero [N m/A]")
+    sensor = _MotorCurrentSensor(names, key, tuple(by_joint[0].tolist()))
+    values = group.values_by_quantity[_CURRENT.quantity][:, [group.names.index(name) for name in names]]
+    return smoothed_effort_data(around, sensor, group.t, values, by_joint[1], by_joint[2], is_sample=True)
