@@ -40,7 +40,7 @@ LAYERS = (
     "solvers",
     "analysis",
 )
-LAYERS = (*LAYERS, "diagnosis", "report", "config", "workflow")
+LAYERS = (*LAYERS, "diagnosis", "planning", "export", "report", "config", "workflow")
 """Packages from left to right; those to the left of the changed one are imported once."""
 LIBRARIES = (
     "numpy",
