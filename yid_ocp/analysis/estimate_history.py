@@ -71,7 +71,7 @@ class _ParameterDrift:
 
 
 @dataclass(frozen=True)
-class RunOutlierTest:
+class _RunOutlierTest:
     """Test of one run against the pooled estimates of all others."""
 
     run_name: str
@@ -89,7 +89,7 @@ class EstimateHistory:
 
     run_names: tuple[str, ...]
     parameter_drifts: tuple[_ParameterDrift, ...]
-    run_outlier_tests: tuple[RunOutlierTest, ...]
+    run_outlier_tests: tuple[_RunOutlierTest, ...]
     chi2: float
     degrees_of_freedom: int
     p_value: float
@@ -158,7 +158,7 @@ def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterD
     return _ParameterDrift(name, mean.units.get(name, ""), places, values, std, *pooled, chi2, p, p < level)
 
 
-def _against(i: int, runs: Sequence[RunEstimates], level: float) -> RunOutlierTest:
+def _against(i: int, runs: Sequence[RunEstimates], level: float) -> _RunOutlierTest:
     """One run against the mean of all others; distrusted where they agree without it."""
     chi2, degrees, worst = _apart(runs[i], [run for k, run in enumerate(runs) if k != i])
     p = chi2_p_value(chi2, degrees)
@@ -166,7 +166,7 @@ def _against(i: int, runs: Sequence[RunEstimates], level: float) -> RunOutlierTe
     rest, free = without[i]
     agree = chi2_p_value(rest, free) >= level or rest < 0.5 * min(r for k, (r, _) in enumerate(without) if k != i)
     alone = len(runs) > 2 and p < level and agree
-    return RunOutlierTest(runs[i].run_name, chi2, degrees, p, worst, runs[i].is_fit_adequate, alone)
+    return _RunOutlierTest(runs[i].run_name, chi2, degrees, p, worst, runs[i].is_fit_adequate, alone)
 
 
 def _apart(run: RunEstimates, others: Sequence[RunEstimates]) -> tuple[float, int, str]:

@@ -73,7 +73,7 @@ class _SymbolName(NamedTuple):
 
 
 @dataclass(frozen=True)
-class FormulaText:
+class _FormulaText:
     """Expressions written as text, with their shared subexpressions."""
 
     shared_subexpressions: tuple[tuple[str, str], ...]  # name and expression, which may use those before it
@@ -91,7 +91,7 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
 
 def format_expressions(
     expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[_SymbolName], latex: bool = False
-) -> FormulaText:
+) -> _FormulaText:
     """Scalar expressions as text or LaTeX, with the names of the variables (k, 1), all symbols that may occur."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
     uses = [0] * len(nodes)
@@ -118,7 +118,7 @@ def format_expressions(
             written.append((text, tightness))
     counted = sum(op not in _LEAF_OPERATIONS for op, _, _ in nodes)
     seen = tuple(sorted({int(value) for op, _, value in nodes if op == ca.OP_INPUT}))
-    return FormulaText(tuple(shared), tuple(written[r][0] for r in results), counted, seen)
+    return _FormulaText(tuple(shared), tuple(written[r][0] for r in results), counted, seen)
 
 
 def _function(expressions: Sequence[ca.SX], variables: ca.SX) -> ca.Function:
@@ -193,7 +193,7 @@ class EquationEntry:
 
     row_name: str
     column_name: str
-    formula: FormulaText
+    formula: _FormulaText
     variable_names: tuple[str, ...]
     expression: ca.SX
 
