@@ -10,7 +10,7 @@ from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
-from yid_ocp.config.schema import _option_info_from_annotation, section_variants_from_annotation
+from yid_ocp.config.schema import option_info_from_annotation, section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.model.objects import OBJECT_KINDS
 from yid_ocp.options import Option, dataclass_options, describe_type, mapping_value_type, tuple_entry_type
@@ -62,7 +62,7 @@ def row(name: str, option: Option) -> str:
     usual = "needed" if option.default_value is MISSING else default(option.default_value)
     cells = (
         f"`{name}`",
-        _option_info_from_annotation(option.type_hint).description,
+        option_info_from_annotation(option.type_hint).description,
         describe_type(option.type_hint),
         usual,
     )

@@ -133,7 +133,7 @@ def config_json_schema() -> dict[str, Any]:
 
 
 def _described_schema(hint: Any) -> dict[str, Any]:
-    about = _option_info_from_annotation(hint)
+    about = option_info_from_annotation(hint)
     text = about.description + (f" [{about.unit}]" if about.unit else "")
     return _type_schema(hint) | ({"description": text} if text else {})
 
@@ -177,7 +177,7 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
     return result | ({"required": required} if required else {})
 
 
-def _option_info_from_annotation(hint: Any) -> options.OptionInfo:
+def option_info_from_annotation(hint: Any) -> options.OptionInfo:
     """The `OptionInfo` in a type annotation (meaning and unit); an empty one where there is none."""
     markers = reversed(options.split_annotated(hint)[1])
     return next((marker for marker in markers if isinstance(marker, options.OptionInfo)), options.OptionInfo())
