@@ -31,11 +31,11 @@ class LoggingProgress(Progress):
     log: logging.Logger
 
     def begin_stage(self, text: str) -> None:
-        """See `Progress`."""
+        """Log the name of the stage."""
         self.log.info("%s", text)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        """See `Progress`."""
+        """Log the number of finished parts."""
         self.log.info("%d of %d, %s", done, total, text)
 
 

@@ -129,17 +129,17 @@ class StderrLogLinesProgress(Progress):
         self._tenths, self._last, self._left = 0, 0.0, _RemainingTime()
 
     def begin_stage(self, text: str) -> None:
-        """See `Progress`."""
+        """Print a line with the name of the stage."""
         interruption.raise_if_requested()
         self._tenths, self._last, self._left = 0, time.monotonic(), _RemainingTime()
         print(f"{text} ...", file=sys.stderr, flush=True)
 
     def report_iterate(self, entry: Iterate) -> None:
-        """See `Progress`."""
+        """Print a line for the accepted point."""
         print(f"  {_format_iterate(entry)}", file=sys.stderr, flush=True)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
-        """See `Progress`."""
+        """Print a line for every tenth of the stage, or where the last one is some seconds old."""
         tenths, left = 10 * done // max(total, 1), self._left.remaining_text(done, total)
         # a line for every frame would be too many
         if tenths > self._tenths or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
