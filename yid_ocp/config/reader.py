@@ -34,7 +34,7 @@ DEFAULT_DIAGNOSIS_CONFIG_FILE = "diagnosis.yaml"
 
 _MAX_DEPTH, _MAX_ENTRIES, _MAX_BYTES = 40, 20_000, 1 << 20  # of a configuration, far beyond what any needs
 _ALIAS_COST = 40  # in entries: the reader compares each mapping that an alias is merged into with all others
-_ALLOWED = "keys with numbers, text, true or false, [lists] and sections"
+_ALLOWED_YAML = "keys with numbers, text, true or false, [lists] and sections"
 
 
 def load_config(
@@ -120,13 +120,13 @@ def _loaded(text: str, origin: str) -> Any:
         twice = re.match(r'found duplicate key "(.*?)"', problem)
         what = f"the key '{twice[1]}' is duplicated" if twice else f"the file is not valid YAML: {problem}"
         hint = "check indentation, brackets, colons and duplicated keys"
-        raise ConfigError(what, where=f"{origin}{line}", allowed=_ALLOWED, hint=hint) from error
+        raise ConfigError(what, where=f"{origin}{line}", allowed=_ALLOWED_YAML, hint=hint) from error
     except (YAMLError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError) as error:
         # the reader's own mistakes on odd text: numbers of thousands of digits, keys that are lists
         problem = next(iter(str(error).splitlines()), type(error).__name__)
         hint = "look for very long numbers and for keys that are lists"
         what = f"the file is not valid YAML: {problem}"
-        raise ConfigError(what, where=origin, allowed=_ALLOWED, hint=hint) from error
+        raise ConfigError(what, where=origin, allowed=_ALLOWED_YAML, hint=hint) from error
 
 
 def _yaml() -> YAML:
@@ -138,7 +138,7 @@ def _yaml() -> YAML:
 
 def _odd(what: str, origin: str, event: Any) -> ConfigError:
     where = f"{origin}, line {event.start_mark.line + 1}"
-    return ConfigError(what, where=where, allowed=_ALLOWED, hint="write it without")
+    return ConfigError(what, where=where, allowed=_ALLOWED_YAML, hint="write it without")
 
 
 def _unwrap(node: Any, path: _KeyPath, places: dict[_KeyPath, str], origin: str) -> Any:

@@ -308,12 +308,12 @@ def _runs(entries: _Indices) -> list[int]:
 
 
 # libm's functions of one member after another
-_ONE = (
+_UNARY_FUNCTIONS = (
     *("exp", "log", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
     *("floor", "ceil", "erf", "log1p", "expm1"),
 )
-_TWO = ("pow", "constpow", "atan2", "fmod", "remainder", "copysign", "hypot")
-_FORMS = {
+_BINARY_FUNCTIONS = ("pow", "constpow", "atan2", "fmod", "remainder", "copysign", "hypot")
+_OPERATION_FORMS = {
     ca.OP_ASSIGN: "{0}",
     ca.OP_ADD: "{0} + {1}",
     ca.OP_SUB: "{0} - {1}",
@@ -336,11 +336,14 @@ _FORMS = {
     ca.OP_AND: "truth(({0} != 0) & ({1} != 0))",
     ca.OP_OR: "truth(({0} != 0) | ({1} != 0))",
     ca.OP_IF_ELSE_ZERO: "choose({0} != 0, {1}, (real)ALL(0.0))",
-    **{getattr(ca, f"OP_{name.upper()}"): f"each({name}, {{0}})" for name in _ONE},
-    **{getattr(ca, f"OP_{name.upper()}"): f"each_pair({name.removeprefix('const')}, {{0}}, {{1}})" for name in _TWO},
+    **{getattr(ca, f"OP_{name.upper()}"): f"each({name}, {{0}})" for name in _UNARY_FUNCTIONS},
+    **{
+        getattr(ca, f"OP_{name.upper()}"): f"each_pair({name.removeprefix('const')}, {{0}}, {{1}})"
+        for name in _BINARY_FUNCTIONS
+    },
 }
-_TURNS = {ca.OP_SIN: "sine", ca.OP_COS: "cosine"}
-_KNOWN = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_FORMS, *_TURNS}
+_SINE_AND_COSINE = {ca.OP_SIN: "sine", ca.OP_COS: "cosine"}
+_TRANSLATED_OPERATIONS = {ca.OP_INPUT, ca.OP_OUTPUT, ca.OP_CONST, *_OPERATION_FORMS, *_SINE_AND_COSINE}
 
 _LONG_INSTRUCTION_COUNT = 80_000  # from which on a function is split into parts: compile time grows superlinearly
 _PART_INSTRUCTION_COUNT = 300  # with which a step of 151 variables compiles in half the time of 4000 and runs as fast
@@ -369,7 +372,7 @@ class _Instruction:
 
 def _source(function: ca.Function) -> str | None:
     instructions = _instructions(function)
-    if any(instruction.code not in _KNOWN for instruction in instructions):
+    if any(instruction.code not in _TRANSLATED_OPERATIONS for instruction in instructions):
         return None
     size = _PART_INSTRUCTION_COUNT if _is_long_function(function) else max(len(instructions), 1)
     needed = [0] * len(instructions)  # the last part that takes its value
@@ -393,7 +396,7 @@ def _instructions(function: ca.Function) -> list[_Instruction]:
     for k in range(function.n_instructions()):
         code, inputs = function.instruction_id(k), function.instruction_input(k)
         outputs = function.instruction_output(k)
-        if code in _KNOWN and code != ca.OP_INPUT:
+        if code in _TRANSLATED_OPERATIONS and code != ca.OP_INPUT:
             inputs = [held[place] for place in inputs]
         constant = function.instruction_constant(k) if code == ca.OP_CONST else 0.0
         found.append(_Instruction(code, inputs, outputs, constant))
@@ -426,15 +429,15 @@ def _part(instructions: Sequence[_Instruction], first: int, size: int, needed: S
             lines.append(f"const real {name} = ALL({constant});")
         elif told.code == ca.OP_INPUT:
             lines.append(f"const real {name} = arg[{told.inputs[0]}][{told.inputs[1]}];")
-        elif told.code in _TURNS:
+        elif told.code in _SINE_AND_COSINE:
             of, angle = told.inputs[0], value(told.inputs[0])
             if of not in turned:
                 turned[of] = f"t{k}"
                 lines.append(f"const Turn t{k} = turn({angle});")
-            name = f"{turned[of]}.{_TURNS[told.code]}"
+            name = f"{turned[of]}.{_SINE_AND_COSINE[told.code]}"
         else:
             operands = [value(of) for of in told.inputs]
-            lines.append(f"const real {name} = {_FORMS[told.code].format(*operands)};")
+            lines.append(f"const real {name} = {_OPERATION_FORMS[told.code].format(*operands)};")
         known[k] = name
     kept = sorted((instructions[k].outputs[0], k) for k in own if needed[k] > first // size)
     return [*lines, *(f"w[{place}] = {known[k]};" for place, k in kept)]

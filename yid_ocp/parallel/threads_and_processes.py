@@ -19,7 +19,7 @@ from yid_ocp.errors import ConfigError
 
 _THREADS_VARIABLE = "YID_OCP_THREADS"  # number of threads per process; by default that of processors
 _MAX_CONCURRENT_ITEMS = 8  # largest number of concurrent items, equal to the largest batch size
-_SHARE = threading.local()
+_THREAD_SHARE = threading.local()
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 _Key = TypeVar("_Key", bound=Hashable)
@@ -50,12 +50,12 @@ def _max_threads() -> int:
     if said and not (said.isdecimal() and int(said)):
         raise ConfigError(f"{_THREADS_VARIABLE} is '{said}'", where="environment", allowed="a whole number from 1")
     own = int(said) if said else available_processor_count()
-    return min(own, getattr(_SHARE, "count", own))
+    return min(own, getattr(_THREAD_SHARE, "count", own))
 
 
 def _limit_max_threads(count: int) -> None:
     """Limit the number of threads that the current thread may use."""
-    _SHARE.count = count
+    _THREAD_SHARE.count = count
 
 
 # CasADi marks the nodes of expressions while it differentiates them: two threads at once on expressions that share
@@ -162,10 +162,10 @@ def _answer(requests: Sequence[_Request]) -> None:
 
 def batched_call(function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]) -> list[_Answer]:
     """Answers of a function to questions, in one call with those of other `map_with_batched_calls` items."""
-    march = getattr(_SHARE, "march", None)
+    march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
         return function(questions)
-    found: list[_Answer] = march.ask(_Request(_SHARE.rank, function, questions))
+    found: list[_Answer] = march.ask(_Request(_THREAD_SHARE.rank, function, questions))
     return found
 
 
@@ -176,7 +176,7 @@ def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable
     while it asks.
     """
     entries = list(items)
-    if len(entries) < 2 or getattr(_SHARE, "march", None) is not None:
+    if len(entries) < 2 or getattr(_THREAD_SHARE, "march", None) is not None:
         return [function(entry) for entry in entries]
     march = _March(min(_MAX_CONCURRENT_ITEMS, len(entries)), threading.Semaphore(_max_threads()))
     queue, guard = iter(range(len(entries))), threading.Lock()
@@ -184,7 +184,7 @@ def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable
     errors: dict[int, BaseException] = {}
 
     def work() -> None:
-        _SHARE.march = march
+        _THREAD_SHARE.march = march
         _limit_max_threads(1)
         try:
             while not march.abandoned and not errors:
@@ -192,7 +192,7 @@ def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable
                     index = next(queue, None)
                 if index is None:
                     break
-                _SHARE.rank = index
+                _THREAD_SHARE.rank = index
                 try:
                     with march.running:
                         results[index] = function(entries[index])

@@ -37,7 +37,7 @@ from yid_ocp.vision.frames import look_at_pose
 _Generators = Mapping[str, np.random.Generator]
 
 # every sensor draws from a stream of its own, so that leaving one out changes no other; the order is part of the seed
-_STREAMS = ("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias")
+_RANDOM_STREAMS = ("position", "velocity", "effort", "arm_points", "frames", "camera_points", "effort_bias")
 _CAMERA_DIRECTION = np.array([0.93, 0.0, 0.37])  # from the object
 _TRUE_QUANTITIES = ("bend", "twist", "damping", "twist_damping", "mass")
 
@@ -151,8 +151,8 @@ def record_simulation(
 
 def _random_generators(seed: int) -> _Generators:
     """A stream of random numbers for every sensor."""
-    seeds = np.random.SeedSequence(seed).spawn(len(_STREAMS))
-    return {name: np.random.default_rng(own) for name, own in zip(_STREAMS, seeds, strict=True)}
+    seeds = np.random.SeedSequence(seed).spawn(len(_RANDOM_STREAMS))
+    return {name: np.random.default_rng(own) for name, own in zip(_RANDOM_STREAMS, seeds, strict=True)}
 
 
 def _held_and_visible_points(system: System) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -53,8 +53,8 @@ MODEL_ASPECT_DESCRIPTIONS: Mapping[str, str] = {
 
 _DRY_FRICTION_KINDS = ("joint_coulomb", "joint_presliding")  # smoothed, of friction torque tau_c [N m]
 
-_POINTS = 3  # at which equations are compared
-_ROUNDING = 1e-9
+_N_COMPARED_STATES = 3  # at which equations are compared
+_ROUNDING_TOLERANCE = 1e-9
 MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 # aspects of sensors and recorded torques, which do not enter the mechanics
 _IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
@@ -64,7 +64,7 @@ _NATIVE_ASPECTS = (
 )
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
-_ROTOR = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
+_ROTOR_INERTIA = 5e-4  # [kg m^2] of a motor behind play, as little as lets it rest at a stop
 _AXIS_LEVER = 0.1  # [m] between the two points that keep two axes parallel
 
 
@@ -223,10 +223,10 @@ def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> d
     mixed = [ca.jacobian(momentum, q), *(full - ca.diag(ca.diag(full)) for full in (by_q, by_v, inertia))]
     at = ca.Function("at", [q, v], [ca.densify(x) for x in (force, ca.diag(by_q), second, *slopes, *mixed)])
     rng = np.random.default_rng(0)
-    found = [[np.array(x) for x in at(*rng.uniform(-1.0, 1.0, (2, n)))] for _ in range(_POINTS)]
+    found = [[np.array(x) for x in at(*rng.uniform(-1.0, 1.0, (2, n)))] for _ in range(_N_COMPARED_STATES)]
     rest = [np.array(x).ravel() for x in at(np.zeros(n), np.zeros(n))[:6]]
     pull, slope, curve, damping, armature, twisted = rest
-    scale = _ROUNDING * max(1.0, *(float(np.abs(x).max(initial=0.0)) for x in rest))
+    scale = _ROUNDING_TOLERANCE * max(1.0, *(float(np.abs(x).max(initial=0.0)) for x in rest))
     moved = [np.abs(entry[i].ravel() - rest[i]).max() for entry in found for i in range(3, 3 + len(slopes))]
     constant = all(size <= scale for size in moved)
     apart = all(np.abs(x).max(initial=0.0) <= scale for entry in found for x in entry[6:])
@@ -340,7 +340,7 @@ def _bodies(
         if joint.name in gears:
             motor, name = elements[j], joint.name
             motor.set("name", f"{name}_motor")
-            moved.attrib.setdefault("armature", format_xml_numbers([_ROTOR]))
+            moved.attrib.setdefault("armature", format_xml_numbers([_ROTOR_INERTIA]))
             SubElement(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
             elements[j] = SubElement(motor, "body", {"name": f"{name}_body"})
             kind = {"name": f"{name}_play", "type": attributes["type"], "axis": attributes["axis"]}

@@ -24,7 +24,7 @@ from yid_ocp.virtual.mujoco_simulation import (
 )
 
 REPLAY_FEEDBACK_BANDWIDTH = 5.0  # against drift of driven joints; low, so that recorded torque dominates [rad/s]
-_SMOOTHED = 2.0  # samples over which recorded angles are smoothed before they are followed
+_SMOOTHING_SAMPLES = 2.0  # samples over which recorded angles are smoothed before they are followed
 _START = 5  # samples of which the first posture is the mean
 _AT_ENDS = 0.2  # of a recording in which what moves prescribed joints is not compared [s]: it begins anew there
 _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
@@ -81,7 +81,7 @@ def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[st
         return _errors(system, recording, joints, columns, commanded)
     balance = settle_to_equilibrium(scene, np.array(model.dof_damping))
     noisy = joints.position_std is not None and bool(np.any(np.asarray(joints.position_std) > 0))
-    path = _Path(moved, t, position, _SMOOTHED if noisy else 0.0)
+    path = _Path(moved, t, position, _SMOOTHING_SAMPLES if noisy else 0.0)
     if system.driven:
         return _errors(system, recording, joints, columns, _driven(scene, path, t, effort))
     controller = TrackingController(scene, path, balance)

@@ -25,7 +25,7 @@ from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
 from yid_ocp.virtual.mjcf import compile_mjcf, import_mujoco, mujoco_xml
 
 DEFAULT_SIMULATOR_TIME_STEP = 1e-4  # [s]
-_BANDWIDTH = 25.0  # of the joint controller [rad/s]; a 10 ms hold leaves it well damped
+_TRACKING_BANDWIDTH = 25.0  # of the joint controller [rad/s]; a 10 ms hold leaves it well damped
 _HOLD_STIFFNESS = 2e3  # [N m/rad] while settling; stable explicitly on the lightest wrist
 _HOLD_DAMPING = 60.0  # [N m s/rad]
 _SETTLING_FACTOR = 10.0  # on the object's damping: equilibrium does not depend on it, time to get there does
@@ -33,7 +33,7 @@ _SETTLING_LIMIT = 60.0  # [s]
 _POSTURE_TOLERANCE = 1e-6  # [rad]
 _REST = 1e-7  # [rad/s]
 # warnings after which MuJoCo resets its state and goes on; their numbers differ between its versions
-_LOST = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
+_INSTABILITY_WARNINGS = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
 class InjectedSimulatorTerms(Protocol):
@@ -238,7 +238,7 @@ def _settling_model(scene: MujocoScene, damping: Array) -> Any:
 def _lost(scene: MujocoScene) -> bool:
     """Whether MuJoCo lost the state at some time, and began again from its first one."""
     kinds = scene.mujoco.mjtWarning
-    return any(scene.data.warning[int(getattr(kinds, name))].number > 0 for name in _LOST)
+    return any(scene.data.warning[int(getattr(kinds, name))].number > 0 for name in _INSTABILITY_WARNINGS)
 
 
 class TrackingController:
@@ -261,8 +261,8 @@ class TrackingController:
         data, driven = self._scene.data, self._scene.moved_joint_ids
         offset, velocity, acceleration = self._motion.offset_and_derivatives(t)
         reference = self._rest[driven] + offset
-        demand = acceleration + 2 * _BANDWIDTH * (velocity - data.qvel[driven])
-        demand += _BANDWIDTH**2 * (reference - data.qpos[driven])
+        demand = acceleration + 2 * _TRACKING_BANDWIDTH * (velocity - data.qvel[driven])
+        demand += _TRACKING_BANDWIDTH**2 * (reference - data.qpos[driven])
         torque = np.asarray(self._load + self._arm_torque(reference, velocity, demand))
         data.qfrc_applied[driven] = torque
         return torque

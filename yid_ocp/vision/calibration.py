@@ -39,19 +39,19 @@ from yid_ocp.vision.camera_registration import (
 from yid_ocp.vision.point_cloud import weighted_median
 
 _OFF_ARM_DISTANCE = 0.04  # at which a point stops to be the arm's [m]
-_THIN = 5000  # points of a frame among which starts are tried
-_POINTS, _FEW_POINTS = 500, 150  # near the arm: for its offset, to see which start is best
-_COARSE, _FURTHEST = 0.04, 0.4  # starts: apart, and the furthest [s]
-_NARROWING = (1.0, 0.7, 0.5, 0.5)  # of the reach, from iteration to iteration
-_SHARE = 0.3  # of the points must lie on the arm, or they are something else
-_UNUSUAL = 1.5  # times the usual misfit, from which on other starts are tried
-_CLEARLY = 0.8  # of the misfit at the common offset, below which another is believed
-_LEAST_LATE = 0.02  # [s]; a stamp that is off by less is like the others
-_LATE = 4.0  # standard deviations
-_SHIFT_STD = 1e-3  # of the arm in one frame from where it should be by the calibration [m]
-_ALIKE = 3.0  # points drawn at random have errors that are alike in groups of so many
-_TO_SIGMA, _LEAST_SIGMA = 1.4826, 1e-3  # from the median of sizes; [m]
-_LARGEST_CHANGE = 0.05  # of an offset in one iteration [s]
+_MAX_START_POINTS = 5000  # points of a frame among which starts are tried
+_MAX_ARM_POINTS, _MAX_START_ARM_POINTS = 500, 150  # near the arm: for its offset, to see which start is best
+_START_CLOCK_STEP, _MAX_START_CLOCK_OFFSET = 0.04, 0.4  # starts: apart, and the furthest [s]
+_REACH_FACTORS = (1.0, 0.7, 0.5, 0.5)  # of the reach, from iteration to iteration
+_MIN_ON_ARM_FRACTION = 0.3  # of the points must lie on the arm, or they are something else
+_RESTART_MISFIT_RATIO = 1.5  # times the usual misfit, from which on other starts are tried
+_MAX_BETTER_START_RATIO = 0.8  # of the misfit at the common offset, below which another is believed
+_MIN_STAMP_ERROR = 0.02  # [s]; a stamp that is off by less is like the others
+_STAMP_ERROR_STDS = 4.0  # standard deviations
+_ARM_SHIFT_STD = 1e-3  # of the arm in one frame from where it should be by the calibration [m]
+_CORRELATED_GROUP_SIZE = 3.0  # points drawn at random have errors that are alike in groups of so many
+_MAD_TO_STD, _MIN_POINT_STD = 1.4826, 1e-3  # from the median of sizes; [m]
+_MAX_CLOCK_STEP = 0.05  # of an offset in one iteration [s]
 
 
 @dataclass(frozen=True)
@@ -98,19 +98,21 @@ def stamp_delay_beyond_clock_offset(
     the offset is looked for nearby only.
     """
     t, origin = float(state.stamps_to_joint_clock(stamp)), state.pose[:3, 3]
-    points = points[rng.permutation(len(points))[:_THIN]]
-    chosen = points[arm.is_near_moving_surface_off_grasps(points, t, 2 * _OFF_ARM_DISTANCE)][:_POINTS]
+    points = points[rng.permutation(len(points))[:_MAX_START_POINTS]]
+    chosen = points[arm.is_near_moving_surface_off_grasps(points, t, 2 * _OFF_ARM_DISTANCE)][:_MAX_ARM_POINTS]
     if len(chosen) < MIN_ARM_POINTS_PER_FRAME:
         return None
     trial = _nearby(arm, origin, t, chosen, 0.0)
-    if trial.mean_square_distance > _UNUSUAL * usual:
-        steps, few = round(_FURTHEST / _COARSE), chosen[:_FEW_POINTS]
-        grid = _COARSE * np.arange(-steps, steps + 1)
+    if trial.mean_square_distance > _RESTART_MISFIT_RATIO * usual:
+        steps, few = round(_MAX_START_CLOCK_OFFSET / _START_CLOCK_STEP), chosen[:_MAX_START_ARM_POINTS]
+        grid = _START_CLOCK_STEP * np.arange(-steps, steps + 1)
         met = [arm.match_points_to_surface(few, origin, t - delay, _OFF_ARM_DISTANCE, along=True) for delay in grid]
         start = float(grid[int(np.argmin([_mean_square(one.normal_distance, len(few)) for one in met]))])
-        if abs(start) > _LEAST_LATE:
+        if abs(start) > _MIN_STAMP_ERROR:
             other = _nearby(arm, origin, t, chosen, start)
-            trial = other if other.mean_square_distance < _CLEARLY * trial.mean_square_distance else trial
+            trial = (
+                other if other.mean_square_distance < _MAX_BETTER_START_RATIO * trial.mean_square_distance else trial
+            )
     return trial
 
 
@@ -118,21 +120,21 @@ def _nearby(arm: ArmSurface, origin: Array, t: float, points: Array, start: floa
     """The offset not far from a start, by Gauss and Newton's method within one reach after the other."""
     x = np.array([start, 0.0, 0.0, 0.0])
     hessian, sigma = np.zeros((4, 4)), _OFF_ARM_DISTANCE
-    for share in _NARROWING:
+    for share in _REACH_FACTORS:
         met = arm.match_points_to_surface(points + x[1:], origin, t - x[0], share * _OFF_ARM_DISTANCE, along=True)
         if len(met.normal_distance) < MIN_ARM_POINTS_PER_FRAME:
             break
-        sigma = max(_TO_SIGMA * float(np.median(np.abs(met.normal_distance))), _LEAST_SIGMA)
+        sigma = max(_MAD_TO_STD * float(np.median(np.abs(met.normal_distance))), _MIN_POINT_STD)
         slope = np.column_stack([met.normal_velocity, met.normal])
-        prior = np.array([0.0, *[_ALIKE * (sigma / _SHIFT_STD) ** 2] * 3])
+        prior = np.array([0.0, *[_CORRELATED_GROUP_SIZE * (sigma / _ARM_SHIFT_STD) ** 2] * 3])
         hessian = slope.T @ slope + np.diag(prior) + 1e-9 * np.eye(4)
         step = -np.linalg.solve(hessian, slope.T @ met.normal_distance + prior * x)
-        x += np.clip(step, -_LARGEST_CHANGE, _LARGEST_CHANGE)
+        x += np.clip(step, -_MAX_CLOCK_STEP, _MAX_CLOCK_STEP)
     error = arm.match_points_to_surface(points + x[1:], origin, t - x[0], _OFF_ARM_DISTANCE, along=True).normal_distance
-    on_arm = np.count_nonzero(np.abs(error) < _NARROWING[-1] * _OFF_ARM_DISTANCE)
+    on_arm = np.count_nonzero(np.abs(error) < _REACH_FACTORS[-1] * _OFF_ARM_DISTANCE)
     std = math.inf
-    if on_arm >= max(_SHARE * len(points), MIN_ARM_POINTS_PER_FRAME):
-        std = sigma * math.sqrt(_ALIKE * float(np.linalg.inv(hessian)[0, 0]))
+    if on_arm >= max(_MIN_ON_ARM_FRACTION * len(points), MIN_ARM_POINTS_PER_FRAME):
+        std = sigma * math.sqrt(_CORRELATED_GROUP_SIZE * float(np.linalg.inv(hessian)[0, 0]))
     return _StampDelay(float(x[0]), std, _mean_square(error, len(points)))
 
 
@@ -148,26 +150,26 @@ def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], 
         return [], 0.0
     delay, std, square = np.array(list(known.values())).T
     apart = np.abs(delay - weighted_median(delay, std**-2))
-    near = apart < np.maximum(_LEAST_LATE, _LATE * std)
+    near = apart < np.maximum(_MIN_STAMP_ERROR, _STAMP_ERROR_STDS * std)
     return [i for i, good in zip(known, near, strict=True) if good], float(np.median(square))
 
 
 def is_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) -> bool:
     """Whether a frame's time stamp is significantly late or early, beyond the offset common to all frames."""
-    return abs(own.delay) > max(options.max_stamp_delay, _LATE * own.std)
+    return abs(own.delay) > max(options.max_stamp_delay, _STAMP_ERROR_STDS * own.std)
 
 
-_LEAST_FRAMES, _START_FRAMES = 3, 6  # of a calibration, and in which starts are tried
-_STARTS = 4
-_ENOUGH = 0.9  # of the arm is where a start has led: others are not tried
-_WIDE = (0.08, 0.06, 0.045)  # reach of nearest surfaces, from stage to stage [m]
-_REACH = 0.035  # along the camera's rays [m]
-_ROUNDS, _LAST_ROUNDS = 3, 15
-_FEW, _MANY = 250, 700  # of them, near the arm
-_SETTLED = 1e-5  # of a step: [rad], [m], [s]
-_AROUND = 0.3  # of the directions to the arm that are looked at, to every side, as x/z and y/z
-_NOTED = 0.006  # displacement of the arm that is worth a word [m]
-_CONTRADICTED = 3.0  # standard deviations
+_MIN_FRAMES, _MAX_START_FRAMES = 3, 6  # of a calibration, and in which starts are tried
+_MAX_STARTS = 4
+_GOOD_START_FRACTION = 0.9  # of the arm is where a start has led: others are not tried
+_STAGE_REACHES = (0.08, 0.06, 0.045)  # reach of nearest surfaces, from stage to stage [m]
+_RAY_REACH = 0.035  # along the camera's rays [m]
+_STAGE_ITERATIONS, _LAST_STAGE_ITERATIONS = 3, 15
+_STAGE_POINTS, _LAST_STAGE_POINTS = 250, 700  # of them, near the arm
+_STEP_TOLERANCE = 1e-5  # of a step: [rad], [m], [s]
+_VIEW_MARGIN = 0.3  # of the directions to the arm that are looked at, to every side, as x/z and y/z
+_MIN_REPORTED_DISPLACEMENT = 0.006  # displacement of the arm that is worth a word [m]
+_CONTRADICTION_STDS = 3.0  # standard deviations
 
 
 @dataclass(frozen=True)
@@ -182,7 +184,7 @@ class CameraCalibrationOptions:
         ),
     ] = False
     n_frames: Annotated[
-        int, Ge(_LEAST_FRAMES), OptionInfo("so many, spread over the sequence, are compared with the arm")
+        int, Ge(_MIN_FRAMES), OptionInfo("so many, spread over the sequence, are compared with the arm")
     ] = 24
     rotation_prior_std: Annotated[
         PositiveFloat, OptionInfo("standard deviation of the told directions, about each axis", "rad")
@@ -309,20 +311,22 @@ class _Calibrator:
 
     def run(self, frames: Sequence[CalibrationFrame]) -> CameraCalibration:
         glimpses = [g for g in map(self._about_the_arm, frames) if g is not None]
-        if len(glimpses) < _LEAST_FRAMES:
-            needed = f"it is in view in {len(glimpses)} frames, {_LEAST_FRAMES} are needed"
+        if len(glimpses) < _MIN_FRAMES:
+            needed = f"it is in view in {len(glimpses)} frames, {_MIN_FRAMES} are needed"
             raise _UntoldError(needed, "turn the camera so that it sees the arm, or record for longer")
         state, chosen = self._start(glimpses), glimpses
         for _ in range(2):  # once more without the frames that were stamped late
-            state = self._rounds(state, chosen, _WIDE[-1], True, _FEW, _ROUNDS)[0]
-            state, found, used = self._rounds(state, chosen, _REACH, True, _MANY, _LAST_ROUNDS)
+            state = self._rounds(state, chosen, _STAGE_REACHES[-1], True, _STAGE_POINTS, _STAGE_ITERATIONS)[0]
+            state, found, used = self._rounds(
+                state, chosen, _RAY_REACH, True, _LAST_STAGE_POINTS, _LAST_STAGE_ITERATIONS
+            )
             placed = [(g.stamp, state.measured_to_world_points(g.points)) for g in used]
             own = [stamp_delay_beyond_clock_offset(self.arm, state, *seen, self.rng) for seen in placed]
             on_time, usual = _find_on_time_frames(own)
             chosen = [used[i] for i in on_time]
-            if len(chosen) < _LEAST_FRAMES:
+            if len(chosen) < _MIN_FRAMES:
                 raise _UntoldError("its frames do not agree on one time", "check the time stamps")
-        presence = surface_visibility(self.arm, chosen, state, _REACH)
+        presence = surface_visibility(self.arm, chosen, state, _RAY_REACH)
         free = presence.there + presence.through
         if not presence.there >= self.options.min_visible_fraction * free:
             seen = f"the camera sees through {100 * presence.through / max(free, 1e-9):.0f} % of its surface"
@@ -349,26 +353,30 @@ class _Calibrator:
         if len(own) < MIN_ARM_POINTS_PER_FRAME or not len(points):
             return None
         at, towards = points[:, :2] / points[:, 2:], own[:, :2] / own[:, 2:]
-        kept = points[((at > towards.min(axis=0) - _AROUND) & (at < towards.max(axis=0) + _AROUND)).all(axis=1)]
+        kept = points[
+            ((at > towards.min(axis=0) - _VIEW_MARGIN) & (at < towards.max(axis=0) + _VIEW_MARGIN)).all(axis=1)
+        ]
         return CalibrationFrame(glimpse.stamp, kept) if len(kept) >= MIN_ARM_POINTS_PER_FRAME else None
 
     def _start(self, glimpses: Sequence[CalibrationFrame]) -> CameraState:
         """The state near which most of the arm is where the camera sees something."""
         few = []
-        for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _START_FRAMES)).round():
+        for k in np.linspace(0, len(glimpses) - 1, min(len(glimpses), _MAX_START_FRAMES)).round():
             stamp, points = glimpses[int(k)].stamp, glimpses[int(k)].points
-            few.append(CalibrationFrame(stamp, self.rng.choice(points, min(len(points), _THIN), replace=False)))
-        tried = initial_camera_states(self.arm, few, self.told, self.clock.search_half_width, _STARTS)
+            few.append(
+                CalibrationFrame(stamp, self.rng.choice(points, min(len(points), _MAX_START_POINTS), replace=False))
+            )
+        tried = initial_camera_states(self.arm, few, self.told, self.clock.search_half_width, _MAX_STARTS)
         if not tried:
             raise _UntoldError("it is hardly in view", "turn the camera so that it sees more of the arm")
         best, most = tried[0], -1.0
         for trial in tried:
-            for reach in _WIDE:
-                trial = self._rounds(trial, few, reach, False, _FEW, _ROUNDS)[0]
-            presence = surface_visibility(self.arm, few, trial, 0.5 * _REACH)
+            for reach in _STAGE_REACHES:
+                trial = self._rounds(trial, few, reach, False, _STAGE_POINTS, _STAGE_ITERATIONS)[0]
+            presence = surface_visibility(self.arm, few, trial, 0.5 * _RAY_REACH)
             if presence.there - presence.through > most:
                 best, most = trial, presence.there - presence.through
-            if most > _ENOUGH:
+            if most > _GOOD_START_FRACTION:
                 break
         return best
 
@@ -385,7 +393,7 @@ class _Calibrator:
                 near = self.rng.choice(near, most, replace=False)
             if len(near) >= MIN_ARM_POINTS_PER_FRAME:
                 chosen.append(CalibrationFrame(glimpse.stamp, glimpse.points[near]))
-        if len(chosen) < _LEAST_FRAMES:
+        if len(chosen) < _MIN_FRAMES:
             hint = "check the told pose and the unit of the clouds"
             raise _UntoldError("what the camera sees does not lie on it", hint)
 
@@ -398,7 +406,7 @@ class _Calibrator:
             pull = gradient + self.precision @ state.difference_from(self.told)
             step = np.asarray(-np.linalg.solve(hessian + self.precision, pull), float)
             state = state.with_state_increment(step)
-            if np.abs(step).max() < _SETTLED:
+            if np.abs(step).max() < _STEP_TOLERANCE:
                 break
         return state, cost(state), chosen
 
@@ -413,14 +421,14 @@ class _Calibrator:
         points = self.arm.visible_surface_points(state, stamp)[0].mean(axis=0, keepdims=True)
         away = np.linalg.norm(state.measured_to_world_points(self.told.world_to_measured_points(points)) - points)
         change = state.difference_from(self.told)
-        if away > _NOTED and self.options.fix_pose:
+        if away > _MIN_REPORTED_DISPLACEMENT and self.options.fix_pose:
             slopes = state.world_point_jacobian_by_pose_and_depth(points)[0]
             spread = slopes @ covariance[:CLOCK_OFFSET_INDEX, :CLOCK_OFFSET_INDEX] @ slopes.T
             gap = slopes @ change[:CLOCK_OFFSET_INDEX]
-            if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTED**2 * 3:
+            if float(gap @ np.linalg.solve(spread + 1e-6 * np.eye(3), gap)) > _CONTRADICTION_STDS**2 * 3:
                 off = f"it is seen {1e3 * away:.0f} mm from where the joints have it"
                 words.append(f"the arm contradicts the pose that is kept: {off}, which the standard deviations count")
-        elif away > _NOTED:
+        elif away > _MIN_REPORTED_DISPLACEMENT:
             turn, shift = (float(np.linalg.norm(change[part])) for part in (ROTATION_SLICE, TRANSLATION_SLICE))
             off = f"the told camera sees the arm {1e3 * away:.0f} mm from where the joints have it: turned by"
             moved = f"{math.degrees(turn):.1f} degrees, shifted by {1e3 * shift:.0f} mm"

@@ -44,21 +44,21 @@ DEPTH_SCALE_INDEX, DEPTH_OFFSET_INDEX, CLOCK_OFFSET_INDEX, CLOCK_DRIFT_INDEX = 6
 CAMERA_STATE_SIZE, MIN_ARM_POINTS_PER_FRAME = 10, 40
 
 # through which the robot's visible surface is sampled
-_LOOK = CameraIntrinsics.from_field_of_view(160, 120, math.radians(80.0))
-_SAMPLES = 150  # of it, in every frame
-_CELL = 0.02  # of the field of distances in which starts are tried [m]
-_SIDEWAYS, _AHEAD, _EVERY = 12, 10, 2  # cells to either side of starts tried, and between them
+_START_INTRINSICS = CameraIntrinsics.from_field_of_view(160, 120, math.radians(80.0))
+_SURFACE_SAMPLES = 150  # of it, in every frame
+_GRID_CELL_SIZE = 0.02  # of the field of distances in which starts are tried [m]
+_SIDEWAYS_CELLS, _FORWARD_CELLS, _CELL_STRIDE = 12, 10, 2  # cells to either side of starts tried, and between them
 _CLOCK_STEP = 0.08  # between starts of the clock [s]
-_CAPTURE = 0.06  # how near to the cloud a start must bring the surface [m]
-_HIDDEN = 0.5  # cost of a sample out of view, of that of one without a point near it
-_APART = 0.08  # starts nearer together are one [m]
-_GRAZING = 0.3  # cosine of ray and normal below which a point says little
-_STEP = 0.01  # over which velocities are taken [s]
-_PATCH = 0.08  # of a link, over which its mesh is alike wrong [m]
-_TO_SIGMA = 1.4826
-_CUT = 2.5  # scale of the robust sum in standard deviations
-_LEAST_SIGMA = 1e-3  # [m]
-_LEAST_CURVATURE = 0.2  # of the robust sum, of that of its weights
+_MAX_START_DISTANCE = 0.06  # how near to the cloud a start must bring the surface [m]
+_HIDDEN_SAMPLE_COST = 0.5  # cost of a sample out of view, of that of one without a point near it
+_MIN_START_SEPARATION = 0.08  # starts nearer together are one [m]
+_MIN_INCIDENCE_COSINE = 0.3  # cosine of ray and normal below which a point says little
+_VELOCITY_TIME_STEP = 0.01  # over which velocities are taken [s]
+_MESH_ERROR_PATCH_SIZE = 0.08  # of a link, over which its mesh is alike wrong [m]
+_MAD_TO_STD = 1.4826
+_ROBUST_SCALE_STDS = 2.5  # scale of the robust sum in standard deviations
+_MIN_POINT_STD = 1e-3  # [m]
+_MIN_CURVATURE_FRACTION = 0.2  # of the robust sum, of that of its weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +164,9 @@ class ArmSurface:
     def visible_surface_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
         """Points of moving surfaces that the camera sees if nothing is before the robot, in the world; their parts."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
-        depth, cosine, part = self.robot_surfaces.render_depth_image(_LOOK, state.pose, q)
-        seen = np.isfinite(depth) & (cosine > _GRAZING) & (part >= 0) & self._moving[part]
-        points = _LOOK.pixel_rays_at_unit_depth[seen] * depth[seen][:, None]
+        depth, cosine, part = self.robot_surfaces.render_depth_image(_START_INTRINSICS, state.pose, q)
+        seen = np.isfinite(depth) & (cosine > _MIN_INCIDENCE_COSINE) & (part >= 0) & self._moving[part]
+        points = _START_INTRINSICS.pixel_rays_at_unit_depth[seen] * depth[seen][:, None]
         return points @ state.pose[:3, :3].T + state.pose[:3, 3], part[seen]
 
     def is_near_moving_surface_off_grasps(self, points: Array, t: float, within: float) -> BoolArray:
@@ -188,15 +188,17 @@ class ArmSurface:
             square = -np.einsum("ij,ij->i", normal, ahead)
             with np.errstate(invalid="ignore"):  # of rays that meet nothing
                 error = (distance - 1.0) * square  # n . (P - (origin + d (P - origin)))
-            kept = (square > _GRAZING * np.linalg.norm(ahead, axis=1)) & (np.abs(error) < reach)
+            kept = (square > _MIN_INCIDENCE_COSINE * np.linalg.norm(ahead, axis=1)) & (np.abs(error) < reach)
         else:
             error, normal, part = self.robot_surfaces.nearest_moving_surface(points, q, reach)
             kept = np.ones(len(points), bool)
         chosen = np.flatnonzero(kept & (part >= 0) & self._moving[part])
-        behind, now, later = (self.part_poses_at(t + d)[part[chosen]] for d in (-_STEP, 0.0, _STEP))
+        behind, now, later = (
+            self.part_poses_at(t + d)[part[chosen]] for d in (-_VELOCITY_TIME_STEP, 0.0, _VELOCITY_TIME_STEP)
+        )
         local = np.einsum("nji,nj->ni", now[:, :3, :3], points[chosen] - now[:, :3, 3])
         moved = np.einsum("nij,nj->ni", later[:, :3, :3] - behind[:, :3, :3], local)
-        velocity = (moved + later[:, :3, 3] - behind[:, :3, 3]) / (2 * _STEP)
+        velocity = (moved + later[:, :3, 3] - behind[:, :3, 3]) / (2 * _VELOCITY_TIME_STEP)
         rate = np.einsum("ni,ni->n", normal[chosen], velocity)
         return _SurfaceMatches(chosen, error[chosen], normal[chosen], rate, part[chosen], local)
 
@@ -212,7 +214,7 @@ class ArmSurface:
         # a later offset takes the surface back along its velocity, away from the point
         slope[:, CLOCK_OFFSET_INDEX] = met.normal_velocity
         slope[:, CLOCK_DRIFT_INDEX] = met.normal_velocity * (glimpse.stamp - state.clock_reference_stamp)
-        patch = np.column_stack([met.part, np.floor(met.part_coordinates / _PATCH).astype(np.int64)])
+        patch = np.column_stack([met.part, np.floor(met.part_coordinates / _MESH_ERROR_PATCH_SIZE).astype(np.int64)])
         return _CalibrationEquations(slope, met.normal_distance, patch)
 
 
@@ -256,8 +258,8 @@ class RobustCostQuadraticModel:
 def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostQuadraticModel:
     """Quadratic model of the robust cost over all points of all frames, scaled by their median error."""
     jacobian, residuals, patches = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    sigma = max(_TO_SIGMA * float(np.median(np.abs(residuals))) if len(residuals) else reach, _LEAST_SIGMA)
-    square = (residuals / min(_CUT * sigma, reach)) ** 2
+    sigma = max(_MAD_TO_STD * float(np.median(np.abs(residuals))) if len(residuals) else reach, _MIN_POINT_STD)
+    square = (residuals / min(_ROBUST_SCALE_STDS * sigma, reach)) ** 2
     weight = 1 / (1 + square) ** 2 / sigma**2
     scores = jacobian * (weight * residuals)[:, None]
     bent, blocks = float((weight * (1 - 3 * square) / (1 + square)).sum()), np.zeros((CAMERA_STATE_SIZE,) * 2)
@@ -271,7 +273,7 @@ def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -
 
         both = summed(frame * (patch.max() + 1) + patch)
         blocks = _at_least(both, summed(frame) + summed(patch) - both)
-    curvature = max(bent / max(float(weight.sum()), 1e-12), _LEAST_CURVATURE)
+    curvature = max(bent / max(float(weight.sum()), 1e-12), _MIN_CURVATURE_FRACTION)
     hessian = jacobian.T @ (weight[:, None] * jacobian)
     return RobustCostQuadraticModel(scores.sum(axis=0), hessian, curvature, blocks)
 
@@ -289,11 +291,12 @@ def initial_camera_states(
 ) -> list[CameraState]:
     """Candidate camera states at which the arm's visible surface lies on the clouds, best first.
 
-    So many at most, at least `_APART` from one another, with clock offsets up to `search` [s] from the told one.
+    So many at most, at least `_MIN_START_SEPARATION` from one another, with clock offsets up to `search` [s] from the
+    told one.
     """
     steps = math.ceil(search / _CLOCK_STEP)
     delays = np.linspace(-search, search, 2 * steps + 1) if steps else np.zeros(1)
-    sides, ahead = (np.arange(-n, n + 1, _EVERY) for n in (_SIDEWAYS, _AHEAD))
+    sides, ahead = (np.arange(-n, n + 1, _CELL_STRIDE) for n in (_SIDEWAYS_CELLS, _FORWARD_CELLS))
     cells = np.stack(np.meshgrid(sides, sides, ahead, indexing="ij"), axis=-1).reshape(-1, 3)
     total = np.zeros((len(delays), len(cells)))
     for glimpse in glimpses:
@@ -303,12 +306,12 @@ def initial_camera_states(
         delay, cell = np.unravel_index(index, total.shape)
         change = np.zeros(CAMERA_STATE_SIZE)
         # the cloud has to go where the surface was, and the surface went along the cells
-        change[TRANSLATION_SLICE] = -told.pose[:3, :3] @ (_CELL * cells[cell])
+        change[TRANSLATION_SLICE] = -told.pose[:3, :3] @ (_GRID_CELL_SIZE * cells[cell])
         change[CLOCK_OFFSET_INDEX] = delays[delay]
         trial = told.with_state_increment(change)
         between = [trial.difference_from(other) for other in result]
         apart = [np.linalg.norm(d[TRANSLATION_SLICE]) + 0.5 * abs(d[CLOCK_OFFSET_INDEX]) for d in between]
-        if min(apart, default=math.inf) >= _APART:
+        if min(apart, default=math.inf) >= _MIN_START_SEPARATION:
             result.append(trial)
         if len(result) == most:
             break
@@ -328,25 +331,25 @@ def _add_costs(
     chosen = np.flatnonzero(((towards >= view[0]) & (towards <= view[1])).all(axis=1))
     if len(chosen) < MIN_ARM_POINTS_PER_FRAME:
         return
-    chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SAMPLES)).astype(np.int64)]
+    chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), _SURFACE_SAMPLES)).astype(np.int64)]
     points, part, own = points[chosen], part[chosen], own[chosen]
     # a field of distances with room for the shifts, and for the arm's own way
-    edge = np.array([_SIDEWAYS, _SIDEWAYS, _AHEAD])
-    margin = _CELL * (edge + 2) + 0.2
+    edge = np.array([_SIDEWAYS_CELLS, _SIDEWAYS_CELLS, _FORWARD_CELLS])
+    margin = _GRID_CELL_SIZE * (edge + 2) + 0.2
     low = own.min(axis=0) - margin
-    shape = np.ceil((own.max(axis=0) + margin - low) / _CELL).astype(int) + 1
-    cell = np.floor((glimpse.points - low) / _CELL).astype(int)
+    shape = np.ceil((own.max(axis=0) + margin - low) / _GRID_CELL_SIZE).astype(int) + 1
+    cell = np.floor((glimpse.points - low) / _GRID_CELL_SIZE).astype(int)
     cell = cell[((cell >= 0) & (cell < shape)).all(axis=1)]
     if not len(cell):
         return
     empty = np.ones(shape, bool)
     empty[tuple(cell.T)] = False
-    x, y, z = (low[axis] + _CELL * (np.arange(shape[axis]) + 0.5) for axis in range(3))
-    depth = np.maximum(z, _CELL)
+    x, y, z = (low[axis] + _GRID_CELL_SIZE * (np.arange(shape[axis]) + 0.5) for axis in range(3))
+    depth = np.maximum(z, _GRID_CELL_SIZE)
     u, v = x[:, None, None] / depth, y[:, None] / depth
     outside = (u < view[0, 0]) | (u > view[1, 0]) | (v < view[0, 1]) | (v > view[1, 1])
-    distance = np.minimum(distance_transform_edt(empty, sampling=_CELL), _CAPTURE)
-    flat = np.where(outside, _HIDDEN, (distance / _CAPTURE) ** 2).astype(np.float32).ravel()
+    distance = np.minimum(distance_transform_edt(empty, sampling=_GRID_CELL_SIZE), _MAX_START_DISTANCE)
+    flat = np.where(outside, _HIDDEN_SAMPLE_COST, (distance / _MAX_START_DISTANCE) ** 2).astype(np.float32).ravel()
     t = float(told.stamps_to_joint_clock(glimpse.stamp))
     before = arm.part_poses_at(t)[part]
     local = np.einsum("nji,nj->ni", before[:, :3, :3], points - before[:, :3, 3])
@@ -354,7 +357,7 @@ def _add_costs(
     for row, delay in zip(total, delays, strict=True):
         then = arm.part_poses_at(t - delay)[part]
         own = told.world_to_measured_points(np.einsum("nij,nj->ni", then[:, :3, :3], local) + then[:, :3, 3])
-        index = np.clip(np.floor((own - low) / _CELL).astype(np.int64), edge, shape - 1 - edge)
+        index = np.clip(np.floor((own - low) / _GRID_CELL_SIZE).astype(np.int64), edge, shape - 1 - edge)
         row += flat[(index @ strides)[None, :] + (cells @ strides)[:, None]].mean(axis=1)
 
 

@@ -43,12 +43,12 @@ from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 _Left = tuple[BoolArray, BoolArray]
 """Which of a frame's nodes and points count."""
 _NODE_RADIUS_FRACTION = math.pi / 4  # of a tube's, at which the mean of its visible half lies from its axis
-_SIGMAS = 3.0  # of a point, beyond which an end stands elsewhere than the shape has it
-_NEAR = 3.0  # times the last scale, beyond which a point says nothing of the shape
-_TOUCHING = 1e-3  # [m]
-_LEAST_STIFFNESS = 1e-2  # of the mean; softer bends are still held this much
-_LOOSE = 1e-2  # [1/m, 1/rad]; holds what no point tells, such as a straight rope's turn about itself
-_TOLERANCE = 1e-4  # of a bend [rad] and, relative, of the cost, at which a pass ends
+_END_OFFSET_STDS = 3.0  # of a point, beyond which an end stands elsewhere than the shape has it
+_MAX_POINT_DISTANCE_SCALES = 3.0  # times the last scale, beyond which a point says nothing of the shape
+_TOUCHING_DISTANCE = 1e-3  # [m]
+_MIN_STIFFNESS_FRACTION = 1e-2  # of the mean; softer bends are still held this much
+_WEAK_REGULARISATION = 1e-2  # [1/m, 1/rad]; holds what no point tells, such as a straight rope's turn about itself
+_PASS_TOLERANCE = 1e-4  # of a bend [rad] and, relative, of the cost, at which a pass ends
 
 
 @dataclass(frozen=True)
@@ -135,8 +135,8 @@ class ShapeFitter:
             self.rest_configuration[tree.joint_index(entry.joint_name)] = number(entry.rest_angle)
         stiffness = np.array([number(entry.stiffness) for entry in bends])
         typical = stiffness.mean() if stiffness.max() > 0 else 1.0
-        held_by = np.sqrt(np.maximum(stiffness / typical, _LEAST_STIFFNESS)) / self.options.bend_prior_std
-        self._prior = np.concatenate([held_by, np.full(len(loose), _LOOSE)])
+        held_by = np.sqrt(np.maximum(stiffness / typical, _MIN_STIFFNESS_FRACTION)) / self.options.bend_prior_std
+        self._prior = np.concatenate([held_by, np.full(len(loose), _WEAK_REGULARISATION)])
         sought = {*(entry.joint_name for entry in system.elastic_joints), *loose}
         self.recorded_joint_names = tuple(name for name in tree.joint_names if name not in sought)
 
@@ -174,7 +174,7 @@ class ShapeFitter:
         # links after which nothing comes
         places = np.array(ca.Function("held", [q], [taken])(self.rest_configuration)).reshape(-1, 3)
         apart = np.linalg.norm(at_rest[:, 1][:, None] - np.concatenate([at_rest[:, 0], places]), axis=2).min(axis=1)
-        self.free_end_links = tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING))
+        self.free_end_links = tuple(int(k) for k in np.flatnonzero(apart > _TOUCHING_DISTANCE))
 
     def _links_at(self, q: Array) -> Array:
         """Start and end of every link, shape (K, 2, 3) [m]."""
@@ -278,7 +278,7 @@ class ShapeFitter:
     @property
     def max_informative_surface_distance(self) -> float:
         """Distance from the surface beyond which a point says nothing of the shape [m]."""
-        return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _NEAR
+        return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _MAX_POINT_DISTANCE_SCALES
 
     def _tasks(
         self, sight: ProcessedFrameCloud, at_nodes: BoolArray, at_points: BoolArray
@@ -307,8 +307,8 @@ class ShapeFitter:
                 about,
                 end.q[list(self.free_joints)],
                 max_iterations=most,
-                step_tolerance=_TOLERANCE,
-                cost_tolerance=_TOLERANCE,
+                step_tolerance=_PASS_TOLERANCE,
+                cost_tolerance=_PASS_TOLERANCE,
             )
             end = _Minimum(self._with_free(end.q, found.x), found.final_model.hessian, found.final_model.cost)
         return end
@@ -331,15 +331,15 @@ class ShapeFitter:
         for rival in rivals:
             moved = np.maximum(np.abs(moved), np.abs(self.points_at(rival) - places))
         corners = self._links_at(q)
-        touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING
+        touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING_DISTANCE
         # the spread across the links about each point
         across = shape_evidence.across_links(corners, sight.camera_position)
         wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across)
         swath = np.max(np.where(touching[..., None], wide[:, None], 0.0), axis=0)
         off_end, noise = np.zeros(places.shape), max(self.options.surface_noise_std, evidence.noise_std)
         for k, offset in zip(self.free_end_links, evidence.end_offsets, strict=True):
-            if abs(offset) > _SIGMAS * noise:
-                at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING
+            if abs(offset) > _END_OFFSET_STDS * noise:
+                at_end = np.linalg.norm(places - corners[k, 1], axis=1) < _TOUCHING_DISTANCE
                 off_end[at_end] = offset * shape_evidence.link_axes(corners)[k]
         # a point is seen where a link that begins or ends there is, of a tube that is where it should be
         sure = evidence.covered_fraction >= self.options.min_link_coverage

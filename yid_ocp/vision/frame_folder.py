@@ -29,9 +29,9 @@ _CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".xyz")
 _DEPTH_IMAGE_SUFFIX = ".png"
 _POINTS_ARRAY, _COLOURS_ARRAY = "points", "colours"  # of an NPZ file
 _PCD_HEADER_BYTES = 10_000  # [bytes]; where a PCD file says how many points it has
-_COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
+_PCD_POINT_COUNT = re.compile(rb"^POINTS\s+(\d{1,18})\b", re.MULTILINE)
 _MAX_FRAME_BYTES = 1 << 28  # of one cloud or image
-_AGAIN = "copy or record it again"
+_COPY_AGAIN_HINT = "copy or record it again"
 
 
 _Cloud = tuple[Array, ColourArray | None]
@@ -59,7 +59,9 @@ def _read_npz(path: Path) -> _Cloud:
         with np.load(path, allow_pickle=False) as held:
             arrays: dict[str, Any] = {name: held[name] for name in (_POINTS_ARRAY, _COLOURS_ARRAY) if name in held}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, MemoryError) as error:
-        raise DataError(f"the cloud is damaged ({error})", where=str(path), allowed=allowed, hint=_AGAIN) from error
+        raise DataError(
+            f"the cloud is damaged ({error})", where=str(path), allowed=allowed, hint=_COPY_AGAIN_HINT
+        ) from error
     points, colours = arrays.get(_POINTS_ARRAY), arrays.get(_COLOURS_ARRAY)
     if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         raise DataError(f"the file has no array `{_POINTS_ARRAY}` of points", where=str(path), allowed=allowed)
@@ -85,17 +87,17 @@ def _read_xyz(path: Path) -> _Cloud:
 def _read_pcd(path: Path) -> _Cloud:
     o3d = import_open3d()
     with path.open("rb") as file:
-        declared = _COUNT.search(file.read(_PCD_HEADER_BYTES))
+        declared = _PCD_POINT_COUNT.search(file.read(_PCD_HEADER_BYTES))
     if declared is not None and int(declared[1]) > path.stat().st_size:  # each takes several bytes
         what = f"the cloud is damaged: it declares {int(declared[1]):.3g} points in {path.stat().st_size} bytes"
-        raise DataError(what, where=str(path), hint=_AGAIN)
+        raise DataError(what, where=str(path), hint=_COPY_AGAIN_HINT)
     # Open3D says what is wrong on the standard output and returns an empty cloud
     try:
         with files.limited_memory(), o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
             cloud = o3d.io.read_point_cloud(str(path))
     except (MemoryError, RuntimeError) as error:
         what = f"the cloud is damaged: it declares more points than fit into memory ({error})"
-        raise DataError(what, where=str(path), hint=_AGAIN) from error
+        raise DataError(what, where=str(path), hint=_COPY_AGAIN_HINT) from error
     colours = np.rint(255 * np.asarray(cloud.colors)).astype(np.uint8) if cloud.has_colors() else None
     return np.asarray(cloud.points, dtype=np.float64), colours
 
@@ -115,13 +117,13 @@ def _read_depth_image(path: Path) -> Array:
 
 
 _MAX_HEADER_BYTES = 100_000  # a longer head is none
-_TYPES = {
+_NUMPY_TYPES = {
     **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
 _AXIS_PROPERTIES, _COLOUR_PROPERTIES = ("x", "y", "z"), ("red", "green", "blue")
-_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _Element = tuple[str, int, list[tuple[str, str]]]
 """A table of a PLY file: its name, its number of rows, its columns with NumPy's names of their types, "" for lists."""
 
@@ -146,7 +148,7 @@ def _read_ply(path: Path, coloured: bool) -> _Cloud:
 
 
 def _damaged(path: Path, why: str) -> DataError:
-    return DataError(f"the cloud is empty or cannot be read: {why}", where=str(path), hint=_AGAIN)
+    return DataError(f"the cloud is empty or cannot be read: {why}", where=str(path), hint=_COPY_AGAIN_HINT)
 
 
 def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
@@ -157,14 +159,14 @@ def _head(path: Path, text: str) -> tuple[str, list[_Element]]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 continue
-            case ["format", name, _] if name in _ORDERS:
-                order = _ORDERS[name]
+            case ["format", name, _] if name in _BYTE_ORDERS:
+                order = _BYTE_ORDERS[name]
             case ["element", name, count] if count.isascii() and count.isdigit() and len(count) <= 18:
                 found.append((name, int(count), []))
             case ["property", "list", _, _, name] if found:
                 found[-1][2].append((name, ""))
-            case ["property", kind, name] if found and kind in _TYPES:
-                found[-1][2].append((name, _TYPES[kind]))
+            case ["property", kind, name] if found and kind in _NUMPY_TYPES:
+                found[-1][2].append((name, _NUMPY_TYPES[kind]))
             case _:
                 raise _damaged(path, f"its head says {line[:60]!r}")
     if order is None:
@@ -181,7 +183,7 @@ def _vertices(
     size = sum(np.dtype(kind).itemsize for kind in kinds) if order else 2 * len(names)
     if count * size > len(body) + (not order):  # the last line of a text may end without a newline
         what = f"the cloud is damaged: it declares {count:.3g} points in {len(body)} bytes"
-        raise DataError(what, where=str(path), hint=_AGAIN)
+        raise DataError(what, where=str(path), hint=_COPY_AGAIN_HINT)
     if not count:
         raise _damaged(path, "it has no vertices")
     wanted = [*_AXIS_PROPERTIES, *(_COLOUR_PROPERTIES if coloured and set(_COLOUR_PROPERTIES) <= set(names) else ())]
@@ -202,7 +204,7 @@ def _vertices(
 _FRAMES_FORMAT = "yid-frames/1"
 _CAMERA_FILE, STAMP_FILE = "camera.json", "timestamps.csv"
 _METRES_PER_UNIT: Mapping[str, float] = {"m": 1.0, "mm": 1e-3}
-_KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_unit", "description")
+_CAMERA_FILE_KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_unit", "description")
 
 
 def read_frame_folder(
@@ -280,8 +282,8 @@ def _read_camera(path: Path) -> dict[str, Any]:
     head = files.read_input_json(path)
     if not isinstance(head, dict):
         raise DataError("the camera's file is not an object", where=str(path), allowed='{"pose": ..., ...}')
-    for key in (key for key in head if key not in _KEYS):
-        raise DataError(f"unknown key '{key}'", where=str(path), **unknown_name_details(key, _KEYS))
+    for key in (key for key in head if key not in _CAMERA_FILE_KEYS):
+        raise DataError(f"unknown key '{key}'", where=str(path), **unknown_name_details(key, _CAMERA_FILE_KEYS))
     if head.get("format", _FRAMES_FORMAT) != _FRAMES_FORMAT:
         raise DataError(f"the format of the frames is '{head['format']}'", where=str(path), allowed=_FRAMES_FORMAT)
     return head

@@ -123,9 +123,9 @@ class TrackOptions:
 
 
 _NO_FIT, _END_ELSEWHERE = "the shape does not fit", "an end is not where its gripper is"
-_MISFITS = (_NO_FIT, _END_ELSEWHERE)
-_MOST_NOTES = 4  # in a hint
-_MEAN_ABS = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviations
+_MISFIT_REASONS = (_NO_FIT, _END_ELSEWHERE)
+_MAX_NOTES = 4  # in a hint
+_MEAN_ABS_DEVIATION = math.sqrt(2.0 / math.pi)  # of a normal variable, in standard deviations
 
 
 def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: TrackOptions) -> str:
@@ -134,7 +134,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
         return "the fit failed"
     # a mean distance of normal noise is 0.8 of its standard deviation
     widest, noise = options.max_distance_in_radii * float(shape.link_radii.mean()), shape.options.surface_noise_std
-    limit = math.hypot(widest, _MEAN_ABS * noise)
+    limit = math.hypot(widest, _MEAN_ABS_DEVIATION * noise)
     if not math.isfinite(fit.mean_distance):
         return f"{_NO_FIT}: no point of the cloud is near it"
     if fit.mean_distance > limit:
@@ -224,7 +224,7 @@ def _none_good(
         f"{'for example ' if len(set(reasons)) > 1 else ''}{reasons[0]} ({len(reasons)} of {len(frames)})"
         for reasons in often
     )
-    cause = _because(sizes, bool(often) and often[0][0].startswith(_MISFITS))
+    cause = _because(sizes, bool(often) and often[0][0].startswith(_MISFIT_REASONS))
     hint = "check the camera's pose, the unit of the clouds and the filters, and look at the pictures of a frame"
     hint = "say in camera.json that the unit is mm" if "metres" in listed else _hint(sizes, things, hint)
     return DataError(f"{cause}not one frame could be used: {listed}", where=source, hint=hint)
@@ -238,15 +238,17 @@ def _because(sizes: TubeDimensionCheck, matters: bool) -> str:
 def _hint(sizes: TubeDimensionCheck, things: Sequence[ForeignObject], otherwise: str) -> str:
     """What is known to be wrong with the object or stands about it comes before general advice."""
     notes = [*sizes.messages, *(thing.text for thing in things)]
-    return "; ".join([*notes[:_MOST_NOTES], otherwise])
+    return "; ".join([*notes[:_MAX_NOTES], otherwise])
 
 
-_TOUCHING = 1e-3  # [m]
-_APART = 4.0  # parts of an object nearer than so many radii along it cannot help being near each other
-_MOST = 400  # places along a shape that are compared
-_CLEARLY = 2.0  # times
-_SAME = 0.1  # of the length between the ends, within which roots are the same
-_HANGING = 0.2  # of the length between the ends, by which one is higher
+_TOUCHING_DISTANCE = 1e-3  # [m]
+_MIN_CROSSING_SEPARATION_RADII = (
+    4.0  # parts of an object nearer than so many radii along it cannot help being near each other
+)
+_MAX_SHAPE_STATIONS = 400  # places along a shape that are compared
+_FIXED_ROOT_MOTION_RATIO = 2.0  # times
+_SAME_ROOT_FRACTION = 0.1  # of the length between the ends, within which roots are the same
+_HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends, by which one is higher
 
 
 def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
@@ -274,11 +276,11 @@ def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOption
     above = float(np.median(roots[:, 2] - tips[:, 2]))
     between = float(np.median(np.linalg.norm(roots - tips, axis=1)))
     own = float(np.median(np.linalg.norm(roots - _ends(made[k].alternative_fit for k in two)[0], axis=1)))
-    if own < _SAME * between:
+    if own < _SAME_ROOT_FRACTION * between:
         other, said = False, "branches that are alike were followed from frame to frame, which is which is not known"
-    elif options.root_placement == "fixed" and max(moving) > _CLEARLY * min(moving):
+    elif options.root_placement == "fixed" and max(moving) > _FIXED_ROOT_MOTION_RATIO * min(moving):
         other, said = moving[0] > moving[1], "it is the end that stays in its place"
-    elif abs(above) > _HANGING * between:
+    elif abs(above) > _HANGING_HEIGHT_FRACTION * between:
         other, said = above < 0, "it is the higher end"
     else:
         other, said = False, "either end may be it, one was taken: approximate_root_position says which"
@@ -321,18 +323,18 @@ def is_shape_self_touching(centre_line: Array, radius: Array) -> bool:
     """Whether a shape of links (K, 2, 3) and radii (K,) [m] touches itself at parts that are far apart along it."""
     corners = centre_line.reshape(-1, 3)
     near = np.linalg.norm(corners[:, None] - corners, axis=2)
-    edges = np.where(near < _TOUCHING, 1e-6, 0.0)  # zero is no way
+    edges = np.where(near < _TOUCHING_DISTANCE, 1e-6, 0.0)  # zero is no way
     lengths = np.linalg.norm(centre_line[:, 1] - centre_line[:, 0], axis=1)
     starts = 2 * np.arange(len(centre_line))
     edges[starts, starts + 1] = edges[starts + 1, starts] = lengths
     along = shortest_path(edges, directed=False)
-    spacing = max(float(radius.min()), float(lengths.sum()) / _MOST)
+    spacing = max(float(radius.min()), float(lengths.sum()) / _MAX_SHAPE_STATIONS)
     link = np.repeat(np.arange(len(lengths)), np.ceil(lengths / spacing).astype(np.int64) + 1)
     share = np.concatenate([np.linspace(0.0, 1.0, np.count_nonzero(link == k)) for k in range(len(lengths))])
     places = centre_line[link, 0] + share[:, None] * (centre_line[link, 1] - centre_line[link, 0])
     to = [share * lengths[link], (1 - share) * lengths[link]]  # each end of its link
     ways = [along[np.ix_(2 * link + a, 2 * link + b)] + to[a][:, None] + to[b] for a in (0, 1) for b in (0, 1)]
     reach = radius[link][:, None] + radius[link]
-    far = (np.min(ways, axis=0) > _APART * reach) & (link[:, None] != link)
+    far = (np.min(ways, axis=0) > _MIN_CROSSING_SEPARATION_RADII * reach) & (link[:, None] != link)
     apart = np.linalg.norm(places[:, None] - places, axis=2)
     return bool((far & (apart < reach)).any())

@@ -34,8 +34,8 @@ ColourArray = NDArray[np.uint8]
 
 _DISTORTION_COEFFICIENT_COUNTS = {"plumb_bob": (4, 5), "rational_polynomial": (8,), "equidistant": (4,)}
 """Models of distortion, and how many coefficients each may have: k1, k2, p1, p2, k3 (k4, k5, k6), or k1 to k4."""
-_STEPS = 30  # of the search for a pixel's direction
-_CLOSE = 1e-3  # [pixels]
+_MAX_UNDISTORTION_STEPS = 30  # of the search for a pixel's direction
+_UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def _straightened(lens: CameraIntrinsics, aim_x: Array, aim_y: Array) -> tuple[A
         bent = np.maximum(np.hypot(aim_x, aim_y), 1e-9)
         x, y = (aim * np.tan(np.minimum(bent, 1.5)) / bent for aim in (aim_x, aim_y))
     with np.errstate(all="ignore"):
-        for _ in range(_STEPS):
+        for _ in range(_MAX_UNDISTORTION_STEPS):
             at_x, at_y = lens._distort(x, y)
             right_x, right_y = lens._distort(x + h, y)
             down_x, down_y = lens._distort(x, y + h)
@@ -139,7 +139,7 @@ def _straightened(lens: CameraIntrinsics, aim_x: Array, aim_y: Array) -> tuple[A
         seen_x, seen_y = lens._distort(x, y)
         off = np.hypot((seen_x - aim_x) * lens.fx, (seen_y - aim_y) * lens.fy)
         # beyond where a formula turns back, its other solutions are behind the edge or mirrored
-        good = (off < _CLOSE) & (turn > 0) & (x * aim_x + y * aim_y >= 0)
+        good = (off < _UNDISTORTION_TOLERANCE) & (turn > 0) & (x * aim_x + y * aim_y >= 0)
     return np.where(good, x, np.nan), np.where(good, y, np.nan)
 
 
@@ -220,14 +220,17 @@ def validated_camera_pose(pose: ArrayLike | None, where: str) -> Array:
     return matrix
 
 
-_BASELINE = 0.1  # [m]; between the camera's two eyes, of which no usual depth camera has a wider one
-_PLENTY = 24  # points about the narrowest place; of more, some are left out
-_NARROWER = 0.8  # times the narrowest place, up to which what is sorted stays enough
-_MORE = 0.02  # of the picture, as x/z, that is sorted beyond what is asked for
-_HALF = 0.5  # of the points in a direction decide
-_STRIP, _PIECES = 0.02, 20  # of a picture: width of the strip along a side and the pieces of it, half of them filled
-_NARROWEST = 0.3  # of a picture, as x/z: what is narrower is a cloud that was cut out
-_LEAST_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
+_MAX_STEREO_BASELINE = 0.1  # [m]; between the camera's two eyes, of which no usual depth camera has a wider one
+_MAX_EDGE_POINTS = 24  # points about the narrowest place; of more, some are left out
+_NARROWEST_RATIO = 0.8  # times the narrowest place, up to which what is sorted stays enough
+_SORTED_MARGIN = 0.02  # of the picture, as x/z, that is sorted beyond what is asked for
+_DECIDING_FRACTION = 0.5  # of the points in a direction decide
+_EDGE_STRIP_WIDTH, _EDGE_STRIP_PIECES = (
+    0.02,
+    20,
+)  # of a picture: width of the strip along a side and the pieces of it, half of them filled
+_MIN_PICTURE_WIDTH = 0.3  # of a picture, as x/z: what is narrower is a cloud that was cut out
+_MIN_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,28 +251,28 @@ class OcclusionMap:
         sight, and a margin stands before it, all in [m].
         """
         seen, depth = _picture(places, self.camera_pose)
-        asked, wide = seen.T, radius / np.maximum(depth, _LEAST_DEPTH)
+        asked, wide = seen.T, radius / np.maximum(depth, _MIN_DEPTH)
         if self.intrinsics is not None:
             lens, room = self.intrinsics, 0 * wide[:, None]
             last = np.array([lens.width - 1, lens.height - 1])
             low, high = ((edge - [lens.cx, lens.cy]) / [lens.fx, lens.fy] for edge in (0 * last, last))
         else:
             (low, high), room = self._borders, wide[:, None]
-        hidden = (depth < _LEAST_DEPTH) | ((asked < low + room) | (asked > high - room)).any(axis=1)
+        hidden = (depth < _MIN_DEPTH) | ((asked < low + room) | (asked > high - room)).any(axis=1)
         if hidden.all():
             return hidden
         tree, distance = self._about(asked[~hidden], wide[~hidden])
         for i in np.flatnonzero(~hidden) if len(distance) else ():
             there = distance[tree.query_ball_point(asked[i], wide[i])]
             limit = depth[i] - radius[i] - margin
-            before = len(there) and np.mean(there < limit) > _HALF
+            before = len(there) and np.mean(there < limit) > _DECIDING_FRACTION
             hidden[i] = before if len(there) else self._shadowed(tree, distance, asked[i], limit)
         return hidden
 
     @cached_property
     def _all(self) -> tuple[Array, Array]:
         seen, depth = _picture(self.points, self.camera_pose)
-        ahead = depth > _LEAST_DEPTH
+        ahead = depth > _MIN_DEPTH
         return (seen, depth) if ahead.all() else (seen[:, ahead], depth[ahead])
 
     @cached_property
@@ -279,20 +282,22 @@ class OcclusionMap:
         seen, _ = self._all
         if seen.size:
             low, high = seen.min(1), seen.max(1)
-            for axis in range(2 if (high - low > _NARROWEST).all() else 0):
+            for axis in range(2 if (high - low > _MIN_PICTURE_WIDTH).all() else 0):
                 other = 1 - axis
                 for end, value in enumerate((low[axis], high[axis])):
-                    strip = np.abs(seen[axis] - value) <= _STRIP * (high[axis] - low[axis])
+                    strip = np.abs(seen[axis] - value) <= _EDGE_STRIP_WIDTH * (high[axis] - low[axis])
                     along = (seen[other, strip] - low[other]) / max(high[other] - low[other], 1e-12)
-                    pieces = np.unique(np.minimum((along * _PIECES).astype(np.int64), _PIECES - 1))
-                    if len(pieces) / _PIECES > _HALF:
+                    pieces = np.unique(
+                        np.minimum((along * _EDGE_STRIP_PIECES).astype(np.int64), _EDGE_STRIP_PIECES - 1)
+                    )
+                    if len(pieces) / _EDGE_STRIP_PIECES > _DECIDING_FRACTION:
                         borders[end, axis] = value
         return borders
 
     def _about(self, asked: Array, wide: Array) -> tuple[cKDTree, Array]:
         """Points of the picture round about the places: where in the picture, and how deep."""
         # a shadow of the nearest point falls so far beside its place in the picture
-        shadow, narrow = _BASELINE / float(self._all[1].min(initial=np.inf)), float(wide.min())
+        shadow, narrow = _MAX_STEREO_BASELINE / float(self._all[1].min(initial=np.inf)), float(wide.min())
         reach = max(float(wide.max()), shadow)
         low, high = asked.min(0) - reach, asked.max(0) + reach
         for lower, upper, least, tree, depth in self._kept:
@@ -301,12 +306,12 @@ class OcclusionMap:
         if self.expected_points is not None and len(self.expected_points):
             likely = _picture(self.expected_points, self.camera_pose)[0]
             low, high = np.minimum(low, likely.min(1) - reach), np.maximum(high, likely.max(1) + reach)
-        low, high = low - _MORE, high + _MORE
+        low, high = low - _SORTED_MARGIN, high + _SORTED_MARGIN
         seen, depth = self._all
         near = np.flatnonzero(((seen >= low[:, None]) & (seen <= high[:, None])).all(axis=0))
-        narrow *= _NARROWER
+        narrow *= _NARROWEST_RATIO
         about = len(near) * math.pi * narrow**2 / float(np.prod(high - low))
-        near = near[:: max(1, int(about / _PLENTY))]
+        near = near[:: max(1, int(about / _MAX_EDGE_POINTS))]
         tree = cKDTree(seen.take(near, axis=1).T, leafsize=64, compact_nodes=False, balanced_tree=False)
         self._kept.append((low, high, narrow, tree, depth[near]))
         return tree, depth[near]
@@ -314,18 +319,20 @@ class OcclusionMap:
     @staticmethod
     def _shadowed(tree: cKDTree, distance: Array, asked: Array, limit: float) -> bool:
         """Whether something nearer stands where the other eye would have to look through it."""
-        widest = _BASELINE * (1.0 / max(float(distance.min()), _LEAST_DEPTH) - 1.0 / limit) if limit > 0 else 0.0
+        widest = (
+            _MAX_STEREO_BASELINE * (1.0 / max(float(distance.min()), _MIN_DEPTH) - 1.0 / limit) if limit > 0 else 0.0
+        )
         if widest <= 0:
             return False
         around = np.asarray(tree.query_ball_point(asked, widest), dtype=np.int64)
         around = around[distance[around] < limit]
         apart = np.linalg.norm(tree.data[around] - asked, axis=1)
-        return bool((apart <= _BASELINE * (1.0 / distance[around] - 1.0 / limit)).any())
+        return bool((apart <= _MAX_STEREO_BASELINE * (1.0 / distance[around] - 1.0 / limit)).any())
 
 
 def _picture(points: Array, pose: Array) -> tuple[Array, Array]:
     """Where points stand in the picture, x/z and y/z, shape (2, N), and their depth z [m]."""
     local = pose[:3, :3].T @ points.T
     local -= (pose[:3, :3].T @ pose[:3, 3])[:, None]
-    local[:2] /= np.maximum(local[2], _LEAST_DEPTH)
+    local[:2] /= np.maximum(local[2], _MIN_DEPTH)
     return local[:2], local[2]

@@ -30,13 +30,13 @@ from yid_ocp.model.mechanism import Mechanism
 from yid_ocp.model.system import System, floating_clamp
 from yid_ocp.vision.point_cloud import CloudSkeleton, WeightedCloud
 
-_NEIGHBOURS = 10
-_SPACINGS = 3.0  # points further apart than so many of their usual distance do not hang together
-_LEAST_SHARE = 0.05  # of the points; smaller parts are not the object
-_LOOP = 3.0  # a cycle this many times longer than around the object is a loop of it
-_TWIG = 1.5  # a branch no longer than so many diameters is roughness
-_OUTWARD = 4.0  # widths of slices over which the direction at an end is taken
-_MOST = 2500  # points
+_N_NEIGHBOURS = 10
+_MAX_LINK_SPACINGS = 3.0  # points further apart than so many of their usual distance do not hang together
+_MIN_PART_FRACTION = 0.05  # of the points; smaller parts are not the object
+_MIN_LOOP_RATIO = 3.0  # a cycle this many times longer than around the object is a loop of it
+_MAX_TWIG_DIAMETERS = 1.5  # a branch no longer than so many diameters is roughness
+_END_DIRECTION_SLICES = 4.0  # widths of slices over which the direction at an end is taken
+_MAX_POINTS = 2500  # points
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,9 @@ class _Centerline:
     def outward_direction(self, end: int) -> Array:
         """Unit vector along the object at one of its ends, away from it, shape (3,)."""
         far, _ = self.path_lengths_from(end)
-        near = np.flatnonzero((far > 0) & (far <= max(_OUTWARD * self.slice_width, float(far[far > 0].min()))))
+        near = np.flatnonzero(
+            (far > 0) & (far <= max(_END_DIRECTION_SLICES * self.slice_width, float(far[far > 0].min())))
+        )
         way = self.nodes[end] - self.nodes[near].mean(axis=0)
         return np.asarray(way / max(float(np.linalg.norm(way)), 1e-12))
 
@@ -86,18 +88,18 @@ def trace_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng
     `diameter` is that of its thickest tube [m]; parts further apart than `gap` [m] do not hang together.
     """
     points = cloud.points
-    if len(points) > _MOST:
-        points = points[np.sort(rng.choice(len(points), _MOST, replace=False))]
-    if len(points) > _NEIGHBOURS:
+    if len(points) > _MAX_POINTS:
+        points = points[np.sort(rng.choice(len(points), _MAX_POINTS, replace=False))]
+    if len(points) > _N_NEIGHBOURS:
         points, graph = _connected(points, gap)
-    if len(points) <= _NEIGHBOURS:
+    if len(points) <= _N_NEIGHBOURS:
         return _Centerline(np.empty((0, 3)), np.empty((0, 2), dtype=np.int64), np.empty((0, 3)), diameter)
     far = int(np.argmax(dijkstra(graph, directed=False, indices=0)))
     away = np.asarray(dijkstra(graph, directed=False, indices=far))
     width = max(diameter, 2.0 * float(np.median(graph.data)))
     nodes, edges = _slices(points, graph, np.floor(away / width).astype(np.int64))
-    tree, loops = _tree(nodes, edges, _LOOP * np.pi * diameter)
-    return _pruned(_Centerline(nodes, tree, loops, width), _TWIG * diameter)
+    tree, loops = _tree(nodes, edges, _MIN_LOOP_RATIO * np.pi * diameter)
+    return _pruned(_Centerline(nodes, tree, loops, width), _MAX_TWIG_DIAMETERS * diameter)
 
 
 def _graph(nodes: Array, edges: IntArray) -> csr_matrix:
@@ -107,14 +109,14 @@ def _graph(nodes: Array, edges: IntArray) -> csr_matrix:
 
 def _connected(points: Array, gap: float) -> tuple[Array, csr_matrix]:
     """The points of parts that are large and near enough, and the graph that joins them."""
-    distance, index = cKDTree(points).query(points, k=_NEIGHBOURS + 1)
-    rows = np.repeat(np.arange(len(points)), _NEIGHBOURS)
+    distance, index = cKDTree(points).query(points, k=_N_NEIGHBOURS + 1)
+    rows = np.repeat(np.arange(len(points)), _N_NEIGHBOURS)
     columns, lengths = index[:, 1:].ravel(), distance[:, 1:].ravel()
-    near = lengths <= _SPACINGS * float(np.median(distance[:, 1 : _NEIGHBOURS // 2]))
+    near = lengths <= _MAX_LINK_SPACINGS * float(np.median(distance[:, 1 : _N_NEIGHBOURS // 2]))
     edges = np.column_stack([rows[near], columns[near]])
     _, part = connected_components(_graph(points, edges), directed=False)
     size = np.bincount(part)
-    large = np.flatnonzero(size >= _LEAST_SHARE * len(points))
+    large = np.flatnonzero(size >= _MIN_PART_FRACTION * len(points))
     bridges, joined = [], [int(large[np.argmax(size[large])])]
     while len(joined) < len(large):
         own = np.flatnonzero(np.isin(part, joined))
@@ -190,9 +192,9 @@ def _branch(nodes: Array, edges: IntArray, count: IntArray, end: int) -> tuple[f
 
 
 _FREE_ROOT_PREFIX = "found_root"  # of the joints that `system_with_free_root` adds
-_MOST_ENDS = 7  # of a course; more are clutter, and there are too many ways
-_ALIKE = 1.3  # a way whose distances are off by so many times the best one's is tried as well
-_WHOLE = 0.08  # of the object, by which a course may be off that shows all of it
+_MAX_ENDS = 7  # of a course; more are clutter, and there are too many ways
+_TRIED_MATCH_RATIO = 1.3  # a way whose distances are off by so many times the best one's is tried as well
+_WHOLE_OBJECT_TOLERANCE = 0.08  # of the object, by which a course may be off that shows all of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,7 +277,7 @@ class InitialShapeFinder:
         something else hangs together with it.
         """
         leaves, n_ends = trace.end_nodes, len(self._end_distances)
-        if not n_ends <= len(leaves) <= _MOST_ENDS:
+        if not n_ends <= len(leaves) <= _MAX_ENDS:
             counts = f"the cloud has {len(leaves)} ends, the object {n_ends}"
             raise DataError(f"the object cannot be followed from end to end: {counts}")
         # the middles of the last slices are half a slice from the ends
@@ -286,11 +288,11 @@ class InitialShapeFinder:
             for chosen in permutations(range(len(leaves)), n_ends)
         ]
         best, nearest = min(ways)
-        if best > max(_WHOLE * float(self._root_to_tip_lengths.max()), trace.slice_width):
+        if best > max(_WHOLE_OBJECT_TOLERANCE * float(self._root_to_tip_lengths.max()), trace.slice_width):
             own = self._end_distances[0, 1]
             lengths = f"{along[nearest[0], nearest[1]]:.2f} m from end to end, the object has {own:.2f} m"
             raise DataError(f"the object cannot be followed from end to end: the cloud has {lengths}")
-        limit = max(_ALIKE * best, trace.slice_width)
+        limit = max(_TRIED_MATCH_RATIO * best, trace.slice_width)
         kept = [chosen for off, chosen in sorted(ways) if off <= limit][: 2 * n_ends]
         return [self._along(trace, [int(leaves[k]) for k in chosen]) for chosen in kept]
 

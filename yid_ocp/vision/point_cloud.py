@@ -25,8 +25,8 @@ XyzCoordinates = tuple[float, float, float]
 _ColourComponent = Annotated[float, Ge(0), Le(255)]
 _RgbColour = tuple[_ColourComponent, _ColourComponent, _ColourComponent]
 
-_USUAL = 3000  # points, at least, that tell how far neighbours usually are
-_TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
+_SPACING_SAMPLE_POINTS = 3000  # points, at least, that tell how far neighbours usually are
+_MAD_TO_STD = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,10 +207,10 @@ def is_statistical_inlier(
     def apart(index: IntArray) -> Array:
         return np.asarray(tree.query(cloud.points[index], k=neighbours + 1)[0][:, 1:].mean(axis=1))
 
-    some = np.arange(0, len(cloud), max(1, len(cloud) // _USUAL))
+    some = np.arange(0, len(cloud), max(1, len(cloud) // _SPACING_SAMPLE_POINTS))
     distance = apart(some)
     middle = weighted_median(distance, cloud.point_weights[some])
-    spread = _TO_SIGMA * weighted_median(np.abs(distance - middle), cloud.point_weights[some])
+    spread = _MAD_TO_STD * weighted_median(np.abs(distance - middle), cloud.point_weights[some])
     index = np.flatnonzero(np.ones(len(cloud), bool) if asked is None else asked)
     stays = np.zeros(len(cloud), bool)
     stays[index] = apart(index) <= middle + ratio * spread
@@ -332,11 +332,11 @@ def _spanning_forest(nodes: Array, options: SkeletonOptions) -> tuple[IntArray, 
     return np.column_stack([forest.row, forest.col]).astype(np.int64), part.astype(np.int64)
 
 
-_DEFAULTS = SkeletonOptions()
+_DEFAULT_OPTIONS = SkeletonOptions()
 
 
 def extract_skeleton(
-    cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions = _DEFAULTS
+    cloud: WeightedCloud, rng: np.random.Generator, options: SkeletonOptions = _DEFAULT_OPTIONS
 ) -> CloudSkeleton:
     """Skeleton of a cloud without connected parts that hold too few points, begun at the lowest point."""
     nodes, size, label = _thin_to_nodes(cloud, rng, options)

@@ -27,13 +27,15 @@ from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.shape_evidence import ForeignCluster, FrameShapeFit, TubeLinks, tube_link_projections
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
-_NOISE_STDS = 3.0  # of a point, within which it is the background's
-_MOST = 0.5  # of the frames, in which what stands still must be seen: arm and object hide it from time to time
-_ALIKE = 1.0  # of a thing's size, within which it is the same thing in another frame
-_STILL = 0.3  # of its size, by which a still thing's middle wanders at most
-_FOLLOWS = 0.5  # of how far it wanders in the world, below which it moves with a link
-_FEWEST = 2  # frames in which a thing is worth a word
-_TO_SIGMA = 1.4826
+_BACKGROUND_NOISE_STDS = 3.0  # of a point, within which it is the background's
+_MIN_STILL_FRAME_FRACTION = (
+    0.5  # of the frames, in which what stands still must be seen: arm and object hide it from time to time
+)
+_SAME_THING_DISTANCE = 1.0  # of a thing's size, within which it is the same thing in another frame
+_MAX_STILL_WANDER = 0.3  # of its size, by which a still thing's middle wanders at most
+_MAX_FOLLOWING_WANDER = 0.5  # of how far it wanders in the world, below which it moves with a link
+_MIN_REPORTED_FRAMES = 2  # frames in which a thing is worth a word
+_MAD_TO_STD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +73,12 @@ class BackgroundPoints:
             return BackgroundPoints()
         cells = [np.unique(np.floor(cloud / voxel).astype(np.int64), axis=0) for cloud in clouds]
         place, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
-        often = 1.0 if shapes is None else max(2.0, _MOST * len(clouds))
+        often = 1.0 if shapes is None else max(2.0, _MIN_STILL_FRAME_FRACTION * len(clouds))
         points: Array = np.asarray((place[count >= often] + 0.5) * voxel)
         for tubes in shapes or ():
             link, _, _, distance = tube_link_projections(tubes.link_ends, tubes.radius, points)
             points = points[distance > tubes.radius[link] + near]
-        return BackgroundPoints(points, _NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
+        return BackgroundPoints(points, _BACKGROUND_NOISE_STDS * noise + 0.5 * math.sqrt(3.0) * voxel)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,14 +113,14 @@ def group_foreign_clusters(
             home.append((t, thing))
         else:
             groups.append([(t, thing)])
-    groups = [group for group in groups if len(group) >= min(_FEWEST, len(things))]
+    groups = [group for group in groups if len(group) >= min(_MIN_REPORTED_FRAMES, len(things))]
     groups.sort(key=lambda group: -sum(thing.n_points for _, thing in group))
     found = []
     for group in groups:
         places, extents = np.array([thing.centre for _, thing in group]), [thing.extent for _, thing in group]
         centre, size = np.median(places, axis=0), np.median(extents, axis=0)
         # as arm and object hide parts of a still thing, the middle of the rest wanders within it
-        still = np.maximum(2 * _NOISE_STDS * noise, _STILL * np.max(extents, axis=0))
+        still = np.maximum(2 * _BACKGROUND_NOISE_STDS * noise, _MAX_STILL_WANDER * np.max(extents, axis=0))
         moving = bool((np.ptp(places, axis=0) > still).any())
         poses = [links(t) for t, _ in group]
         link = _carrying_link(places, poses) if moving else ""
@@ -146,32 +148,32 @@ def group_foreign_clusters(
 def _apart(one: ForeignCluster, other: ForeignCluster) -> float:
     """Distance of two things, in shares of their size in which they pass for the same."""
     size = max(float(np.linalg.norm(one.extent)), float(np.linalg.norm(other.extent)), 1e-6)
-    return float(np.linalg.norm(one.centre - other.centre)) / (_ALIKE * size)
+    return float(np.linalg.norm(one.centre - other.centre)) / (_SAME_THING_DISTANCE * size)
 
 
 def _carrying_link(places: Array, poses: Sequence[Mapping[str, Array]]) -> str:
     """Link within which places wander much less than in the world; empty for none."""
 
     def wandering(own: Array) -> float:
-        return _TO_SIGMA * float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1)))
+        return _MAD_TO_STD * float(np.median(np.linalg.norm(own - np.median(own, axis=0), axis=1)))
 
     inside = {"": math.inf}
     for name in poses[0]:
         pose = np.array([at[name] for at in poses])
         inside[name] = wandering(np.einsum("fij,fi->fj", pose[:, :3, :3], places - pose[:, :3, 3]))
     best = min(inside, key=lambda name: inside[name])
-    return best if inside[best] < _FOLLOWS * wandering(places) else ""
+    return best if inside[best] < _MAX_FOLLOWING_WANDER * wandering(places) else ""
 
 
 TubeDimensionKind = Literal["length", "radius"]
 _DIMENSION_KINDS: tuple[TubeDimensionKind, ...] = ("length", "radius")
-_PRIOR = (0.2, 0.4)  # standard deviations of the logarithms of lengths and radii
-_SIGMAS = 3.0  # from the model's value, beyond which that is doubted
-_CLEAR = 2.0  # from there, within which a first look finds nothing to doubt
-_KNOWN = 0.1  # standard deviation of a logarithm, above which nothing can be said of a size
-_ROUNDS, _SETTLED, _LONGEST_STEP = 8, 0.004, 0.15
-_LEAST_FRAMES = 3
-_APART = 3.0  # robust standard deviations from the other frames' ends, at which a frame's end is a wrong one
+_LOG_DIMENSION_PRIOR_STD = (0.2, 0.4)  # standard deviations of the logarithms of lengths and radii
+_DOUBTED_STDS = 3.0  # from the model's value, beyond which that is doubted
+_CLEAR_STDS = 2.0  # from there, within which a first look finds nothing to doubt
+_MAX_KNOWN_LOG_STD = 0.1  # standard deviation of a logarithm, above which nothing can be said of a size
+_MAX_ITERATIONS, _STEP_TOLERANCE, _MAX_STEP = 8, 0.004, 0.15
+_MIN_FRAMES = 3
+_OUTLIER_END_STDS = 3.0  # robust standard deviations from the other frames' ends, at which a frame's end is a wrong one
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,12 +195,12 @@ class TubeDimensionCheck:
     @property
     def is_dimension_determined(self) -> BoolArray:
         """Which dimensions the frames determine, shape (2 s,)."""
-        return np.asarray((self.dimension_log_ratio_std < _KNOWN) & (self.n_frames > 0))
+        return np.asarray((self.dimension_log_ratio_std < _MAX_KNOWN_LOG_STD) & (self.n_frames > 0))
 
     @property
     def is_model_value_contradicted(self) -> BoolArray:
         """Which of the model's values contradict the frames, shape (2 s,)."""
-        off = np.abs(self.log_ratio) > _SIGMAS * self.dimension_log_ratio_std
+        off = np.abs(self.log_ratio) > _DOUBTED_STDS * self.dimension_log_ratio_std
         return np.asarray(self.is_dimension_determined & off)
 
     @property
@@ -259,16 +261,16 @@ def estimate_and_check_dimensions(
     told = np.array([*(lengths.sum() for lengths, _ in sizes), *(radius for _, radius in sizes)])
     count, many = len(told), len(told) // 2
     names = tuple(f"{s.name}.{kind}" for kind in _DIMENSION_KINDS for s in system.segment_layouts)
-    prior = np.diag(np.repeat(1.0 / np.square(_PRIOR), many))
+    prior = np.diag(np.repeat(1.0 / np.square(_LOG_DIMENSION_PRIOR_STD), many))
     change, starts = np.zeros(count), list[Array]()
     nothing = TubeDimensionCheck(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
     wanted = np.array([kind in estimate for kind in _DIMENSION_KINDS for _ in range(many)])
     shared = np.concatenate([math.hypot(*std) / told[:many], std[0] ** 2 / (2 * told[many:] ** 2)])
     covariance, frames = nothing.covariance, 0
-    for turn in range(_ROUNDS):
+    for turn in range(_MAX_ITERATIONS):
         fits = fitted(_changed(system, given, change), starts)
         chosen = _believed(fits)
-        if len(chosen) < _LEAST_FRAMES:
+        if len(chosen) < _MIN_FRAMES:
             return nothing
         starts, frames = [fit.q for fit in fits], len(chosen)
         gradient = np.array([fit.dimension_equations.gradient for fit in chosen])
@@ -278,12 +280,12 @@ def estimate_and_check_dimensions(
         left = gradient + curvature @ step
         scatter = inverse @ (left.T @ left) @ inverse * frames / (frames - 1)
         covariance = np.asarray(inverse + scatter + np.diag(shared**2))
-        change = change + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
-        if turn == 0 and not wanted.any() and (np.abs(change) < _CLEAR * np.sqrt(np.diag(covariance))).all():
+        change = change + np.clip(step, -_MAX_STEP, _MAX_STEP)
+        if turn == 0 and not wanted.any() and (np.abs(change) < _CLEAR_STDS * np.sqrt(np.diag(covariance))).all():
             break  # nothing to doubt
-        if np.abs(step).max() < _SETTLED:
+        if np.abs(step).max() < _STEP_TOLERANCE:
             break
-    known = np.sqrt(np.diag(covariance)) < _KNOWN
+    known = np.sqrt(np.diag(covariance)) < _MAX_KNOWN_LOG_STD
     return TubeDimensionCheck(names, told, change, covariance, tuple(bool(x) for x in wanted & known), frames)
 
 
@@ -295,7 +297,7 @@ def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
     keep = np.ones(len(fits), bool)
     for column in ends[:, np.isfinite(ends).any(axis=0)].T:
         off = np.abs(column - np.nanmedian(column))
-        keep &= np.isnan(column) | (off < _APART * max(_TO_SIGMA * float(np.nanmedian(off)), noise))
+        keep &= np.isnan(column) | (off < _OUTLIER_END_STDS * max(_MAD_TO_STD * float(np.nanmedian(off)), noise))
     return [fit for fit, good in zip(fits, keep, strict=True) if good]
 
 

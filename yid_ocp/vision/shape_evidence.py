@@ -23,18 +23,18 @@ from yid_ocp.vision.frames import OcclusionMap
 from yid_ocp.vision.initial_shapes import ObservedObjectEnd
 from yid_ocp.vision.point_cloud import weighted_median
 
-_AWAY = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
-_STATIONS = 6  # per link at least, where it is asked whether points are near
-_SIGMAS = 3.0  # from the surface, within which a point lies on it
-_TO_SIGMA = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
-_LINKED = 3.0  # times the usual distance of neighbours, within which two points hang together
-_FEWEST = 12  # points of a thing
-_MATCH = 0.5  # of a piece of surface about a point that must be foreign for it to go on there
-_MOST_THINGS = 8  # of a frame, that are remembered
-_FILLED = 0.3  # of the usual number of points, with which a slice of a tube counts as filled
-_SURROUNDINGS = 3.0  # radii about a node, in which it is asked how wide the surface is there
-_AHEAD = 0.5  # of its length, by which a tube may be too short and its end still be found
-_RIM = 0.85  # of the radius to either side, within which a tube's depth is compared
+_HIDDEN_SIDE_COSINE = -0.5  # cosine of normal and sight beyond which a point cannot be on the side that the camera sees
+_MIN_LINK_STATIONS = 6  # per link at least, where it is asked whether points are near
+_ON_SURFACE_STDS = 3.0  # from the surface, within which a point lies on it
+_MAD_TO_STD = 1.4826  # from the median absolute deviation of a normal distribution to its standard deviation
+_MAX_LINK_SPACINGS = 3.0  # times the usual distance of neighbours, within which two points hang together
+_MIN_THING_POINTS = 12  # points of a thing
+_FOREIGN_SURFACE_FRACTION = 0.5  # of a piece of surface about a point that must be foreign for it to go on there
+_MAX_THINGS = 8  # of a frame, that are remembered
+_FILLED_SLICE_FRACTION = 0.3  # of the usual number of points, with which a slice of a tube counts as filled
+_SURROUNDING_RADII = 3.0  # radii about a node, in which it is asked how wide the surface is there
+_MAX_SHORT_FRACTION = 0.5  # of its length, by which a tube may be too short and its end still be found
+_RIM_RADIUS_FRACTION = 0.85  # of the radius to either side, within which a tube's depth is compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def across_links(link_ends: Array, camera: Array) -> Array:
 
 def _faces_away_from_camera(normal: Array, sight: Array) -> BoolArray:
     """Whether surface normals (N, 3) face away from the camera, by lines of sight (N, 3)."""
-    return np.asarray(np.einsum("ij,ij->i", normal, sight) > -_AWAY * np.linalg.norm(sight, axis=1))
+    return np.asarray(np.einsum("ij,ij->i", normal, sight) > -_HIDDEN_SIDE_COSINE * np.linalg.norm(sight, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,19 +163,25 @@ def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near
     size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
     close = size < near
     tree, spacing = seen._point_tree, seen._point_spacing
-    noise = _TO_SIGMA * weighted_median(size[close], seen.point_weights[close]) if close.any() else near / _SIGMAS
+    noise = (
+        _MAD_TO_STD * weighted_median(size[close], seen.point_weights[close])
+        if close.any()
+        else near / _ON_SURFACE_STDS
+    )
     # where points lie in between others is not known better than from one to the next
     noise = max(noise, spacing / math.sqrt(12.0))
-    gate = min(_SIGMAS * noise, near)
+    gate = min(_ON_SURFACE_STDS * noise, near)
     on_shape = size < gate
     beyond = np.zeros(len(on_shape), bool)
     ends = np.full(len(tubes.free_end_links), np.nan)
     for i, k in enumerate(tubes.free_end_links):
         ends[i], behind_tip = _end_offset(tubes, k, seen, gate)
         beyond |= behind_tip
-    part = _things(tree, ~on_shape & ~beyond, _LINKED * spacing, 4 * float(tubes.radius.min()) ** 2 / spacing**2)
+    part = _things(
+        tree, ~on_shape & ~beyond, _MAX_LINK_SPACINGS * spacing, 4 * float(tubes.radius.min()) ** 2 / spacing**2
+    )
     foreign = part >= 0
-    contact = _contacts(tree, seen, on_shape | beyond, foreign, _LINKED * spacing)
+    contact = _contacts(tree, seen, on_shape | beyond, foreign, _MAX_LINK_SPACINGS * spacing)
     contested = np.zeros(len(on_shape), bool)
     if contact.any():
         touching = cKDTree(seen.points[contact])
@@ -189,7 +195,7 @@ def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near
     filled, empty = _coverage(tubes, seen, own, link, along, gate)
     counted = close & ~foreign
     mean = float(np.average(size[counted], weights=seen.point_weights[counted])) if counted.any() else math.inf
-    clusters = [seen.points[part == number] for number in range(min(_MOST_THINGS, int(part.max(initial=-1)) + 1))]
+    clusters = [seen.points[part == number] for number in range(min(_MAX_THINGS, int(part.max(initial=-1)) + 1))]
     return ShapePointClassification(
         is_own=own,
         is_contested=contested,
@@ -210,7 +216,7 @@ def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) ->
     About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
     spread as far in two.
     """
-    within = _SURROUNDINGS * radius
+    within = _SURROUNDING_RADII * radius
     thin = np.zeros(len(sight.skeleton_nodes), bool)
     for i, around in enumerate(sight._point_tree.query_ball_point(sight.skeleton_nodes, within)):
         if len(around) > 3:
@@ -232,7 +238,7 @@ def _things(tree: cKDTree, chosen: BoolArray, within: float, least: float) -> In
     count = np.bincount(owner)
     order = np.argsort(-count, kind="stable")
     number = np.full(len(count), -1)
-    kept = order[count[order] >= max(least, _FEWEST)]
+    kept = order[count[order] >= max(least, _MIN_THING_POINTS)]
     number[kept] = np.arange(len(kept))
     part[index] = number[owner]
     return part
@@ -249,7 +255,7 @@ def _contacts(
     for i in np.flatnonzero(shape)[np.isfinite(close)]:
         around = np.asarray(tree.query_ball_point(seen.points[i], within), dtype=np.int64)
         theirs = float(seen.point_weights[around[foreign[around]]].sum())
-        contact[i] = theirs >= _MATCH * float(seen.point_weights[around[shape[around]]].sum())
+        contact[i] = theirs >= _FOREIGN_SURFACE_FRACTION * float(seen.point_weights[around[shape[around]]].sum())
     return contact
 
 
@@ -258,7 +264,7 @@ def _coverage(
 ) -> tuple[Array, Array]:
     """Shares of each link that have own points, and that visibly have none."""
     lengths = np.linalg.norm(tubes.link_ends[:, 1] - tubes.link_ends[:, 0], axis=1)
-    count = np.maximum(_STATIONS, np.ceil(lengths / (2 * tubes.radius))).astype(np.int64)
+    count = np.maximum(_MIN_LINK_STATIONS, np.ceil(lengths / (2 * tubes.radius))).astype(np.int64)
     first = np.concatenate([[0], np.cumsum(count)[:-1]])
     station = first[link] + np.minimum((along * count[link]).astype(np.int64), count[link] - 1)
     filled = np.bincount(station[own], minlength=int(count.sum())) > 0
@@ -287,7 +293,7 @@ def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: fl
     (start, tip), radius, axis = tubes.link_ends[link], float(tubes.radius[link]), link_axes(tubes.link_ends)[link]
     thick = max(radius, 2 * seen._point_spacing)
     behind = max(3, int(float(np.linalg.norm(tip - start)) / thick))
-    edges = thick * np.arange(-behind, max(3, int(_AHEAD * tubes.tube_lengths[link] / thick)) + 1.0)
+    edges = thick * np.arange(-behind, max(3, int(_MAX_SHORT_FRACTION * tubes.tube_lengths[link] / thick)) + 1.0)
     away = seen.points - tip
     along = away @ axis
     about = np.einsum("ij,ij->i", away, away) - along**2 < (radius + gate) ** 2
@@ -296,7 +302,7 @@ def _end_offset(tubes: TubeLinks, link: int, seen: ProcessedFrameCloud, gate: fl
     nothing = math.nan, np.zeros(len(along), bool)
     if not (count[edges[1:] <= 0] > 0).any():
         return nothing
-    filled = count > _FILLED * float(np.median(count[count > 0]))
+    filled = count > _FILLED_SLICE_FRACTION * float(np.median(count[count > 0]))
     middles = tip + 0.5 * (edges[1:] + edges[:-1])[:, None] * axis
     hidden = seen._is_hidden_or_filtered(middles, np.full(len(middles), radius), gate) & ~filled
     score = np.concatenate([[0.0], np.cumsum(np.where(hidden, 0.0, np.where(filled, 0.5, -0.5)))])
@@ -350,7 +356,7 @@ def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera
     side = np.cross(axis, front)
     offset = normal * distance[:, None]
     across = np.einsum("ij,ij->i", offset, side)
-    index = np.flatnonzero((np.abs(across) < _RIM * radius[link]) & (along > 0) & (along < 1))
+    index = np.flatnonzero((np.abs(across) < _RIM_RADIUS_FRACTION * radius[link]) & (along > 0) & (along < 1))
     link, along, front, side, across = link[index], along[index], front[index], side[index], across[index]
     deep = np.sqrt(radius[link] ** 2 - across**2)
     error = np.einsum("ij,ij->i", offset[index], front) - deep

@@ -45,9 +45,9 @@ UrdfMeshKind = Literal["visual", "collision"]
 _Triple = tuple[float, float, float]
 
 _MAX_MESH_BYTES = 1 << 28
-_FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
-_TOUCHING = 5e-4  # [m]
-_NEAR = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
+_TUBE_FACETS = 48  # of a tube: the surface is then within 0.2 % of the radius
+_TOUCHING_DISTANCE = 5e-4  # [m]
+_MIN_PROJECTED_DISTANCE = 0.05  # [m]; closer than this a box is not projected but taken to fill the image
 
 
 @dataclass(frozen=True)
@@ -114,17 +114,17 @@ class TriangleMesh:
         from trimesh import creation
 
         middle = homogeneous_transform(np.eye(3), (0.0, 0.0, 0.5 * (low + high)))
-        return TriangleMesh._of(creation.cylinder(radius, high - low, _FACETS, transform=middle))
+        return TriangleMesh._of(creation.cylinder(radius, high - low, _TUBE_FACETS, transform=middle))
 
     @staticmethod
     def sphere(radius: float) -> TriangleMesh:
         """A sphere about the origin."""
         from trimesh import creation
 
-        polar = np.linspace(0.0, np.pi, _FACETS // 2 + 1)
+        polar = np.linspace(0.0, np.pi, _TUBE_FACETS // 2 + 1)
         outline = radius * np.column_stack([np.sin(polar), np.cos(polar)])
         outline[[0, -1], 0] = 0.0
-        return TriangleMesh._of(creation.revolve(outline, sections=_FACETS))
+        return TriangleMesh._of(creation.revolve(outline, sections=_TUBE_FACETS))
 
 
 class ArticulatedSurfaces:
@@ -193,7 +193,7 @@ class ArticulatedSurfaces:
             # the way to a surface that is all but touched is rounding: its own normal is better
             flat = answer["primitive_normals"].numpy()
             flat = flat * np.where((flat * away).sum(1) < 0, -1.0, 1.0)[:, None]
-            unit = np.where(length[:, None] > _TOUCHING, away / np.maximum(length, 1e-12)[:, None], flat)
+            unit = np.where(length[:, None] > _TOUCHING_DISTANCE, away / np.maximum(length, 1e-12)[:, None], flat)
             better = (length < distance[near]) & (length <= within)
             chosen = near[better]
             distance[chosen], owner[chosen] = length[better], part
@@ -251,9 +251,9 @@ class ArticulatedSurfaces:
     ) -> tuple[slice, slice] | None:
         """Rows and columns of the image in which a part may be seen."""
         seen = (np.array(list(product(*self._boxes[part].T))) - origin) @ rotation
-        if (seen[:, 2] < _NEAR).all():
+        if (seen[:, 2] < _MIN_PROJECTED_DISTANCE).all():
             return None
-        if (seen[:, 2] < _NEAR).any() or pinhole.has_distortion:
+        if (seen[:, 2] < _MIN_PROJECTED_DISTANCE).any() or pinhole.has_distortion:
             return slice(0, pinhole.height), slice(0, pinhole.width)
         u = pinhole.fx * seen[:, 0] / seen[:, 2] + pinhole.cx
         v = pinhole.fy * seen[:, 1] / seen[:, 2] + pinhole.cy

@@ -40,12 +40,12 @@ from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, Trac
 
 _Given = tuple[Array, OcclusionMap, Callable[[Array], BoolArray]]
 
-_ASKED = 8  # frames, at most, that are asked about the object's sizes
-_SOME = 2000  # points that tell how far away a cloud is
-_LARGEST = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
-_SAME_TIME = 1e-6  # [s]
-_AS_GOOD = 1.2  # times the distance of the best shape, up to which another one may be the right one
-_GRIP = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]
+_MAX_SIZED_FRAMES = 8  # frames, at most, that are asked about the object's sizes
+_DISTANCE_SAMPLE_POINTS = 2000  # points that tell how far away a cloud is
+_MAX_DISTANCE = 50.0  # [m]; a depth camera sees no further, a cloud in millimetres always does
+_SAME_TIME_TOLERANCE = 1e-6  # [s]
+_RIVAL_SHAPE_RATIO = 1.2  # times the distance of the best shape, up to which another one may be the right one
+_GRASP_MARGIN = 0.06  # about a grasp, beyond the tube's radius, a point may be the object's [m]
 
 
 def track_object(
@@ -138,7 +138,7 @@ class FrameTracker:
         self.arm_surface: ArmSurface | None = None
         self._widest = float(self.shape_fitter.link_radii.max())
         if self.robot_surfaces is not None and self.joint_time_span is not None and scene.robot_urdf is not None:
-            held = self.shape_fitter.gripper_positions_at, self._widest + _GRIP
+            held = self.shape_fitter.gripper_positions_at, self._widest + _GRASP_MARGIN
             self.arm_surface = ArmSurface(self.robot_surfaces, self._configuration_at_rest, *held)
         self.frame_order, self._reasons = _by_stamp(sequence.stamps)
         usable = [i for i in self.frame_order if i not in self._reasons]
@@ -146,7 +146,7 @@ class FrameTracker:
         if options.filters.object_colours and sequence.load_colours is None:
             hint = "leave track.options.filters.object_colours out, or record clouds with colours"
             raise DataError("the clouds have no colours", where=sequence.source, hint=hint)
-        self._asked = _spread(usable, _ASKED)
+        self._asked = _spread(usable, _MAX_SIZED_FRAMES)
         self._shapes: dict[tuple[float, ...], ShapeFitter] = {(): self.shape_fitter}
         self.calibration_frames = _spread(usable, options.calibration.n_frames) if self.arm_surface is not None else ()
 
@@ -255,8 +255,8 @@ class FrameTracker:
         points = points if finite.all() else points[finite]
         if not len(points):
             raise DataError("the cloud is empty")
-        far = float(np.median(np.abs(points[:: 1 + len(points) // _SOME]).max(axis=1)))
-        if far > _LARGEST:
+        far = float(np.median(np.abs(points[:: 1 + len(points) // _DISTANCE_SAMPLE_POINTS]).max(axis=1)))
+        if far > _MAX_DISTANCE:
             raise DataError(f"the cloud is not in metres: half of its points are {far:.0f} m away (millimetres?)")
         return points, finite
 
@@ -292,7 +292,9 @@ class FrameTracker:
         anywhere = self.initial_shape_finder is not None
         if anywhere and not reason and frame_selection.is_shape_self_touching(fits[0].link_ends, shape.link_radii):
             reason = "the object crosses or touches itself"
-        other = fits[1] if len(fits) > 1 and fits[1].mean_distance < _AS_GOOD * fits[0].mean_distance else None
+        other = (
+            fits[1] if len(fits) > 1 and fits[1].mean_distance < _RIVAL_SHAPE_RATIO * fits[0].mean_distance else None
+        )
         spent = work.report.cpu_seconds + time.process_time() - begun
         work.say(shape_fit=fits[0], alternative_fit=other, cpu_seconds=spent, drop_reason=reason)
         return work.report
@@ -480,7 +482,7 @@ def _by_stamp(stamps: Array) -> tuple[tuple[int, ...], dict[int, str]]:
     order = sorted(range(len(stamps)), key=lambda i: (math.inf if i in reasons else float(stamps[i]), i))
     before = -math.inf
     for i in (i for i in order if i not in reasons):
-        if stamps[i] - before < _SAME_TIME:
+        if stamps[i] - before < _SAME_TIME_TOLERANCE:
             reasons[i] = "its time stamp is that of the frame before: a duplicate"
         else:
             before = float(stamps[i])

@@ -119,7 +119,7 @@ class TrackResult:
         return validate_recording(made)
 
 
-_MOST = 12000  # points in one picture: more hide each other
+_MAX_DRAWN_POINTS = 12000  # points in one picture: more hide each other
 _GREY, _BLUE, _ORANGE, _GREEN = "#9a9a9a", "#1f5fa8", "#e07a1f", "#2a8f4f"
 
 
@@ -178,7 +178,7 @@ def _write(path: Path, title: str, frame: Array, camera: Array, picture: _Pictur
     axes: Any = figure.add_subplot(projection="3d")
     rng = np.random.default_rng(0)
     for points, colour, size in picture.points:
-        shown = points if len(points) <= _MOST else rng.choice(points, _MOST, replace=False)
+        shown = points if len(points) <= _MAX_DRAWN_POINTS else rng.choice(points, _MAX_DRAWN_POINTS, replace=False)
         axes.scatter(*shown.T, s=size, c=colour, linewidths=0, depthshade=False)
     for line in picture.lines:
         axes.plot(*line.T, color=picture.line_colour, linewidth=1.2 if picture.line_colour == _BLUE else 2.5)
