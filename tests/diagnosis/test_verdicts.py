@@ -10,8 +10,6 @@ import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text
-from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
-from yid_ocp.effects import make_effect
 from yid_ocp.errors import YidError
 from yid_ocp.problem import ProblemOptions, SensorOptions
 
@@ -88,21 +86,6 @@ def test_a_candidate_that_is_left_out_is_composed_and_not_tried(bench):
             diagnose(problem, FRICTION, recordings[1:], exclude=[name])
     with pytest.raises(YidError, match="no candidate is left"):
         diagnose(problem, FRICTION, recordings[1:], exclude=["joint_coulomb", "link_mass", "effort_offset"])
-
-
-def test_candidates_are_composed_once_for_a_step(bench):
-    recordings = [bench.recording({}, seed) for seed in (1, 2)]
-
-    def composed(*labels: str, **values: float) -> AllCandidatesProblem:
-        effects = [make_effect(*label.split("@"), bench.system, values or None) for label in labels]
-        return AllCandidatesProblem.from_problem(bench.problem(recordings[:1]), effects, recordings[1:])
-
-    first, again = (composed("joint_coulomb@elbow", "link_mass@elbow") for _ in range(2))
-    assert again.problem.step is first.problem.step
-    assert again.candidate_effects == first.candidate_effects, "those whose symbols the step has"
-    assert composed("link_mass@elbow", "joint_coulomb@elbow").problem.step is not first.problem.step
-    at_work = composed("joint_coulomb@elbow", tau_c=0.1)
-    assert at_work.problem.step is not composed("joint_coulomb@elbow").problem.step
 
 
 def test_an_effect_that_is_not_in_the_library_is_unknown_but_placed(bench):

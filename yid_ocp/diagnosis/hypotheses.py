@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from yid_ocp.inference.whitening import (
     problem_with_relinearized_held_out,
     problem_with_whitened_held_out,
 )
-from yid_ocp.integrator.step import Step, compile_step_like
+from yid_ocp.integrator.step import compile_step_like
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, truncate_episode
@@ -126,7 +125,8 @@ class AllCandidatesProblem:
         problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
     ) -> AllCandidatesProblem:
         """Build from a problem and its candidates; `DataError` if a recording is both estimated on and held out."""
-        joint, effects = _joint(problem.step, tuple(effects))
+        effects = tuple(effects)
+        joint = compile_step_like(problem.step, problem.step.system.with_effects(effects))
         estimate = [episode.recording for episode in problem.episodes]
         held = [*held_out] or [episode.recording for episode in problem.held_out]
         for recording in held:
@@ -198,22 +198,6 @@ class AllCandidatesProblem:
 def _beside(own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]) -> tuple[Array, Array]:
     """Unknowns at some values, and with neutral effects, where filters are about the right torques."""
     return own.vector(at), own.vector({**at, **neutral_effect_parameter_values(effects)})
-
-
-_JOINT: WeakKeyDictionary[Step, tuple[Step, tuple[EffectBase, ...]]] = WeakKeyDictionary()
-"""The last step composed with candidates, and these: another diagnosis with the same step finds it again."""
-
-
-def _joint(step: Step, effects: tuple[EffectBase, ...]) -> tuple[Step, tuple[EffectBase, ...]]:
-    """A step with candidates composed, and the candidates whose symbols it has."""
-    known = _JOINT.get(step)
-    if known is None or list(map(_identity, known[1])) != list(map(_identity, effects)):
-        known = _JOINT[step] = compile_step_like(step, step.system.with_effects(effects)), effects
-    return known
-
-
-def _identity(effect: EffectBase) -> tuple[object, ...]:
-    return effect.label, effect.definitions, tuple(effect.parameters.vector())
 
 
 def _same(a: Recording, b: Recording) -> bool:
