@@ -111,7 +111,9 @@ def test_a_locked_joint_stands_at_its_value_or_within_its_range(urdf_folder):
         np.testing.assert_allclose(numbers(short.frame_pose(frame).homogeneous_matrix()), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("robot", ["package:baxter", "package:panda", "package:ur5", "mixed_joints", "turntable"])
+@pytest.mark.parametrize(
+    "robot", ["package:baxter", "package:panda", "package:ur5", "package:so101", "mixed_joints", "turntable"]
+)
 def test_urdf_round_trip(robot, urdf_folder, tmp_path):
     source = robot if robot.startswith("package:") else urdf_folder / f"{robot}.urdf"
     mechanism = read_urdf(source)

@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 
 
 def _example_robot_urdf(robot: str) -> Path:
-    """Path of `baxter`, `panda`, `ur5`, or `folder/file.urdf` in the installed example-robot-data package."""
+    """Path of `baxter`, `so101` or another file's stem, or `folder/file.urdf` in the installed example-robot-data."""
     roots = [Path(p) / "cmeel.prefix/share/example-robot-data/robots" for p in [*sys.path, *site.getsitepackages()]]
     roots += [Path(sys.prefix) / "share/example-robot-data/robots"]
     folder = next((root for root in roots if root.is_dir()), None)
@@ -54,8 +54,12 @@ def _example_robot_urdf(robot: str) -> Path:
     for candidate in (wanted, f"{wanted}_description/urdf/{wanted}.urdf"):
         if candidate in files:
             return files[candidate]
-    stems = {path.stem for path in files.values()}
-    raise ModelError(f"example-robot-data has no robot '{robot}'", hint=nearest_name_hint(robot, stems))
+    by_stem: dict[str, list[Path]] = {}
+    for path in files.values():
+        by_stem.setdefault(path.stem, []).append(path)
+    if len(by_stem.get(wanted, ())) == 1:
+        return by_stem[wanted][0]
+    raise ModelError(f"example-robot-data has no robot '{robot}'", hint=nearest_name_hint(robot, by_stem))
 
 
 def resolve_urdf_path(robot: str | Path) -> Path:
