@@ -15,6 +15,7 @@ from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError
 from yid_ocp.problem.options import SensorOptions
+from yid_ocp.sensors.joints import joint_angle_noise_std
 
 NAMES = ("a", "b", "c")
 STD = 1e-4
@@ -64,6 +65,10 @@ def test_a_recording_without_a_fault_is_not_in_doubt(seed):
 def test_steps_as_large_as_the_stated_noise_and_a_rest_on_one_of_them_are_not_in_doubt():
     step = 12**0.5 * STD
     assert causes(changed(RECORDING, position=step * np.rint(POSITION / step), velocity=None)) == set()
+    # however coarse an encoder is, if the recording says so
+    coarse = changed(RECORDING, position=0.01 * np.rint(POSITION / 0.01), position_resolution=0.01)
+    assert "quantised" in causes(replace(coarse, joints=replace(coarse.joints, position_resolution=None)))
+    assert causes(coarse) == causes(changed(coarse, position_std=None)) == set()
     rest, still = column(POSITION, 1, lambda x: 0 * x + 0.3), column(VELOCITY, 1, lambda v: 0 * v)
     assert causes(changed(RECORDING, position=rest, velocity=still, position_std=None)) == set()
 
@@ -213,6 +218,18 @@ def encoder_counts(seed: int, n: int = 3000) -> Recording:
     angle = np.sin(0.7 * t + seed) + 0.3 * np.sin(1.9 * t)
     step = 2 * np.pi / 4096
     return Recording(JointGroup(("a",), t - t[0], step * np.rint(angle / step)[:, None]), name=f"run_{seed}")
+
+
+def test_the_step_of_an_encoder_is_noise_of_its_variance_stated_or_seen_in_gaps_between_values():
+    step, unstated = 2 * np.pi / 4096, SensorOptions()
+    seen = encoder_counts(1, n=400).joints
+    assert joint_angle_noise_std(replace(seen, position_std=0.0), ("a",), unstated, "") == pytest.approx(step / 12**0.5)
+    both = replace(seen, position_std=3e-4, position_resolution=1e-3)
+    assert joint_angle_noise_std(both, ("a",), unstated, "") == pytest.approx(np.hypot(3e-4, 1e-3 / 12**0.5))
+    assert joint_angle_noise_std(both, ("a",), SensorOptions(std=1e-4), "") == 1e-4
+    # without steps there are none, however short the recording is
+    smooth = replace(seen, position=seen.position + 1e-4 * np.random.default_rng(0).standard_normal((400, 1)))
+    assert joint_angle_noise_std(replace(smooth, position_std=1e-4), ("a",), unstated, "") == 1e-4
 
 
 def test_equal_counts_of_an_encoder_are_no_second_copy_but_a_copied_stretch_is():

@@ -24,7 +24,12 @@ from yid_ocp.parallel import CasadiLockedCache
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import SensorOptions
 from yid_ocp.sensors.base import expand_to_joint_values
-from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
+from yid_ocp.sensors.joints import (
+    JOINT_EFFORT_GROUP_NAME,
+    JOINT_POSITION_GROUP_NAME,
+    is_noise_std_stated,
+    joint_angle_noise_std,
+)
 
 _ANGLE_LIMIT_MARGIN = 0.1  # beyond a joint's limits, where a robot's own model differs from its URDF [rad or m]
 _MAX_SPEED_RATIO = 1.5  # factor by which joints may turn faster than the URDF says that they can
@@ -264,10 +269,8 @@ def check_joint_excitation(
                 continue
             angle = joints.position[:, joints.names.index(joint)]
             noise = white_noise_std(joints.t, angle)
-            given = joints.position_std if position.std is None else position.std
-            if given is not None:
-                std = expand_to_joint_values(given, joints.names, (joint,), f"sensors.{JOINT_POSITION_GROUP_NAME}.std")
-                noise = max(noise, float(std[0]))
+            if is_noise_std_stated(joints, JOINT_POSITION_GROUP_NAME, position):
+                noise = max(noise, float(joint_angle_noise_std(joints, (joint,), position, recording.name)[0]))
             limit, width = max(limit, 6 * noise), float(np.ptp(angle))
             if not name or width > widest:
                 widest, name = width, recording.name

@@ -20,7 +20,7 @@ from yid_ocp.data.issues import (
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.sensors import CHANNEL_KINDS
-from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_DIFFERENCE_ORDER
+from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, NOISE_DIFFERENCE_ORDER, quantization_step
 
 _MAX_REPEATED_FRACTION = 0.1  # of a channel's samples, which may repeat the previous one
 _MAX_STEPS_AT_REST, _MAX_FRACTION_AT_REST = 2.5, 0.2  # next to a rest, in smallest and median changes of a channel
@@ -111,19 +111,6 @@ def white_noise_std(t: Array, values: Array) -> float:
     return float(1.4826 * np.median(np.abs(np.diff(values, NOISE_DIFFERENCE_ORDER)[together])) / size)
 
 
-def quantization_step(values: Array) -> float:
-    """Quantization step of a channel, zero if it is not quantized."""
-    levels = np.unique(values)
-    if not 1 < len(levels) < 0.7 * values.size:
-        return 0.0
-    apart = np.diff(levels)
-    step = float(np.min(apart[apart > 1e-9 * np.ptp(levels)], initial=np.inf))
-    if not math.isfinite(step):
-        return 0.0
-    count = apart / step
-    return step if np.mean(np.abs(count - np.rint(count)) < 0.05 * np.maximum(count, 1)) > 0.95 else 0.0
-
-
 def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, channel: str) -> float:
     """Standard deviation that settings or recording give to a channel, zero where nobody says."""
     joints = recording.joints
@@ -134,6 +121,8 @@ def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, chann
             return float(said.get(name, 0.0))
         recorded = getattr(joints, CHANNEL_KINDS[f"joints.{quantity}"].std_attribute_names[0])
         given = said if said is not None else recorded if recorded is not None else 0.0
+        if quantity == "position" and said is None and joints.position_resolution is not None:
+            given = np.hypot(given, joints.position_resolution / math.sqrt(12))
         return float(np.broadcast_to(given, (len(joints.names),))[joints.names.index(name)])
     said = choice(group).std
     if isinstance(said, (int, float)):

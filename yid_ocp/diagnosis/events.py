@@ -18,7 +18,6 @@ import numpy as np
 import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
-from yid_ocp.data.channel_checks import quantization_step
 from yid_ocp.diagnosis.hypotheses import mask_out_samples
 from yid_ocp.diagnosis.localise import generalised_force_unit, is_significantly_nonzero
 from yid_ocp.diagnosis.pulse_detection import (
@@ -41,6 +40,7 @@ from yid_ocp.problem.measurements import Measurements, subtract_estimated_biases
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.problem.signal_filters import two_pass_effort_filter
 from yid_ocp.sensors.base import CHANNEL_KINDS, expand_to_joint_values
+from yid_ocp.sensors.joints import quantization_step
 
 _RecordingRollout = tuple[Episode, EpisodePrediction, Array]
 """A recording, its prediction and the parameters theta of that."""

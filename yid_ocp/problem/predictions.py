@@ -20,6 +20,7 @@ from yid_ocp.sensors.base import EffortKind, expand_to_joint_values
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
     JOINT_POSITION_GROUP_NAME,
+    is_noise_std_stated,
     joint_angle_noise_std,
     joint_torque_bias_std,
     joint_torque_noise_std,
@@ -378,25 +379,26 @@ def _levels(
     assert joints is not None
     effort = predictor.options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions())
     position = predictor.options.sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions())
-    joint_angles = joints.position_std if position.std is None else position.std
-    torques = joints.effort_std if effort.std is None else effort.std
+    kinds = (
+        (JOINT_POSITION_GROUP_NAME, position, joint_angle_noise_std),
+        (JOINT_EFFORT_GROUP_NAME, effort, joint_torque_noise_std),
+    )
+    known = [is_noise_std_stated(joints, group, choice) for group, choice, _ in kinds]
     if episode.input_errors is None:
         angle, torque = (
-            None if given is None else expand_to_joint_values(given, joints.names, names, f"sensors.{group}.std")
-            for group, given in ((JOINT_POSITION_GROUP_NAME, joint_angles), (JOINT_EFFORT_GROUP_NAME, torques))
+            noise_std(joints, names, choice, episode.name) if stated else None
+            for stated, (_, choice, noise_std) in zip(known, kinds, strict=True)
         )
         return angle, torque, None
     at, rest = [names.index(name) for name in driven], [i for i, name in enumerate(names) if name not in driven]
     other = tuple(names[i] for i in rest)
-    angle, torque, bias = np.zeros((3, len(names)))
-    angle[at] = joint_angle_noise_std(joints, driven, position, episode.name)
-    torque[at] = joint_torque_noise_std(joints, driven, effort, episode.name)
-    bias[at] = joint_torque_bias_std(joints, driven, effort)
-    if other:
-        stated = ((angle, joint_angles, JOINT_POSITION_GROUP_NAME), (torque, torques, JOINT_EFFORT_GROUP_NAME))
-        for target, std, group in stated:
-            own = 0.0 if std is None else std
-            target[rest] = expand_to_joint_values(own, joints.names, other, f"sensors.{group}.std")
+    levels = np.zeros((3, len(names)))
+    levels[2, at] = joint_torque_bias_std(joints, driven, effort)
+    for level, stated, (_, choice, noise_std) in zip(levels[:2], known, kinds, strict=True):
+        level[at] = noise_std(joints, driven, choice, episode.name)
+        if other and stated:
+            level[rest] = noise_std(joints, other, choice, episode.name)
+    angle, torque, bias = levels
     return angle, torque, bias
 
 

@@ -32,6 +32,7 @@ JOINT_EFFORT_GROUP_NAME = "joints.effort"
 JOINT_POSITION_GROUP_NAME = "joints.position"
 _EFFORT = CHANNEL_KINDS.register(JOINT_EFFORT_GROUP_NAME)(ChannelKind("joints", "effort", "N m"))
 _POSITION = CHANNEL_KINDS.register(JOINT_POSITION_GROUP_NAME)(ChannelKind("joints", "position", "rad"))
+_MAX_STEPS_PER_GAP = 0.1  # median gap between a quantized channel's values, in smallest gaps and per value
 NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate a noise level: they remove motion slow against sampling
 
 
@@ -172,23 +173,57 @@ def smoothed_effort_data(
 
 
 def is_noise_std_stated(joints: RecordedJoints, group: str, choice: SensorOptions) -> bool:
-    """Whether the recording or the settings state the noise std of `joints.effort` or `joints.position`."""
-    return choice.std is not None or getattr(joints, CHANNEL_KINDS[group].std_attribute_names[0]) is not None
+    """Whether the recording or the settings state the noise std of `joints.effort` or `joints.position`.
+
+    The step of the encoders, where the recording states it, is a statement of their noise.
+    """
+    names = [CHANNEL_KINDS[group].std_attribute_names[0]]
+    names += ["position_resolution"] if group == JOINT_POSITION_GROUP_NAME else []
+    return choice.std is not None or any(getattr(joints, name) is not None for name in names)
+
+
+def quantization_step(values: Array) -> float:
+    """Quantization step of a channel from the gaps between its values, zero if it is not quantized."""
+    levels = np.unique(values)
+    apart = np.diff(levels)
+    step = float(np.min(apart[apart > 1e-9 * np.ptp(levels)], initial=np.inf))
+    if not math.isfinite(step):
+        return 0.0
+    count = apart / step
+    # a short recording repeats few values; without steps its smallest gap is far below the median of as many
+    if len(levels) >= 0.7 * values.size and np.median(count) > _MAX_STEPS_PER_GAP * len(levels):
+        return 0.0
+    return step if np.mean(np.abs(count - np.rint(count)) < 0.05 * np.maximum(count, 1)) > 0.95 else 0.0
 
 
 def _joint_noise_std(
     joints: RecordedJoints, names: Sequence[str], choice: SensorOptions, where: str, *, group: str
 ) -> Array:
-    channel = CHANNEL_KINDS[group]
-    given = choice.std if choice.std is not None else getattr(joints, channel.std_attribute_names[0])
+    channel, columns = CHANNEL_KINDS[group], recorded_joint_columns(joints, tuple(names), where)
+    values, given, step = getattr(joints, channel.quantity)[:, columns], choice.std, np.zeros(len(names))
+    if given is None and group == JOINT_POSITION_GROUP_NAME:
+        found = joints.position_resolution
+        step = (
+            np.array([quantization_step(column) for column in values.T])
+            if found is None
+            else (expand_to_joint_values(found, joints.names, names, "position_resolution"))
+        )
+    step_std = step / math.sqrt(12)
     if given is None:
-        values = getattr(joints, channel.quantity)[:, recorded_joint_columns(joints, tuple(names), where)]
-        return _estimated_noise_std(values, where, group, channel.unit)
-    return expand_to_joint_values(given, joints.names, names, f"sensors.{group}.std")
+        given = getattr(joints, channel.std_attribute_names[0])
+    if given is not None:
+        return np.hypot(expand_to_joint_values(given, joints.names, names, f"sensors.{group}.std"), step_std)
+    if is_noise_std_stated(joints, group, choice):
+        return step_std
+    return np.maximum(_estimated_noise_std(values, where, group, channel.unit), step_std)
 
 
 joint_angle_noise_std = partial(_joint_noise_std, group=JOINT_POSITION_GROUP_NAME)
-"""Noise standard deviation of driven joints' encoders, stated or estimated, shape (len(names),) [rad]."""
+"""Noise standard deviation of joints' encoders, stated or estimated, shape (len(names),) [rad].
+
+Unless the settings give it, a step of the encoder adds the variance step^2/12; it is that of the recording's
+`position_resolution`, else the one that gaps between values show.
+"""
 joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_GROUP_NAME)
 """Noise standard deviation of driven joints' recorded torques, stated or estimated, shape (len(names),) [N m]."""
 
@@ -224,9 +259,9 @@ def _smoothed_effort_noise(
     value_gain, _, second_gain = around.effort_filter.noise_gains_of_value_and_rates(period)
     joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
     assert joints is not None
-    known = encoders.std if encoders.std is not None else joints.position_std
-    key = f"sensors.{JOINT_POSITION_GROUP_NAME}.std"
-    angle = expand_to_joint_values(0.0 if known is None else known, joints.names, names, key)
+    angle = np.zeros(len(names))
+    if is_noise_std_stated(joints, JOINT_POSITION_GROUP_NAME, encoders):
+        angle = joint_angle_noise_std(joints, names, encoders, around.recording.name)
     own = (std * value_gain) ** 2
     if not np.any(angle > 0):
         return np.broadcast_to(np.sqrt(own), (len(times), len(names))), None

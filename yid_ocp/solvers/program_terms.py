@@ -51,7 +51,7 @@ class LocalVariableFunction:
         return compiled_casadi_function(function) if self._use_compiler else function
 
     @ThreadSafeCachedProperty
-    def weighted_hessian_function(self) -> ca.Function | None:
+    def _weighted_hessian_function(self) -> ca.Function | None:
         """CasADi function (v, d, s, weight) of the sparse Hessian of weight . y by v; None where y is linear."""
         # one product with a direction, for each colour of the pattern: the whole would be millions of operations
         v, weight = self._inputs[0], ca.SX.sym("weight", self._expression.numel())
@@ -113,7 +113,7 @@ class ProgramTerm:
 
     def weighted_hessian_triplets(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
         """Hessian of weight . values by w as entries, rows, columns (positions may repeat); None where it is zero."""
-        function = self.local_function.weighted_hessian_function
+        function = self.local_function._weighted_hessian_function
         if function is None:
             return None
         weights = ca.reshape(weight, len(self.row_names), len(self.variable_indices))

@@ -95,9 +95,9 @@ class ParameterEvaluator:
 
     def is_identically_zero(self, expression: ca.SX) -> bool:
         """Whether an expression, with the parameters at their values, is zero for all values of its other symbols."""
-        return bool(ca.sparsify(self.substitute_parameter_values(expression)).is_zero())
+        return bool(ca.sparsify(self._substitute_parameter_values(expression)).is_zero())
 
-    def substitute_parameter_values(self, expression: ca.SX) -> ca.SX:
+    def _substitute_parameter_values(self, expression: ca.SX) -> ca.SX:
         """The expression with parameters replaced by their values."""
         return ca.substitute(expression, self._symbols, ca.DM(self._theta))
 
@@ -205,11 +205,11 @@ def _joint_terms(system: System, effect: Effect, value: ParameterEvaluator) -> d
     none, h = ca.SX(0, 1), ca.SX.sym("h")
     kinematics = forward_kinematics(system.mechanism, q)
     terms = effect.step_terms(MidpointState(system, kinematics, q, v, none, none, u, reaction, {}, h))
-    energy, closed = value.substitute_parameter_values(terms.lagrangian), terms.force_with_derivatives
+    energy, closed = value._substitute_parameter_values(terms.lagrangian), terms.force_with_derivatives
     force = ca.gradient(energy, q)
     for part in (terms.generalized_force, terms.dissipative_force, None if closed is None else closed.force):
         if part is not None:
-            force += value.substitute_parameter_values(ca.densify(part))
+            force += value._substitute_parameter_values(ca.densify(part))
     if ca.sparsify(ca.vertcat(energy, force)).is_zero():
         return {}
     momentum = ca.gradient(energy, v)

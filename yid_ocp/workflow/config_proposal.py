@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from yid_ocp.arrays import Array
-from yid_ocp.data.channel_checks import quantization_step, white_noise_std
+from yid_ocp.data.channel_checks import white_noise_std
 from yid_ocp.data.readers import mean_sample_rate
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import ConfigError, nearest_name_hint
@@ -19,6 +19,7 @@ from yid_ocp.files import named_attributes
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf
+from yid_ocp.sensors.joints import quantization_step
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
 """What the frame at the end of an arm is called, the likeliest first."""
