@@ -39,9 +39,9 @@ from yid_ocp.model.objects.cable import (
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
-    clamp_displacement_baseline,
     constant_position_baseline,
     interpolated_displacement_baseline,
+    mean_clamp_displacement_baseline,
     measured_point_positions,
     position_rmse,
 )
@@ -132,7 +132,7 @@ def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
     free, measured = cable.free_vertex_names, measured_point_positions(recording, cable.free_vertex_names)
     predictions = {
         "stay": constant_position_baseline(recording, free),
-        "move_with_clamps": clamp_displacement_baseline(recording, free, cable.clamped_vertex_names),
+        "move_with_clamps": mean_clamp_displacement_baseline(recording, free, cable.clamped_vertex_names),
         "linear_carry": interpolated_displacement_baseline(
             recording, free, cable.parent_branch_points, cable.child_branch_points, cable.clamped_vertex_names
         ),
@@ -229,7 +229,7 @@ def show(result: Mapping[str, Any], console: Console) -> None:
     def row(name: str, entry: Mapping[str, Any], plain: Mapping[str, float]) -> None:
         errors = [
             plain["constant_position_baseline"],
-            plain["clamp_displacement_baseline"],
+            plain["mean_clamp_displacement_baseline"],
             plain["interpolated_displacement_baseline"],
         ]
         errors += [entry["nominal"], entry["undeformed_rest"], entry["error"]]

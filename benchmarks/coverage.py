@@ -34,11 +34,11 @@ import yid_ocp
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import ModelError
-from yid_ocp.files import json_sha256, write_json
+from yid_ocp.files import json_sha256, write_strict_json
 from yid_ocp.model.system import System
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, aligned_table_lines, summary_terminal_lines
-from yid_ocp.sensors.base import EffortKind
+from yid_ocp.sensors.base import EffortSamplingKind
 from yid_ocp.version import source_hash
 from yid_ocp.virtual.experiment import ArmSensorNoise, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
 from yid_ocp.virtual.joint_motion import (
@@ -94,7 +94,7 @@ class Cell:
     effort_bias: float = 0.0
     stated: bool = True
     controller_rate: float = 100.0
-    effort_kind: EffortKind = "command"
+    effort_kind: EffortSamplingKind = "command"
     undeformed: bool = False
     sees: tuple[str, ...] = ("points_arm", "points_camera")
     settings: tuple[str, ...] = ()
@@ -472,7 +472,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.record_only:
         return 1 if any(entry.error for entries in made.values() for entry in entries) else 0
     twins = solve(made, workers, chosen.out)
-    write_json(
+    write_strict_json(
         chosen.out / "coverage.json", {cell: [asdict(twin) for twin in entries] for cell, entries in twins.items()}
     )
     print("\n".join(report(twins)))

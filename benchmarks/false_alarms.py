@@ -39,7 +39,7 @@ from make_recordings import OFFSETS, TRUTH
 
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
 from yid_ocp.data.recording_hdf5 import write_recording
-from yid_ocp.files import json_sha256, to_json_types, write_json
+from yid_ocp.files import json_sha256, to_json_types, write_strict_json
 from yid_ocp.parallel import Task, TaskResult, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import source_hash
@@ -276,7 +276,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1 if any(entry.error for entries in made.values() for entry in entries) else 0
     twins = diagnosed(made, chosen.candidates, workers, chosen.out)
     findings = {name: [asdict(twin) for twin in entries] for name, entries in twins.items()}
-    write_json(chosen.out / "false_alarms.json", findings)
+    write_strict_json(chosen.out / "false_alarms.json", findings)
     print("\n".join(report(twins)))
     return 1 if shortcomings(twins) else 0
 

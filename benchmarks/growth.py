@@ -34,7 +34,7 @@ from yid_ocp.diagnosis.diagnose import fit_nominal_model
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, make_candidate_effects
 from yid_ocp.diagnosis.screening import linearize_candidates
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS
-from yid_ocp.files import write_json
+from yid_ocp.files import write_strict_json
 from yid_ocp.integrator import compiled
 from yid_ocp.parallel import Task, WorkerConfig, process_pool, run_tasks
 from yid_ocp.problem import EstimationProblem
@@ -280,7 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         slopes[axis] = {of: slope(found[axis], by, of) for of in ("cpu", "memory")}
     if chosen.json is not None:
         kept = {axis: {of: value for of, value in own.items() if math.isfinite(value)} for axis, own in slopes.items()}
-        write_json(chosen.json, {"points": found, "slopes": kept})
+        write_strict_json(chosen.json, {"points": found, "slopes": kept})
     print("\n".join(report(found, slopes)))
     return 0
 

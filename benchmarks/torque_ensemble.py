@@ -25,7 +25,7 @@ from make_recordings import OFFSET, OFFSETS, ROUGH, TRUTH, WHITE
 from yid_ocp.analysis.compare import PAPER_ESTIMATES, is_within_ensemble_range
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import ModelError
-from yid_ocp.files import json_sha256, write_json
+from yid_ocp.files import json_sha256, write_strict_json
 from yid_ocp.parallel import Task, WorkerConfig, run_tasks
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.version import source_hash
@@ -152,7 +152,7 @@ def main() -> None:
         parser.error(f"there is no experiment '{unknown[0]}'; choose from {', '.join(PAPER_ESTIMATES)}")
     experiments = [name for name in PAPER_ESTIMATES if name in chosen.experiments or not chosen.experiments]
     found = run(experiments, chosen.errors, chosen.members, WorkerConfig(chosen.workers, chosen.scheduler), chosen.out)
-    write_json(chosen.out / "torque_ensemble.json", found)
+    write_strict_json(chosen.out / "torque_ensemble.json", found)
     print("\n".join(report(found)))
 
 

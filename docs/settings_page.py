@@ -13,7 +13,7 @@ from typing import Any
 from yid_ocp.config.schema import option_info_from_annotation, section_variants_from_annotation
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.model.objects import OBJECT_KINDS
-from yid_ocp.options import Option, dataclass_options, describe_type, mapping_value_type, tuple_entry_type
+from yid_ocp.options import Option, dataclass_options, describe_type, mapping_value_type, variadic_tuple_entry_type
 
 HEAD = """\
 # Settings
@@ -49,7 +49,7 @@ def tables(hint: Any, path: str) -> Iterator[tuple[str, str, list[str]]]:
         yield title, (kind.__doc__ or "").splitlines()[0], [row(*item) for item in options.items()]
         for name, option in options.items():
             yield from tables(option.type_hint, f"{path}.{name}" if path else name)
-    values, entries = mapping_value_type(hint), tuple_entry_type(hint)
+    values, entries = mapping_value_type(hint), variadic_tuple_entry_type(hint)
     named = section_variants_from_annotation(values)
     if values is not None and (named is None or named.selector_key != "name"):
         yield from tables(values, f"{path}.NAME")

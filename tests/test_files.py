@@ -15,7 +15,15 @@ import pytest
 from yid_ocp.config.reader import load_config
 from yid_ocp.data.readers import preview_file, read_any
 from yid_ocp.errors import ConfigError, DataError, ModelError, OutputError
-from yid_ocp.files import atomic_write, file_sha256, is_file, json_sha256, read_input_json, to_json_types, write_json
+from yid_ocp.files import (
+    atomic_write,
+    file_sha256,
+    is_file,
+    json_sha256,
+    read_input_json,
+    to_json_types,
+    write_strict_json,
+)
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences, source_hash
 
@@ -32,22 +40,22 @@ def test_an_interruption_leaves_nothing(tmp_path):
 
 def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path, monkeypatch):
     file = tmp_path / "a.json"
-    write_json(file, {"a": 1})
-    write_json(file, {"a": [2, None]})
+    write_strict_json(file, {"a": 1})
+    write_strict_json(file, {"a": [2, None]})
     with pytest.raises(ValueError, match="not JSON compliant"):
-        write_json(file, {"a": float("nan")})
+        write_strict_json(file, {"a": float("nan")})
     monkeypatch.setattr(os, "replace", Mock(side_effect=OSError(28, "any words")))
     with pytest.raises(OutputError, match=os.strerror(28)):
-        write_json(file, 1)
+        write_strict_json(file, 1)
     assert json.loads(file.read_text()) == {"a": [2, None]}
     assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
 def test_a_place_that_cannot_hold_a_file(tmp_path):
     with pytest.raises(OutputError, match="that of a folder"):
-        write_json(tmp_path, 1)
+        write_strict_json(tmp_path, 1)
     with pytest.raises(OutputError, match="does not exist"):
-        write_json(tmp_path / "no" / "a.json", 1)
+        write_strict_json(tmp_path / "no" / "a.json", 1)
 
 
 def test_the_hash_of_a_folder_is_that_of_its_files(tmp_path):

@@ -137,8 +137,8 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def write_json(path: Path, data: Any) -> None:
-    """Write plain data as indented JSON atomically; errors as `atomic_write`, and ValueError for infinities and NaN."""
+def write_strict_json(path: Path, data: Any) -> None:
+    """Write plain data, without conversion, as JSON atomically; as `atomic_write`, ValueError for infinity and NaN."""
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 

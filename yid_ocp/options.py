@@ -96,7 +96,7 @@ def mapping_value_type(hint: Any) -> Any:
     return next((get_args(bare)[1] for bare in found if get_origin(bare) in (Mapping, dict)), None)
 
 
-def tuple_entry_type(hint: Any) -> Any:
+def variadic_tuple_entry_type(hint: Any) -> Any:
     """Entry type of a tuple of any length; None for other types."""
     bare, _ = split_annotated(hint)
     arguments = get_args(bare)
@@ -147,7 +147,7 @@ def check_option_bounds(options: Any, where: str) -> None:
 def _within(hint: Any, value: Any) -> bool:
     """Whether every number of a value is within the bounds of its type; True for other values."""
     if isinstance(value, tuple):
-        entries = tuple_entry_type(hint)
+        entries = variadic_tuple_entry_type(hint)
         return entries is None or all(_within(entries, entry) for entry in value)
     if not isinstance(value, (int, float)):
         return True

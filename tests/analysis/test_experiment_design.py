@@ -370,7 +370,7 @@ def drawn_motion(monkeypatch):
     monkeypatch.setattr(propagation, "applied_torque_by_torque_error", lambda gain, momentum: np.eye(NU))
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
     shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
-    functions = SimpleNamespace(step=None, momentum_shift=shift)
+    functions = SimpleNamespace(step=None, reference_momentum_shift=shift)
     feedback = SimpleNamespace(state_indices=[0, 1], gain=0.3 * rng.standard_normal((STEPS, NU, 2)))
     course = SimpleNamespace(
         model_functions=functions, tracking_feedback=feedback, theta=None, rollout=None,
@@ -474,7 +474,7 @@ def test_a_predicted_camera_tells_beside_wrong_torques_what_it_tells_when_it_is_
     # what is there tells of errors of torques too: those that the real recording tells of
     errors = problem_whitened_at(noisy, noisy.initial_unknowns, rounds=2).episodes[0].input_errors
     effort = recording.joints.effort.copy()
-    effort[: len(errors.torque_noise)] -= errors.total_torque_error
+    effort[: len(errors.torque_noise)] -= errors.estimated_torque_error
     faster = replace(recording, points=tuple(groups), joints=replace(recording.joints, effort=effort))
     values = noisy.named_values(noisy.initial_unknowns)
     problem = EstimationProblem(noisy.step, [faster], noisy.free, noisy.options, values)

@@ -241,7 +241,7 @@ def numbers(hint, wrap=lambda value: value, path=(), option=None):
     elif values is not None:
         yield from numbers(values, within(wrap, "NAME"), (*path, "NAME"), option)
     for member in options.union_members(hint):
-        entries, (bare, markers) = options.tuple_entry_type(member), options.split_annotated(member)
+        entries, (bare, markers) = options.variadic_tuple_entry_type(member), options.split_annotated(member)
         if entries is not None:
             yield from numbers(entries, lambda value: wrap([value]), path, option)
         if bare in (int, float):
@@ -256,7 +256,7 @@ def within(wrap, name, beside=None):
 
 def needed_value(hint):
     bare, _ = options.split_annotated(hint)
-    return 1.0 if bare is float else [*"abcde"] if options.tuple_entry_type(hint) is not None else "a"
+    return 1.0 if bare is float else [*"abcde"] if options.variadic_tuple_entry_type(hint) is not None else "a"
 
 
 NUMBERS = list(numbers(RunSettings))

@@ -338,7 +338,7 @@ def predicting(monkeypatch):
 
     def rows(i, there, result):
         pairs = zip(there.measurements, result.predicted_outputs, strict=True)
-        return SimpleNamespace(residual=np.concatenate([group.residual_block(x).residual for group, x in pairs]))
+        return SimpleNamespace(residual=np.concatenate([group.residual_and_jacobian(x).residual for group, x in pairs]))
 
     usual = {"whitened_held_out_residual": rows, "has_process_noise": False, "options": ProblemOptions()}
     usual |= {"shared_parameters": (), "unknown_names": (), "initial_unknowns": np.zeros(0)}

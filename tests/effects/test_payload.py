@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from yid_ocp.effects import EFFECTS, make_effect
-from yid_ocp.effects.base import arm_link_end_frame_names, arm_link_frame_names, effort_limit_over_baxter
+from yid_ocp.effects.base import arm_link_end_frame_names, effort_limit_over_baxter, one_frame_name_per_arm_link
 from yid_ocp.effects.bodies import _MAX_COM_SHIFT, _MAX_PAYLOAD_DISTANCE
 from yid_ocp.model import Mechanism, System
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
@@ -157,7 +157,7 @@ def test_a_search_begins_with_the_other_sign_too(mass, moments, other) -> None:
 
 def test_places_for_a_mass() -> None:
     one = baxter_foam_y_system(1)
-    frames = arm_link_frame_names(one)
+    frames = one_frame_name_per_arm_link(one)
     assert len(frames) == 7
     assert frames[-1] == "left_gripper"
     ends = arm_link_end_frame_names(one)
@@ -169,14 +169,14 @@ def test_places_for_a_mass() -> None:
     names = [f"panda_joint{i}" for i in range(1, 8)]
     robot = read_urdf("package:panda", joints=names, exclude_links=["panda_hand"])
     bare = System.build(robot, prescribed=names)
-    assert arm_link_frame_names(bare)[-1] == "panda_link8"
+    assert one_frame_name_per_arm_link(bare)[-1] == "panda_link8"
     # joints 1 and 2 meet where nothing moves, 5 and 6 in one place
     assert sorted(arm_link_end_frame_names(bare)) == [f"panda_link{i}" for i in (3, 4, 5, 7, 8)]
     whole = read_urdf("package:panda")
     fingers = [j.name for j in whole.joints if j.kind == "prismatic"]
     held = System.build(whole, prescribed=whole.joint_names)
     assert fingers
-    carriers = {held.mechanism.frame(name).joint_index for name in arm_link_frame_names(held)}
+    carriers = {held.mechanism.frame(name).joint_index for name in one_frame_name_per_arm_link(held)}
     assert held.mechanism.joint_index(fingers[0]) not in carriers
 
 

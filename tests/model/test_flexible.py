@@ -20,7 +20,7 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Segment, System, flexible_object, forward_kinematics
 from yid_ocp.model.flexible import relative_parallel_transport_rotations
-from yid_ocp.model.objects.base import init_object_builders
+from yid_ocp.model.objects.base import init_object_templates
 from yid_ocp.model.objects.foam_y import foam_y_object, foam_y_segments
 from yid_ocp.model.objects.tapered_rod import TaperedRod
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
@@ -262,6 +262,6 @@ def test_a_configuration_and_init_describe_it(tmp_path: Path) -> None:
     assert len(system.segment_layout("rod").link_joints) == 8
     assert divided_link_parameter_scale(run, "rod.bend", 2) == 1  # a rigidity
     given = {"length": LENGTH, "mass": MASS, "radius": 0.006, "tip_radius": 0.003}
-    made = init_object_builders()["tapered_rod"].build(given, 4)
+    made = init_object_templates()["tapered_rod"].build(given, 4)
     assert made.settings == replace(rod(4), joint_axes="xy", gravity_fraction=1.0)
     assert set(made.start_values) == {"rod.bend", "rod.damping"}

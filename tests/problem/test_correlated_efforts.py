@@ -39,17 +39,17 @@ def test_rows_are_independent_whatever_of_a_sample_was_seen():
     np.testing.assert_allclose(mixing @ covariance @ mixing, np.eye(5), atol=1e-12)
     predicted = np.array([[0.0, 1.0, 5.0], [1.0, 9.0, 2.0]])
     plain = 2.0 * np.array([-1.0, -1.0, 2.0, -3.0, -4.0])
-    np.testing.assert_allclose(made.residual_block(predicted).residual, mixing @ plain, rtol=1e-12)
+    np.testing.assert_allclose(made.residual_and_jacobian(predicted).residual, mixing @ plain, rtol=1e-12)
     np.testing.assert_allclose(made.whitened_residual(predicted)[made.used_output_mask], mixing @ plain, rtol=1e-12)
     assert made.whitened_residual(predicted)[1, 1] == 0.0
     slopes = np.random.default_rng(0).standard_normal((2, 3, 4))
-    found = made.residual_block(predicted, slopes, threshold=1.5)
+    found = made.residual_and_jacobian(predicted, slopes, threshold=1.5)
     seen = made.used_output_mask
     expected = found.robust_factor[:, None] * (mixing @ (2.0 * slopes[seen]))
     np.testing.assert_allclose(found.jacobian, expected, rtol=1e-12)
     pull = np.random.default_rng(1).standard_normal((2, 3))
     back = np.einsum("mk,mkd->d", made.whitened_residual_adjoint(np.where(seen, pull, 0.0)), slopes)
-    np.testing.assert_allclose(back, pull[seen] @ made.residual_block(predicted, slopes).jacobian, rtol=1e-12)
+    np.testing.assert_allclose(back, pull[seen] @ made.residual_and_jacobian(predicted, slopes).jacobian, rtol=1e-12)
 
 
 def arm(step, path, effort, angle=ANGLE, std=EFFORT, free=("shoulder.damping",), cutoff=CUTOFF, values=None, **joint):

@@ -13,9 +13,9 @@ from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.predictions import (
-    clamp_displacement_baseline,
     constant_position_baseline,
     interpolated_displacement_baseline,
+    mean_clamp_displacement_baseline,
     measured_point_positions,
     position_rmse,
     rmse_unit_and_count_by_channel,
@@ -130,7 +130,7 @@ def test_stay_repeats_the_last_given_frame(recording):
 
 
 def test_all_points_move_with_the_mean_of_the_clamps(recording):
-    predicted = clamp_displacement_baseline(recording, ("p2", "c1"), ("p0", "p4"))
+    predicted = mean_clamp_displacement_baseline(recording, ("p2", "c1"), ("p0", "p4"))
     np.testing.assert_allclose(predicted[-1, :, 2], 2e-3 * 9)
     np.testing.assert_allclose(predicted[-1, :, :2], [[0.2, 0.0], [0.2, 0.1]])
 
@@ -154,7 +154,7 @@ def test_baselines_never_look_at_free_points_after_the_given_frames(recording):
     free = ("p1", "p2", "p3", "c1", "c2")
     for method in (
         lambda r: constant_position_baseline(r, free),
-        lambda r: clamp_displacement_baseline(r, free, ("p0", "p4")),
+        lambda r: mean_clamp_displacement_baseline(r, free, ("p0", "p4")),
         lambda r: interpolated_displacement_baseline(r, free, PARENT, CHILDREN),
     ):
         np.testing.assert_array_equal(method(recording)[2:], method(other)[2:])

@@ -62,7 +62,7 @@ TWO = measured(efforts("a", "b"), [0, 1], [0.0, 0.0], [[1.0, NAN], [3.0, 4.0]], 
 def test_rows_are_whitened_differences_where_something_was_measured():
     predicted = np.array([[2.0, 9.0], [1.0, 5.0]])
     np.testing.assert_array_equal(TWO.whitened_residual(predicted), [[2.0, 0.0], [-1.0, 10.0]])
-    found = TWO.residual_block(predicted)
+    found = TWO.residual_and_jacobian(predicted)
     np.testing.assert_array_equal(found.residual, [2.0, -1.0, 10.0])
     np.testing.assert_array_equal(found.robust_factor, [1.0, 1.0, 1.0])
     assert found.cost == pytest.approx(0.5 * (4 + 1 + 100))
@@ -73,7 +73,7 @@ def test_rows_are_whitened_differences_where_something_was_measured():
 
 def test_rows_have_the_slopes_of_their_predictions_and_a_robust_weight():
     slopes = np.arange(12.0).reshape(2, 2, 3)
-    found = TWO.residual_block(np.array([[2.0, 9.0], [1.0, 5.0]]), slopes, threshold=2.5)
+    found = TWO.residual_and_jacobian(np.array([[2.0, 9.0], [1.0, 5.0]]), slopes, threshold=2.5)
     np.testing.assert_allclose(found.residual, [2.0, -1.0, 5.0])
     np.testing.assert_allclose(found.robust_factor, [1.0, 1.0, 0.5])
     np.testing.assert_allclose(found.jacobian, [[0, 2, 4], [3, 3.5, 4], [45, 50, 55]])

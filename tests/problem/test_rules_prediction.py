@@ -231,7 +231,7 @@ def test_heavier_joints_have_more_momentum_for_the_filter_to_follow(urdf_folder)
     problem = problem_of(urdf_folder, "driven, filtered, both", seeds=(1,))
     episode, vector = problem.episodes[0], problem.system.parameters.vector
     neutral = {name: value for effect in problem.system.effects for name, value in effect.neutral_values.items()}
-    none, shifted = np.zeros(problem.step.sizes["nx"]), problem.predictor.corrected_inputs_with_momentum_shift
+    none, shifted = np.zeros(problem.step.sizes["nx"]), problem.predictor.inputs_with_reference_momentum_shift
     assert shifted(episode, vector(neutral), (), none).momentum_shift is None
     name = "rotor_inertia@shoulder.armature"
     found = shifted(episode, vector(neutral | {name: 0.05}), (name,), none)

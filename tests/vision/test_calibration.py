@@ -21,7 +21,7 @@ from yid_ocp.vision.camera_registration import (
     CalibrationFrame,
     CameraState,
     _CalibrationEquations,
-    quadratic_robust_cost,
+    robust_gradient_and_hessian,
 )
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, load_robot_meshes
 
@@ -201,7 +201,7 @@ def test_errors_alike_in_a_frame_or_on_a_patch_count_as_one_and_others_only_once
     by_patch = own * 0.1 + 1e-2 * rng.standard_normal(patches)[np.newaxis, places[0]]
 
     def variance(errors):
-        found = quadratic_robust_cost(rows_of(errors, places), 10.0)
+        found = robust_gradient_and_hessian(rows_of(errors, places), 10.0)
         return found.score_covariance[0, 0] / found.hessian[0, 0]
 
     alone = variance(own)
@@ -215,7 +215,7 @@ def test_one_frame_at_its_minimum_has_the_errors_of_its_patches():
     """The sum over a frame is zero at the minimum: without a least value its errors would seem to be none."""
     rng = np.random.default_rng(1)
     error = np.tile(1e-2 * rng.standard_normal(50), 2) * np.repeat([1.0, -1.0], 50)
-    found = quadratic_robust_cost(rows_of([error], [np.arange(100)]), 10.0)
+    found = robust_gradient_and_hessian(rows_of([error], [np.arange(100)]), 10.0)
     assert abs(found.gradient[0]) < 1e-9 * found.hessian[0, 0]
     assert found.score_covariance[0, 0] / found.hessian[0, 0] == pytest.approx(0.41, rel=0.3)
 

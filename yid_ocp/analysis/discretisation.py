@@ -343,7 +343,7 @@ def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> Al
         begin = predictor.initial_state(episode, theta, offset, ())
         if begin.failure_message:
             continue
-        inputs = predictor.corrected_inputs_with_momentum_shift(episode, theta, (), begin.state)
+        inputs = predictor.inputs_with_reference_momentum_shift(episode, theta, (), begin.state)
         feedback = inputs.corrected_feedback(
             episode.tracking_feedback, system.driven_coordinate_indices, episode.measured_driven_angles
         )

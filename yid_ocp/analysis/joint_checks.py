@@ -355,7 +355,7 @@ def check_efforts_by_inverse_dynamics(arm: RecordedJointsModel, recording: Recor
     found = list(_limits(arm, motion.effort, largest))
     most = [float(np.max(np.abs(values), initial=0.0)) for values in (needed, motion.effort)]
     if most[0] > _MIN_EFFORT and max(most) < _MAX_FITTED_EFFORT:
-        commanded = joints.effort_kind_or_default == "command"
+        commanded = joints.effort_sampling_kind_or_default == "command"
         least = (_IDLE_COMMAND_FRACTION if commanded else 2 * _EFFORT_LIMIT_ERROR_FRACTION) * size
         # zero throughout although gravity and motion need more than the least that counts
         wanted = np.sqrt(np.mean(needed**2, axis=0))

@@ -102,7 +102,7 @@ def _read_angles(encoders: EstimationProblem, x: Array, i: int, blur: Array) -> 
     for samples, rows in zip(encoders.episodes[i].measurements, encoders.residual_rows.measurements[i], strict=True):
         if isinstance(samples.sensor, PositionSensor):
             read = samples.interpolate_to_samples(blur[samples.evaluation_nodes])
-            own = samples.residual_block(np.zeros(samples.value.shape), read).jacobian
+            own = samples.residual_and_jacobian(np.zeros(samples.value.shape), read).jacobian
             assert own is not None
             return np.hstack([evaluation.jacobian[rows], own])
     return np.zeros((0, len(x) + blur.shape[2]))
@@ -139,7 +139,7 @@ class _Motion:
 
     def __init__(self, course: NominalTrajectory, errors: InputErrorModel) -> None:
         step, feedback = course.model_functions.step, course.tracking_feedback
-        momentum = course.model_functions.momentum_shift.momentum_derivative_by_previous_torque(course.theta)
+        momentum = course.model_functions.reference_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
         self.by_state, self.by_torque, self.by_angles = list[Array](), list[Array](), list[Array]()
         for k, here in enumerate(linearized_steps(step, course.theta, course.rollout)):
             state, by_error = here.state_by_state.copy(), here.state_by_torque.copy()

@@ -260,7 +260,7 @@ class _Reader:
         return f"{self.origin}: {key}" if key else self.origin
 
     def build(self, hint: Any, raw: Any, path: _KeyPath) -> Any:
-        sections, entries = schema.section_variants_from_annotation(hint), options.tuple_entry_type(hint)
+        sections, entries = schema.section_variants_from_annotation(hint), options.variadic_tuple_entry_type(hint)
         inner = schema.section_variants_from_annotation(options.mapping_value_type(hint))
         if sections is not None:
             return None if raw is None and sections.is_nullable else self._section(sections, raw, path)
@@ -347,7 +347,7 @@ def _refuse_nan(word: str) -> float:
 def _absolute(value: Any, hint: Any, base: Path) -> Any:
     """Paths within a value, relative to the configuration no longer."""
     if isinstance(value, tuple):
-        entries = options.tuple_entry_type(hint)
+        entries = options.variadic_tuple_entry_type(hint)
         return value if entries is None else tuple(_absolute(entry, entries, base) for entry in value)
     markers = [marker for part in (hint, *options.union_members(hint)) for marker in options.split_annotated(part)[1]]
     is_path = any(isinstance(marker, options.OptionInfo) and marker.is_path for marker in markers)

@@ -111,7 +111,7 @@ def iter_settable_key_completions(hint: Any, prefix: str, raw: Any, at: str = ""
 
 def _sections_with_key(hint: Any, name: str, at: str = "") -> Iterator[str]:
     """Yield descriptions of the sections that have a key; NAME represents a user-chosen name."""
-    for inner, step in ((options.mapping_value_type(hint), ".NAME"), (options.tuple_entry_type(hint), "")):
+    for inner, step in ((options.mapping_value_type(hint), ".NAME"), (options.variadic_tuple_entry_type(hint), "")):
         if inner is not None:
             yield from _sections_with_key(inner, name, at + step)
     sections = section_variants_from_annotation(hint)
@@ -139,7 +139,7 @@ def _described_schema(hint: Any) -> dict[str, Any]:
 
 
 def _type_schema(hint: Any) -> dict[str, Any]:
-    sections, entries = section_variants_from_annotation(hint), options.tuple_entry_type(hint)
+    sections, entries = section_variants_from_annotation(hint), options.variadic_tuple_entry_type(hint)
     values = options.mapping_value_type(hint)
     if sections is not None:
         parts = [_section_schema(sections, word) for word in sections.classes]

@@ -173,7 +173,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
     do steps. What has no noise at all was computed, as commands are.
     """
     found: dict[str, list[tuple[str, float, float]]] = {}
-    commanded = recording.joints is not None and recording.joints.effort_kind_or_default == "command"
+    commanded = recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command"
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         sensor = f"joints.{channel.partition('.')[0]}" if group == "joints" else group
         said, step = choice(sensor), median_sample_period(t)
@@ -211,7 +211,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
 
 def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
     """Issues for efforts that repeatedly equal their extreme value exactly."""
-    if recording.joints is not None and recording.joints.effort_kind_or_default == "command":
+    if recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command":
         return  # what a controller asks for ends at its own bound
     for group, channel, t, values in _channels(recording, "effort"):
         for sign in (1.0, -1.0):

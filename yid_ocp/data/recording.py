@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, BoolArray
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError, nearest_name_hint
-from yid_ocp.sensors.base import EffortKind, channel_kinds_of_group
+from yid_ocp.sensors.base import EffortSamplingKind, channel_kinds_for_group_name
 
 RecordedOrNominalClock = Literal["recorded", "nominal"]
 
@@ -90,7 +90,7 @@ class JointGroup(ReprMixin):
     effort_bias_std: float | Array | None = None
     position_resolution: float | Array | None = None
     proportional_gain: float | Array | None = None
-    effort_kind: EffortKind | None = None
+    effort_kind: EffortSamplingKind | None = None
     clock: RecordedOrNominalClock = "recorded"
 
     def __post_init__(self) -> None:
@@ -106,7 +106,7 @@ class JointGroup(ReprMixin):
         return {name: getattr(self, name) for name in JOINT_CHANNEL_UNITS if getattr(self, name) is not None}
 
     @property
-    def effort_kind_or_default(self) -> EffortKind:
+    def effort_sampling_kind_or_default(self) -> EffortSamplingKind:
         """`effort_kind`, or `sample` if it is not stated, which is what robot drivers publish."""
         return self.effort_kind or "sample"
 
@@ -293,7 +293,7 @@ class Recording(ReprMixin):
         """Time from the first sample of any group to the last of any [s]."""
         return float(max(group.t[-1] for group in self.all_groups) - min(group.t[0] for group in self.all_groups))
 
-    def with_effort_kind(self, kind: EffortKind | None) -> Recording:
+    def with_effort_kind(self, kind: EffortSamplingKind | None) -> Recording:
         """The recording with the given effort kind; unchanged for None."""
         if kind is None or self.joints is None:
             return self
@@ -417,7 +417,7 @@ def _validate_joints(joints: JointGroup, where: str, allow_nan_effort: bool) -> 
         if std is not None:
             _validate_std(std, len(joints.names), name, place, "one number or (nj,)")
     if joints.effort_kind is not None:
-        place, kinds = f"{where}, attribute effort_kind", get_args(EffortKind)
+        place, kinds = f"{where}, attribute effort_kind", get_args(EffortSamplingKind)
         what, hint = f"the kind is '{joints.effort_kind}'", "leave the attribute out where it is not known"
         require_data(joints.effort_kind in kinds, what, place, ", ".join(kinds), hint)
 
@@ -452,7 +452,7 @@ def _check_distances(positions: Array, where: str, remedy: str = "") -> None:
 
 def _validate_channels(group: SensorChannelGroup, where: str) -> None:
     _check_names_and_clock(group, where)
-    declared = {channel.quantity: channel for channel in channel_kinds_of_group(group.name)}
+    declared = {channel.quantity: channel for channel in channel_kinds_for_group_name(group.name)}
     fields = [name for channel in declared.values() for name in channel.std_attribute_names]
     own, stds = group.values_by_quantity, group.stds_by_attribute
     require_data(own, "the group has no values", where, ", ".join(declared))

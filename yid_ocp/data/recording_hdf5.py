@@ -37,7 +37,7 @@ from yid_ocp.data.recording import (
 )
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.sensors import CHANNEL_KINDS
-from yid_ocp.sensors.base import channel_kinds_of_group
+from yid_ocp.sensors.base import channel_kinds_for_group_name
 
 _RECORDING_FORMAT = "yid-recording/1"
 
@@ -86,7 +86,7 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
             attributes = [name for name in _POINT_ATTRIBUTES if name != "std"]
             _write_group(file.create_group(group.name), vars(group), _POINT_UNITS, attributes)
         for channels in recording.channel_groups:
-            units = {"t": "s"} | {c.quantity: c.unit for c in channel_kinds_of_group(channels.name)}
+            units = {"t": "s"} | {c.quantity: c.unit for c in channel_kinds_for_group_name(channels.name)}
             content, stds = {**vars(channels), **channels.values_by_quantity}, channels.stds_by_attribute
             _write_group(file.create_group(channels.name), {**content, **stds}, units, ("names", "clock", *stds))
         if recording.marker_reference_pose is not None:
@@ -119,7 +119,7 @@ def _from_file(file: h5py.File, path: Path, digest: str) -> Recording:
     further = sorted({CHANNEL_KINDS[kind].group for kind in CHANNEL_KINDS} - {"joints", "points"})
     allowed = ", ".join(["joints, points, points_<name>", *(f"{name}, {name}_<name>" for name in further), _STRAIGHT])
     for name in map(str, file):
-        where, declared = f"{origin}: {name}", channel_kinds_of_group(name)
+        where, declared = f"{origin}: {name}", channel_kinds_for_group_name(name)
         legal = name in ("joints", _STRAIGHT) or POINT_GROUP_NAME_PATTERN.fullmatch(name) or declared
         hint = "" if legal else nearest_name_hint(name, ("joints", "points", *further, _STRAIGHT))
         require_data(legal, f"the format has no group '{name}'", origin, allowed, hint)

@@ -36,7 +36,7 @@ from yid_ocp.diagnosis.verdict import (
 )
 from yid_ocp.display import ReprMixin, ReprSummary
 from yid_ocp.effects import EffectBase
-from yid_ocp.effects.base import EXCITATION_DESCRIPTIONS
+from yid_ocp.effects.base import ORDERED_EXCITATION_DESCRIPTIONS
 from yid_ocp.files import attributes_to_json, to_json_types
 from yid_ocp.inference.null_test import AssumedChannelNoiseLevel, NullTestResult, min_bonferroni_p_value
 from yid_ocp.inference.smoother import SmootherResult
@@ -338,7 +338,7 @@ _UNKNOWN_REASON_TEXTS = {
 def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
     """The experiment that separates indistinguishable effects, from what their equations depend on."""
     said = dict.fromkeys(effect.required_excitation for effect in rivals if effect.required_excitation)
-    known = [aspect for aspect in EXCITATION_DESCRIPTIONS if aspect in said]
+    known = [aspect for aspect in ORDERED_EXCITATION_DESCRIPTIONS if aspect in said]
     aspects = [*known, *(aspect for aspect in said if aspect not in known)]
     places = list(dict.fromkeys(effect.location for effect in rivals))
     case = "separate" if len(aspects) > 1 else "places" if len(places) > 1 else "vary" if aspects else "other"

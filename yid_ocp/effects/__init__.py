@@ -40,7 +40,7 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
     return base.build_effect(kind, location, system, values or {})
 
 
-def required_signal_kinds() -> frozenset[str]:
+def signal_kinds_required_by_any_effect() -> frozenset[str]:
     """Kinds of recorded signals that effects can require, such as `joints.effort`, plug-in effects included."""
     return frozenset(_SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
 
@@ -48,11 +48,11 @@ def required_signal_kinds() -> frozenset[str]:
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
     """Every pair (effect kind, location) possible in a system and visible in its recorded signals, ordered by kind.
 
-    The system is without the effects in question, the signals are among `required_signal_kinds`. What works only on
-    prescribed joints is left out where no effort was recorded, for there nothing would show it. `ModelError` of another
-    signal.
+    The system is without the effects in question, the signals are among `signal_kinds_required_by_any_effect`. What
+    works only on prescribed joints is left out where no effort was recorded, for there nothing would show it.
+    `ModelError` of another signal.
     """
-    present, known = set(recorded_sensors), required_signal_kinds()
+    present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()
     for name in sorted(present - known):
         raise ModelError(f"there is no kind of sensor '{name}'", **unknown_name_details(name, sorted(known)))
     unseen = set() if "joints.effort" in present else set(system.prescribed)

@@ -19,7 +19,7 @@ from yid_ocp.model.servos_and_springs import UNLIMITED_EFFORT_THRESHOLD
 from yid_ocp.model.system import Effect, System
 from yid_ocp.registry import Registry
 
-EXCITATION_DESCRIPTIONS = (
+ORDERED_EXCITATION_DESCRIPTIONS = (
     *("how fast it moves", "how long it is held", "how hard it accelerates", "how far it bends"),
     *("how it stands against gravity", "how hard it pulls at its ends", "when it is read", "where the camera stands"),
     "how long it is",
@@ -85,8 +85,8 @@ class EffectBase(Effect):
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
 
     equation: ClassVar[str] = ""  # that the kind adds, as text
-    # what a motion has to vary to distinguish the kind from others: one of `EXCITATION_DESCRIPTIONS`, or words that
-    # continue "vary ..."
+    # what a motion has to vary to distinguish the kind from others: one of `ORDERED_EXCITATION_DESCRIPTIONS`, or words
+    # that continue "vary ..."
     required_excitation: ClassVar[str] = ""
     required_sensors: ClassVar[frozenset[str]] = frozenset()  # without which the effect is not observable
     # whether its presence at one location says nothing about others, as for a mass; not so for friction
@@ -297,8 +297,8 @@ def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
     return tuple(found)
 
 
-def arm_link_frame_names(system: System) -> tuple[str, ...]:
-    """Names of one frame on every arm link with mass: the grasp's, else a gripper's, else the first.
+def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
+    """One frame name for every arm link with mass: the grasp's, else a gripper's, else the first.
 
     A finger, what slides on a link and carries nothing else, counts as part of that link.
     """

@@ -148,7 +148,7 @@ class Payload(EffectBase):
     is_local = True
     possible_locations = _moving_frames
     # payloads at two frames of one link are equivalent
-    candidate_locations = base.arm_link_frame_names
+    candidate_locations = base.one_frame_name_per_arm_link
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:

@@ -19,7 +19,7 @@ from yid_ocp.analysis.step_symbols import (
     format_expressions,
 )
 from yid_ocp.arrays import Array
-from yid_ocp.files import atomic_write, make_folder, write_json, write_text
+from yid_ocp.files import atomic_write, make_folder, write_strict_json, write_text
 from yid_ocp.integrator.codegen import casadi_c_source, parameter_jacobian_function
 from yid_ocp.model.kinematics import forward_kinematics, mass_matrix, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import merge_bodies
@@ -104,7 +104,7 @@ def export_step_functions(
         "parameters": {p.name: {"value": float(value), "unit": p.unit} for p, value in parameters},
         "time_step": time_step,
     }
-    write_json(listed, names)
+    write_strict_json(listed, names)
     return (*written, source, listed)
 
 

@@ -17,7 +17,7 @@ from yid_ocp.arrays import Array, IntArray
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.signal_filters import LowPassFilter, two_pass_effort_filter
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_from_path_cutoff
 
 RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 
@@ -208,7 +208,7 @@ def residual_channel_samples(problem: EstimationProblem) -> tuple[ResidualChanne
             place[samples.used_output_mask] = np.arange(rows.start, rows.stop)
             autocorrelation = np.ones(1)
             if samples.sensor.effort_joints:
-                low_pass, step = two_pass_effort_filter(problem.options.path_cutoff), episode.grid.time_step
+                low_pass, step = effort_filter_from_path_cutoff(problem.options.path_cutoff), episode.grid.time_step
                 stride = low_pass.decorrelation_stride(step)
                 autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[::stride]
             for column, channel in enumerate(samples.output_channel_names):

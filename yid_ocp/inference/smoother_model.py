@@ -281,7 +281,7 @@ def recording_models_with_unknown_forces(
         theta, _ = problem.theta_and_initial_state_offset(x, i)
         nominal = nominal_trajectory_from_prediction(problem.predictor, episode, result, theta)
         pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
-        blocks = [samples.residual_block(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
+        blocks = [samples.residual_and_jacobian(y, threshold=problem.options.huber_threshold) for samples, y in pairs]
         course = _LinearizedEpisode(problem, episode, nominal)
         factor = np.concatenate([block.robust_factor for block in blocks])
         found.append(_recording(course, factor, observed, limits, interval))

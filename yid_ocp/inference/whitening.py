@@ -249,7 +249,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     covariance = first = unit @ unit.T
     made, steps = [], linear()
     # what torques of the step before add to the momenta that the filter follows, shape (nu, nu)
-    momentum = course.model_functions.momentum_shift.momentum_derivative_by_previous_torque(course.theta)
+    momentum = course.model_functions.reference_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
     for k in range(count + 1):
         fresh = k + 1 < count and errors.sample_of_step[k + 1] != errors.sample_of_step[k]
         here, rows = next(steps, None), rows_of_node[k]
@@ -308,7 +308,7 @@ def _plain(episode: Episode, result: EpisodePrediction) -> Array:
     """Residual of an episode in units of the sensors' noise, their constant errors taken off."""
     samples = subtract_estimated_biases(episode.measurements, result.predicted_outputs)
     pairs = zip(samples, result.predicted_outputs, strict=True)
-    return np.concatenate([own.residual_block(y).residual for own, y in pairs])
+    return np.concatenate([own.residual_and_jacobian(y).residual for own, y in pairs])
 
 
 def _whitened_episode(
@@ -345,7 +345,7 @@ def _about_smoothed(
     errors = replace(errors, torque_bias=found.torque_bias, torque_noise=found.torque_noise)
     errors = _behind_effects(predictor, episode, own, errors)
     if errors.has_encoder_measurements and feedback is not None:
-        inputs = predictor.corrected_inputs_with_momentum_shift(episode, own, (), result.rollout.state[0])
+        inputs = predictor.inputs_with_reference_momentum_shift(episode, own, (), result.rollout.state[0])
         driven = predictor.system.driven_coordinate_indices
         guided = inputs.corrected_feedback(feedback, driven, episode.measured_driven_angles)
         assert guided is not None

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import ModelError, nearest_name_hint
-from yid_ocp.model.mechanism import Frame, Inertia, Joint, LinkChain, Mechanism, Placement
+from yid_ocp.model.mechanism import ArcLengthChain, Frame, Inertia, Joint, Mechanism, Placement
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import rotation_from_axis_sin_cos, snap_near_integer_entries
 
@@ -154,7 +154,7 @@ class _Parts:
     joints: list[Joint] = field(default_factory=list)
     elastic: list[ElasticJoint] = field(default_factory=list)
     layouts: dict[str, SegmentLayout] = field(default_factory=dict)
-    chains: dict[str, LinkChain] = field(default_factory=dict)
+    chains: dict[str, ArcLengthChain] = field(default_factory=dict)
 
 
 def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fraction: ca.SX | None) -> None:
@@ -202,7 +202,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
         carrier, before = Frame(parent, Placement(ca.SX(ca.DM.eye(3)), along)), length
         parts.frames[f"{segment.name}_{i}_tip"] = carrier
     parts.frames[f"w_{segment.name}"] = carrier
-    parts.chains[segment.name] = LinkChain(tuple(f"{segment.name}_{i}_tip" for i in range(len(shares))), shares)
+    parts.chains[segment.name] = ArcLengthChain(tuple(f"{segment.name}_{i}_tip" for i in range(len(shares))), shares)
     parts.layouts[segment.name] = SegmentLayout(segment.name, tuple(links), lengths, radius, mass, segment.parent)
 
 

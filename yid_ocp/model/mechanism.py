@@ -102,7 +102,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class LinkChain:
+class ArcLengthChain:
     """A chain of straight links along which points are located by arc length."""
 
     tip_frames: tuple[str, ...]  # at the far end of every link, which is its translation, base to tip
@@ -130,7 +130,7 @@ class Mechanism(ReprMixin):
     joints: tuple[Joint, ...]
     frames: Mapping[str, Frame]
     parameters: Parameters = field(default_factory=Parameters)
-    link_chains: Mapping[str, LinkChain] = field(default_factory=dict)
+    link_chains: Mapping[str, ArcLengthChain] = field(default_factory=dict)
 
     def _summary(self) -> ReprSummary:
         carriers = ("the world", *self.joint_names)

@@ -188,7 +188,7 @@ def joint_damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> di
     return {n: Parameter(f"{n}.damping", value, per, 0.0, math.inf, f"{text} {n}") for n, value in wanted.items()}
 
 
-def joint_spring_parameters(tree: Mechanism, joint: str, spring: RobotJointSpring) -> tuple[Parameter, Parameter]:
+def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJointSpring) -> tuple[Parameter, Parameter]:
     """Stiffness and rest position parameters of a spring on a robot joint."""
     unit = tree.joints[tree.joint_index(joint)].coordinate_unit
     per = "N m/rad" if unit == "rad" else "N/m"

@@ -23,8 +23,8 @@ from yid_ocp.model.servos_and_springs import (
     RobotJointSpring,
     build_joint_servos,
     joint_damping_parameters,
-    joint_spring_parameters,
     mechanism_without_gravity,
+    stiffness_and_rest_parameters,
 )
 
 if TYPE_CHECKING:
@@ -81,8 +81,8 @@ class Grasp:
             rows.append(0.5 * ca.vertcat(*(error[i, j] - error[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))))
         return ca.vertcat(*rows)
 
-    def aligned_axis_differences(self, kinematics: Kinematics) -> ca.SX:
-        """Differences between aligned axes, shape (0, 3 or 9; 1): not zero where axes are opposite, for a far start."""
+    def far_start_orientation_error(self, kinematics: Kinematics) -> ca.SX:
+        """Holder minus held axes, (0, 3 or 9; 1); unlike `constraint_residual` not zero where axes are opposite."""
         if self.kind == "point":
             return ca.SX(0, 1)
         holder, held = (kinematics.frame_pose(name).rotation for name in (self.holder_frame, self.held_frame))
@@ -276,7 +276,7 @@ class System(ReprMixin):
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in options.get("springs", {}).items():
-            stiffness, rest = joint_spring_parameters(tree, joint, spring)
+            stiffness, rest = stiffness_and_rest_parameters(tree, joint, spring)
             entries += [stiffness, rest]
             elastic.append(ElasticJoint(joint, joint, "bend", "", stiffness.symbol, ca.SX(0), rest.symbol))
         moved, own = ({}, []) if servos is None else build_joint_servos(tree, driven, servos)

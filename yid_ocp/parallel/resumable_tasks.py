@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from yid_ocp.errors import ConfigError, DataError, OutputError, WorkerError, YidError
-from yid_ocp.files import file_sha256, json_sha256, make_folder, read_input_json, write_json
+from yid_ocp.files import file_sha256, json_sha256, make_folder, read_input_json, write_strict_json
 from yid_ocp.parallel.threads_and_processes import InlineExecutor, available_processor_count, process_pool
 from yid_ocp.version import package_source_hash, software_fingerprint, software_fingerprint_differences
 
@@ -230,11 +230,11 @@ def _perform(job: _Job) -> str:
     failed = job.file.with_suffix(".error.json")
     try:
         value = job.function(**job.task.arguments)
-        write_json(job.file, {**entry, "seconds": time.perf_counter() - begun, "value": value})
+        write_strict_json(job.file, {**entry, "seconds": time.perf_counter() - begun, "value": value})
     except Exception as error:
         text = f"{type(error).__name__}: {error}"
         with contextlib.suppress(OutputError):
-            write_json(failed, {**entry, "error": text})
+            write_strict_json(failed, {**entry, "error": text})
         return text
     finally:
         _give_back()

@@ -35,7 +35,7 @@ from yid_ocp.planning.joint_paths import (
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.measurements import Measurements
-from yid_ocp.problem.signal_filters import two_pass_effort_filter
+from yid_ocp.problem.signal_filters import effort_filter_from_path_cutoff
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME
 
 _PLANNED_RECORDING_NAME = "planned"
@@ -315,7 +315,7 @@ class PlannedExperiment:
 
 def _check_long_enough(problem: EstimationProblem, duration: float) -> None:
     """Refuse a motion of whose efforts the low-pass filter leaves nothing."""
-    joints, low_pass = problem.episodes[0].recording.joints, two_pass_effort_filter(problem.options.path_cutoff)
+    joints, low_pass = problem.episodes[0].recording.joints, effort_filter_from_path_cutoff(problem.options.path_cutoff)
     step = problem.step.time_step
     least = 2.0 * low_pass.settling_time + low_pass.decorrelation_stride(step) * step
     if joints is not None and joints.effort is not None and duration <= least:

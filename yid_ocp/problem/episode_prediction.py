@@ -149,9 +149,9 @@ class EpisodePredictor:
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
         recorded = (episode.torque, episode.prescribed_path, episode.measured_driven_angles)
         slopes = [inputs.torque_sensitivity, inputs.prescribed_path_sensitivity, inputs.driven_angles_sensitivity]
-        if self._follows_momenta and self.model_functions.momentum_shift.is_active(theta, wanted):
+        if self._follows_momenta and self.model_functions.reference_momentum_shift.is_active(theta, wanted):
             return False
-        slopes += self.model_functions.input_corrections.joint_times("effort_lag", theta, wanted) or ()
+        slopes += self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted) or ()
         for samples in episode.measurements:
             slopes += self._delay_in_steps(samples, theta, wanted) or ()
         moved = any(x is not None and np.any(x) for x in slopes)
@@ -164,7 +164,7 @@ class EpisodePredictor:
 
     # -- what drives the rollout --------------------------------------------------------------------------------------
 
-    def corrected_inputs_with_momentum_shift(
+    def inputs_with_reference_momentum_shift(
         self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> CorrectedInputs:
         """Corrected inputs of an episode, with the momentum shift of its tracking filter's reference.
@@ -177,9 +177,8 @@ class EpisodePredictor:
         rows = slice(2 * self.system.n_coordinates, None)
         recorded = DifferentiatedJointMotion(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
-        return inputs.with_momentum_shift(
-            self.model_functions.momentum_shift, recorded, episode.measured_driven_angles, theta, wanted, by_internal
-        )
+        shift, measured = self.model_functions.reference_momentum_shift, episode.measured_driven_angles
+        return inputs.with_reference_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
         """Torques, angles and paths corrected by the effects on inputs, with derivatives by the parameters `wanted`."""
@@ -188,7 +187,7 @@ class EpisodePredictor:
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
         first = torque[0] if nu else np.zeros(0)
         by_torque = by_first = by_arm = by_path = by_recorded = None
-        late = corrections.joint_times("torque_delay", theta, wanted)
+        late = corrections.joint_delay_or_lag("torque_delay", theta, wanted)
         if late is not None:
             joints, (delay, by_delay) = episode.recording.joints, late
             assert joints is not None
@@ -207,7 +206,7 @@ class EpisodePredictor:
             if by_recorded is not None and wanted:
                 by_theta[:-1] += by_reading[:-1, :nu, None] * by_recorded
             torque, first, by_torque, by_first = true[:-1, :nu], true[-1, :nu], by_theta[:-1], by_theta[-1]
-        if (lag := corrections.joint_times("torque_lag", theta, wanted)) is not None:
+        if (lag := corrections.joint_delay_or_lag("torque_lag", theta, wanted)) is not None:
             torque, by_torque = FirstOrderLag(*lag, self.step.time_step).lagged_step_means(torque, by_torque)
         if errors is not None:
             left = errors.remaining_torque_error_after_effects
@@ -257,8 +256,8 @@ class EpisodePredictor:
         if start.failure_message:
             return start.failure_message
         by_start = start.state_sensitivity
-        inputs = self.corrected_inputs_with_momentum_shift(episode, theta, wanted, start.state, by_start)
-        feedback, driven = episode.feedback_with_smoothed_reference, self.system.driven_coordinate_indices
+        inputs = self.inputs_with_reference_momentum_shift(episode, theta, wanted, start.state, by_start)
+        feedback, driven = episode.feedback_about_smoother_estimate, self.system.driven_coordinate_indices
         directions = None
         if derivatives and by_start.shape[1]:
             width, by_path = by_start.shape[1], inputs.prescribed_path_sensitivity
@@ -340,7 +339,7 @@ class EpisodePredictor:
     def _recorded(self, episode: Episode, rollout: Rollout, theta: Array, wanted: tuple[str, ...]) -> Rollout:
         """The rollout with efforts of prescribed joints as they are compared: as sensors follow them, and smoothed."""
         effort, slope = rollout.effort, rollout.effort_sensitivity
-        if (lag := self.model_functions.input_corrections.joint_times("effort_lag", theta, wanted)) is not None:
+        if (lag := self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted)) is not None:
             effort, slope = FirstOrderLag(*lag, self.step.time_step).lagged_node_values(effort, slope)
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             effort, slope = smooth.smooth(effort), None if slope is None else smooth.smooth(slope)
@@ -415,7 +414,7 @@ class EpisodePredictor:
         by_state, by_effort, by_applied, by_multipliers = pulled.values()
         if (smooth := self.predicted_effort_smoother(episode, theta)) is not None:
             by_effort = smooth.smoothing_adjoint(by_effort)
-        if (lag := self.model_functions.input_corrections.joint_times("effort_lag", theta, wanted)) is not None:
+        if (lag := self.model_functions.input_corrections.joint_delay_or_lag("effort_lag", theta, wanted)) is not None:
             lagged = FirstOrderLag(*lag, self.step.time_step)
             by_effort, by_lag = lagged.lagged_node_values_adjoint(rollout.effort, by_effort)
             total += by_lag
@@ -426,7 +425,7 @@ class EpisodePredictor:
         partials = (by_state, by_lam, by_effort)
         by_inputs = self.step.kernel.adjoint_gradient(theta, rollout, feedback, wanted, partials)
         start = self.initial_state(episode, theta, offset, wanted, result.equilibrium_guess)
-        inputs = self.corrected_inputs_with_momentum_shift(episode, theta, wanted, start.state, start.state_sensitivity)
+        inputs = self.inputs_with_reference_momentum_shift(episode, theta, wanted, start.state, start.state_sensitivity)
         own = np.concatenate([total + by_inputs.by_theta, np.zeros(len(self.unknowns.initial_state_names))])
         by_torque = inputs.nominal_torque_sensitivity(feedback, self.system.driven_coordinate_indices, len(own))
         if by_torque is not None:
@@ -480,8 +479,8 @@ class _Trajectory:
 # -- what a recording shows of its start and of its loads --------------------------------------------------------------
 
 
-def with_observed_equilibrium_and_gear_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """Episode with the initial equilibrium that its points show and gear loads without effort noise, at a theta."""
+def with_seen_equilibrium_and_denoised_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
+    """Episode with the initial equilibrium nearest to its points and gear loads without effort noise, at a theta."""
     return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
 
 

@@ -34,7 +34,7 @@ from yid_ocp.problem.recorded_inputs import (
     smoothed_joint_angles,
     smoothed_joint_efforts,
 )
-from yid_ocp.problem.signal_filters import LowPassFilter, two_pass_effort_filter
+from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_from_path_cutoff
 from yid_ocp.sensors import CHANNEL_KINDS, SENSOR_READERS, SensorDataInputs
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
@@ -107,14 +107,14 @@ class InputErrorModel:
     smoothed_reference: Array | None = None  # of the tracking filter, in place of the measured motion, (N, nb)
 
     @property
-    def total_torque_error(self) -> Array:
-        """Estimated torque error in every step, constant offset plus noise, shape (N, nu) [N m]."""
+    def estimated_torque_error(self) -> Array:
+        """Estimated recorded minus true torque in every step, constant offset plus noise, shape (N, nu) [N m]."""
         return self.torque_bias + self.torque_noise
 
     @property
     def remaining_torque_error_after_effects(self) -> Array:
         """Part of the torque error still to be subtracted after effects on torques apply, shape (N, nu) [N m]."""
-        return self.total_torque_error - self.transmitted_torque_noise
+        return self.estimated_torque_error - self.transmitted_torque_noise
 
     @property
     def with_torque_bias_only(self) -> InputErrorModel:
@@ -190,8 +190,8 @@ class Episode:
     equilibrium_guess: Array | None = None  # near the initial equilibrium, where that is not of least energy, (n,)
 
     @property
-    def feedback_with_smoothed_reference(self) -> TrackingFeedback | None:
-        """Tracking filter, gains and reference, which is the motion that the smoother found where that is known."""
+    def feedback_about_smoother_estimate(self) -> TrackingFeedback | None:
+        """Tracking filter whose reference is the motion that the Kalman smoother estimated, as measured without one."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback
         return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)
@@ -251,8 +251,9 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
     if options.feedback == "proportional":
         loop = proportional_feedback(step, episode.measured_driven_angles, options.proportional_gains)
     else:
-        plain, arms = functions.momentum_shift.theta_without_effects(theta), functions.arms_only_integrator_step
-        loop = lqr_feedback(step, episode.smoothed_driven_angles, episode.torque, plain, arms)
+        plain = functions.reference_momentum_shift.theta_without_effects(theta)
+        known = episode.smoothed_driven_angles, episode.torque, plain
+        loop = lqr_feedback(step, *known, functions.arms_only_integrator_step)
     return replace(episode, tracking_feedback=loop)
 
 
@@ -313,7 +314,7 @@ def _samples(
         lambda group: options.sensors.get(group, SensorOptions()),
         grid.node_times,
         grid.time_step,
-        two_pass_effort_filter(options.path_cutoff),
+        effort_filter_from_path_cutoff(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
     )
     found = [data for kind in SENSOR_READERS for data in SENSOR_READERS[kind](around)]

@@ -15,7 +15,7 @@ from yid_ocp.data.recording import Recording
 from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError
 from yid_ocp.integrator.step import Step
-from yid_ocp.problem.episode_prediction import EpisodePredictor, with_observed_equilibrium_and_gear_loads
+from yid_ocp.problem.episode_prediction import EpisodePredictor, with_seen_equilibrium_and_denoised_loads
 from yid_ocp.problem.episodes import (
     Episode,
     EpisodePrediction,
@@ -31,7 +31,7 @@ from yid_ocp.problem.evaluation import (
     ResidualWhitener,
     whitened_episode_residual,
 )
-from yid_ocp.problem.measurements import ResidualBlock, huber_loss_and_residual_factors
+from yid_ocp.problem.measurements import ResidualAndJacobian, huber_loss_and_residual_factors
 from yid_ocp.problem.model_functions import ModelFunctions
 from yid_ocp.problem.options import ProblemOptions
 from yid_ocp.problem.predictions import synthesize_recording
@@ -116,7 +116,7 @@ class EstimationProblem(ReprMixin):
         self._set(functions, options, tuple(free), theta, episodes, others)
         fitted = (self.predictor.episode_with_fitted_initial_state(episode, theta) for episode in episodes)
         ready, other = (
-            tuple(with_observed_equilibrium_and_gear_loads(self.predictor, e, theta) for e in group)
+            tuple(with_seen_equilibrium_and_denoised_loads(self.predictor, e, theta) for e in group)
             for group in (fitted, others)
         )
         self._set(functions, options, tuple(free), theta, ready, other)
@@ -413,7 +413,7 @@ class EstimationProblem(ReprMixin):
         """Whether errors of recorded torques or angles act as process noise in any recording."""
         return any(episode.input_errors is not None for episode in self.episodes)
 
-    def whitened_held_out_residual(self, i: int, episode: Episode, result: EpisodePrediction) -> ResidualBlock:
+    def whitened_held_out_residual(self, i: int, episode: Episode, result: EpisodePrediction) -> ResidualAndJacobian:
         """Whitened residual of held-out recording `i` from `predict_held_out`, without a robust loss."""
         return whitened_episode_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
@@ -462,7 +462,7 @@ def _estimated_initial_state_offset(predictor: EpisodePredictor, episode: Episod
         rows, slopes = [weight * offset], [np.diag(weight)]
         for k, samples in enumerate(short.measurements):
             by_start = result.output_sensitivities[k][:, :, len(predictor.unknowns.free_parameters) :]
-            part = samples.residual_block(result.predicted_outputs[k], by_start)
+            part = samples.residual_and_jacobian(result.predicted_outputs[k], by_start)
             rows.append(part.residual)
             slopes += [] if part.jacobian is None else [part.jacobian]
         offset = offset - np.linalg.lstsq(np.vstack(slopes), np.concatenate(rows), rcond=None)[0]

@@ -14,7 +14,7 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InputErrorModel
 from yid_ocp.problem.measurements import (
     Measurements,
-    ResidualBlock,
+    ResidualAndJacobian,
     huber_loss_and_residual_factors,
     measurement_sensitivities_to_biases,
     whitened_by_constant_errors,
@@ -29,7 +29,7 @@ class ResidualWhitener(Protocol):
 
     @property
     def input_errors(self) -> InputErrorModel:
-        """Errors of torques and angles, with the torque errors about which the filter is linearized."""
+        """Stds of torque and angle errors, and the torque errors about which the filter is linearized."""
         ...
 
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
@@ -97,13 +97,13 @@ EvaluateFunction = Callable[..., Evaluation]
 
 def _sensor_whitened_residual(
     measurements: Sequence[Measurements], result: EpisodePrediction, threshold: float = math.inf
-) -> ResidualBlock:
+) -> ResidualAndJacobian:
     """Residual of one recording in units of the sensors' noise, group after group."""
     slopes = result.output_sensitivities or (None,) * len(measurements)
     groups = zip(measurements, result.predicted_outputs, slopes, strict=True)
-    parts = [samples.residual_block(predicted, by_unknowns, threshold) for samples, predicted, by_unknowns in groups]
+    parts = [samples.residual_and_jacobian(y, slope, threshold) for samples, y, slope in groups]
     jacobians = [part.jacobian for part in parts if part.jacobian is not None]
-    return ResidualBlock(
+    return ResidualAndJacobian(
         sum(part.cost for part in parts),
         np.concatenate([part.residual for part in parts]),
         np.vstack(jacobians) if jacobians else None,
@@ -113,7 +113,7 @@ def _sensor_whitened_residual(
 
 def whitened_episode_residual(
     episode: Episode, whitening: ResidualWhitener | None, result: EpisodePrediction, threshold: float
-) -> ResidualBlock:
+) -> ResidualAndJacobian:
     """Whitened residual of one episode: by sensor noise, or by the frozen Kalman filter where one is given.
 
     Constant sensor errors count as noise, see `whitened_by_constant_errors`.
@@ -135,4 +135,4 @@ def whitened_episode_residual(
         columns = whitened_by_constant_errors(by_constants, columns)
     cost, factor = huber_loss_and_residual_factors(columns[:, 0], threshold)
     columns = factor[:, None] * columns
-    return ResidualBlock(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)
+    return ResidualAndJacobian(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)

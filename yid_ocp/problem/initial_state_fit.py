@@ -82,7 +82,7 @@ class InitialStateFitter:
         )
         chosen = ca.vertcat(ca.SX(0, 1), *(system.parameters[name].symbol for name in self.fitted_parameters))
         kinematics = forward_kinematics(system.mechanism, e.q1)
-        aligned = ca.vertcat(ca.SX(0, 1), *(grasp.aligned_axis_differences(kinematics) for grasp in system.grasps))
+        aligned = ca.vertcat(ca.SX(0, 1), *(grasp.far_start_orientation_error(kinematics) for grasp in system.grasps))
         internal = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
         held = ca.vertcat(e.end_of_step_constraint_violation, ca.substitute(aligned, internal, e.z1))
         outputs = [held, ca.jacobian(held, e.q1), ca.jacobian(held, chosen)]

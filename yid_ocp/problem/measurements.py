@@ -67,7 +67,7 @@ ResidualWeighting = Literal["whitened", "paper"]
 
 
 @dataclass(frozen=True)
-class ResidualBlock:
+class ResidualAndJacobian:
     """One block of a residual: robust cost, weighted residual and Jacobian."""
 
     cost: float  # half the sum of squares, or Huber's loss
@@ -151,9 +151,9 @@ class Measurements:
             pull[self.used_output_mask] = self.output_decorrelation_matrix.T @ pull[self.used_output_mask]
         return np.asarray(pull * self.weight)
 
-    def residual_block(
+    def residual_and_jacobian(
         self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf
-    ) -> ResidualBlock:
+    ) -> ResidualAndJacobian:
         """Residual block with weights of Huber's loss and, with slopes of the prediction (M, k, d), its Jacobian."""
         raw = self.whitened_residual(predicted)
         cost, factor = huber_loss_and_residual_factors(raw, threshold)
@@ -161,7 +161,7 @@ class Measurements:
         robust = factor[seen]
         if slopes is not None:
             jacobian = robust[:, None] * self.decorrelate(self.weight[seen][:, None] * slopes[seen])
-        return ResidualBlock(cost, robust * raw[seen], jacobian, robust)
+        return ResidualAndJacobian(cost, robust * raw[seen], jacobian, robust)
 
     def shifted_earlier_by(self, steps: Array) -> Measurements:
         """The same samples moved earlier by each output's delay, shape (k,) [steps], within the predictable nodes."""

@@ -65,7 +65,7 @@ class CorrectedInputs:
                     reference[:, column] += moved[: len(reference), at]
         return replace(feedback, reference=reference)
 
-    def with_momentum_shift(
+    def with_reference_momentum_shift(
         self,
         shift: EffectMomentumShift,
         recorded: DifferentiatedJointMotion,
@@ -74,7 +74,7 @@ class CorrectedInputs:
         wanted: Sequence[str],
         by_internal: Array | None,
     ) -> CorrectedInputs:
-        """Inputs with the momentum that effects add to the driven joints.
+        """Inputs with the momentum that effects add to the tracking filter's reference at every step.
 
         The angles `recorded` are smooth, those `measured` (N + 1, nu) are as they were read; `by_internal` (nz, d) is
         the derivative of the internal coordinates at the start.
@@ -186,7 +186,7 @@ class InputCorrections:
         a_theta, e_theta = (x[:, :, at] for x in slopes) if wanted else (np.zeros((*a.shape[:2], 0)),) * 2
         return a[:, :, 0], e[:, :, 0], a_theta, e_theta, e_reading[:, :, 0]
 
-    def joint_times(
+    def joint_delay_or_lag(
         self, kind: Literal["torque_delay", "torque_lag", "effort_lag"], theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
         """Delays or lags' time constants of driven joints' torques or prescribed joints' efforts, shape (nj,) [s].
@@ -337,8 +337,8 @@ class ModelFunctions:
         return self._arms(None)
 
     @property
-    def momentum_shift(self) -> EffectMomentumShift:
-        """Function of the momenta that effects add to driven joints: the shift of the tracking reference."""
+    def reference_momentum_shift(self) -> EffectMomentumShift:
+        """Function of the momenta that effects add to the tracking filter's reference, at every step of a motion."""
         return self._momentum(None)
 
     def compiled_sensor_function(

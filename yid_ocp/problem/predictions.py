@@ -16,7 +16,7 @@ from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND
 from yid_ocp.problem.episode_prediction import EpisodePredictor
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.options import SensorOptions
-from yid_ocp.sensors.base import EffortKind, expand_to_joint_values
+from yid_ocp.sensors.base import EffortSamplingKind, expand_to_joint_values
 from yid_ocp.sensors.joints import (
     JOINT_EFFORT_GROUP_NAME,
     JOINT_POSITION_GROUP_NAME,
@@ -49,7 +49,7 @@ def constant_position_baseline(recording: Recording, points: Sequence[str], give
     return _carried(recording, points, (), given, np.zeros((len(points), 0)))
 
 
-def clamp_displacement_baseline(
+def mean_clamp_displacement_baseline(
     recording: Recording, points: Sequence[str], clamped: Sequence[str], given: int = 2
 ) -> Array:
     """Baseline prediction: every point moves by the clamped points' mean displacement since the last given frame.
@@ -337,7 +337,7 @@ def _joints(
     effort = effort + _noisy(np.zeros(len(names)), bias, rng)
     levels: dict[str, Any] = {"position_std": angle_std, "effort_std": effort_std, "effort_bias_std": bias_std}
     # of prescribed joints it is the effort at the nodes
-    kind: EffortKind = "command" if system.driven else "sample"
+    kind: EffortSamplingKind = "command" if system.driven else "sample"
     return JointGroup(names, episode.grid.node_times, position, effort=effort, effort_kind=kind, **levels)
 
 

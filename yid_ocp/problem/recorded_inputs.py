@@ -9,7 +9,7 @@ import scipy.interpolate
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
 from yid_ocp.data.recording import JointGroup, Recording
-from yid_ocp.effects import required_signal_kinds
+from yid_ocp.effects import signal_kinds_required_by_any_effect
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.objects.base import ClampPoseDefinition
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, SERVO_GAIN_FACTOR, PositionServo
@@ -131,9 +131,9 @@ def _courses(
         hint = "prescribe the arms' motion instead (model.arms.mode: prescribed)"
         raise DataError(what, where=f"{where}: joints/effort", hint=hint)
     effort = joints.effort[:, recorded_joint_columns(joints, driven, where)]
-    if joints.effort_kind_or_default == "sample":
+    if joints.effort_sampling_kind_or_default == "sample":
         return [scipy.interpolate.CubicSpline(t, column) for column in effort.T]
-    if joints.effort_kind_or_default == "command":
+    if joints.effort_sampling_kind_or_default == "command":
         return [_held(column, edges) for column in effort.T]
     sums = np.vstack([np.zeros((1, len(driven))), np.cumsum(effort * np.diff(edges)[:, None], axis=0)])
     return [scipy.interpolate.CubicSpline(edges, column).derivative() for column in sums.T]
@@ -191,20 +191,20 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
 
 
 def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
-    """Sensors that the recordings contain, among those that effects require (`effects.required_signal_kinds`)."""
+    """Kinds of recorded signals, among those of `effects.signal_kinds_required_by_any_effect`."""
     found = set()
     for recording in recordings:
         own = {} if recording.joints is None else {"joints": recording.joints.channels}
         own |= {group.name: dict(group.values_by_quantity) for group in recording.channel_groups}
         for kind in CHANNEL_KINDS:
             channel = CHANNEL_KINDS[kind]
-            if any(channel.is_in_group(group) and channel.quantity in values for group, values in own.items()):
+            if any(channel.matches_group_name(group) and channel.quantity in values for group, values in own.items()):
                 found.add(kind)
         if any(recorded_camera_pose(group) is not None for group in recording.points):
             found.add("camera")
         if any(group.clock == "nominal" for group in recording.all_groups):
             found.add("nominal_clock")
-    return frozenset(found) & required_signal_kinds()
+    return frozenset(found) & signal_kinds_required_by_any_effect()
 
 
 def prescribed_path(

@@ -128,8 +128,8 @@ def _weights(low_pass: LowPassFilter, step: float) -> Array:
     return np.asarray(weight / weight.sum())
 
 
-def two_pass_effort_filter(cutoff: float) -> LowPassFilter:
-    """Filter of measured and predicted efforts: two passes of the filter that smooths prescribed paths."""
+def effort_filter_from_path_cutoff(cutoff: float) -> LowPassFilter:
+    """Filter of measured and predicted efforts: the zero-phase filter of prescribed paths, applied twice."""
     return LowPassFilter(cutoff, 2)
 
 

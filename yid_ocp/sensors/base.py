@@ -20,7 +20,7 @@ from yid_ocp.model.system import NodeState, System
 from yid_ocp.options import OptionInfo
 from yid_ocp.registry import Registry
 
-EffortKind = Literal["sample", "mean", "command"]
+EffortSamplingKind = Literal["sample", "mean", "command"]
 """What a recorded effort is: the sampled torque, its mean until the next sample, or a command held until then."""
 _Positive = Annotated[float, Gt(0)]
 _NonNegative = Annotated[float, Ge(0)]
@@ -55,7 +55,7 @@ class SensorOptions:
         ),
     ] = None
     effort_kind: Annotated[
-        EffortKind | None,
+        EffortSamplingKind | None,
         OptionInfo(
             "what recorded efforts are of the torque that acts, instead of what the recording says (joints.effort only)"
         ),
@@ -88,7 +88,7 @@ class ChannelKind:
         """Names of the group's attributes that hold the stds of white noise and of a constant error."""
         return f"{self.quantity}_std", f"{self.quantity}_bias_std"
 
-    def is_in_group(self, name: str) -> bool:
+    def matches_group_name(self, name: str) -> bool:
         """Whether a group of this name is one for the channel, `GROUP` or `GROUP_NAME`; only the name is looked at."""
         return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
@@ -97,10 +97,10 @@ CHANNEL_KINDS: Registry[ChannelKind] = Registry("recorded channel")
 """Kinds of recorded values; those of `joints` and `points` have their own fields in `data.recording.Recording`."""
 
 
-def channel_kinds_of_group(group: str) -> tuple[ChannelKind, ...]:
+def channel_kinds_for_group_name(group: str) -> tuple[ChannelKind, ...]:
     """Kinds of channels that sensors declare for a recording's group of this name; none for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
-    return tuple(c for c in found if c.group not in ("joints", "points") and c.is_in_group(group))
+    return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
 
 
 class _RecordedGroup(Protocol):
@@ -141,7 +141,7 @@ class RecordedJoints(Protocol):
     @property
     def effort_bias_std(self) -> float | Array | None: ...
     @property
-    def effort_kind_or_default(self) -> str: ...
+    def effort_sampling_kind_or_default(self) -> str: ...
     @property
     def position_std(self) -> float | Array | None: ...
     @property

@@ -124,7 +124,7 @@ def _read_joint_efforts(around: SensorDataInputs) -> list[SensorData]:
         hint = f"set sensors.{JOINT_EFFORT_GROUP_NAME}.std [N m], from a stretch at rest or the data sheet"
         raise DataError(what, where=around.recording.name, hint=hint)
     std = expand_to_joint_values(given, joints.names, names, f"sensors.{JOINT_EFFORT_GROUP_NAME}.std")
-    is_sample = joints.effort_kind_or_default == "sample"
+    is_sample = joints.effort_sampling_kind_or_default == "sample"
     bias = joint_torque_bias_std(joints, names, choice)
     return [smoothed_effort_data(around, EffortSensor(names), joints.t, effort, std, bias, is_sample=is_sample)]
 

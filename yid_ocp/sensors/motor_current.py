@@ -50,7 +50,7 @@ class _MotorCurrentSensor(JointSensor):
 
 @SENSOR_READERS.register("motors.current")
 def _read_motor_currents(around: SensorDataInputs) -> list[SensorData]:
-    groups = (group for group in around.recording.channel_groups if _CURRENT.is_in_group(group.name))
+    groups = (group for group in around.recording.channel_groups if _CURRENT.matches_group_name(group.name))
     return [found for group in groups if (found := _currents(around, group)) is not None]
 
 

@@ -93,7 +93,7 @@ def mean_square_residual_without_efforts(problem: EstimationProblem, i: int, tra
     for samples in problem.episodes[i].measurements:
         if not samples.sensor.effort_joints:
             predicted, _ = problem.predictor.readings_along_trajectory(samples, trajectory, slopes, theta)
-            parts.append(samples.residual_block(predicted, threshold=problem.options.huber_threshold).residual)
+            parts.append(samples.residual_and_jacobian(predicted, threshold=problem.options.huber_threshold).residual)
     return float(np.mean(np.concatenate(parts) ** 2))
 
 

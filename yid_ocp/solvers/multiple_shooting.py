@@ -404,7 +404,7 @@ class _ShootingIntervals:
             slopes.append((by_x, by_defect))
             for samples in episode.measurements:
                 read = problem.predictor.readings_along_trajectory(samples, trajectory, by_unknowns, theta)
-                part = samples.residual_block(*read, problem.options.huber_threshold)
+                part = samples.residual_and_jacobian(*read, problem.options.huber_threshold)
                 assert part.jacobian is not None
                 cost += part.cost
                 residuals.append(part.residual)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.system import System
-from yid_ocp.sensors.base import EffortKind
+from yid_ocp.sensors.base import EffortSamplingKind
 from yid_ocp.virtual.joint_motion import JointMotion, grasping_joint_angles
 from yid_ocp.virtual.mjcf import compile_mjcf, import_mujoco, mujoco_xml
 
@@ -58,7 +58,7 @@ class SimulationOptions:
     time_step: float = DEFAULT_SIMULATOR_TIME_STEP  # must divide the controller's period
     # at which torques are computed, held in between, a multiple of `sample_rate`, which it is where absent
     controller_rate: float | None = None
-    effort_kind: EffortKind = "command"  # what is recorded; `command` needs a controller no faster than the recording
+    effort_kind: EffortSamplingKind = "command"  # recorded; `command` needs a controller no faster than the recording
 
     def __post_init__(self) -> None:
         controller, periods = self._controller_rate, self.controller_periods_per_sample
@@ -69,8 +69,8 @@ class SimulationOptions:
         if inner < 1 or abs(inner * self.time_step * controller - 1.0) > 1e-9:
             what = f"time_step = {self.time_step:g} s does not divide the period of {controller:g} Hz"
             raise ConfigError(what, allowed="1/(controller's rate k), k whole")
-        if self.effort_kind not in get_args(EffortKind):
-            raise ConfigError(f"effort_kind = '{self.effort_kind}'", allowed=", ".join(get_args(EffortKind)))
+        if self.effort_kind not in get_args(EffortSamplingKind):
+            raise ConfigError(f"effort_kind = '{self.effort_kind}'", allowed=", ".join(get_args(EffortSamplingKind)))
         if self.effort_kind == "command" and periods > 1:
             what = f"a command of a controller at {controller:g} Hz"
             what += f" is not held over a sample of {self.sample_rate:g} Hz"

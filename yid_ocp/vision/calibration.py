@@ -30,10 +30,10 @@ from yid_ocp.vision.camera_registration import (
     ArmSurface,
     CalibrationFrame,
     CameraState,
-    RobustCostQuadraticModel,
+    RobustCostGradientAndHessian,
     SurfaceVisibility,
     initial_camera_states,
-    quadratic_robust_cost,
+    robust_gradient_and_hessian,
     surface_visibility,
 )
 from yid_ocp.vision.point_cloud import weighted_median
@@ -382,7 +382,7 @@ class _Calibrator:
 
     def _rounds(
         self, state: CameraState, frames: Sequence[CalibrationFrame], reach: float, along: bool, most: int, rounds: int
-    ) -> tuple[CameraState, RobustCostQuadraticModel, list[CalibrationFrame]]:
+    ) -> tuple[CameraState, RobustCostGradientAndHessian, list[CalibrationFrame]]:
         """The state after some steps on at most so many points of each frame, the sum there, and those points."""
         chosen = []
         for glimpse in frames:
@@ -397,9 +397,9 @@ class _Calibrator:
             hint = "check the told pose and the unit of the clouds"
             raise _UntoldError("what the camera sees does not lie on it", hint)
 
-        def cost(state: CameraState) -> RobustCostQuadraticModel:
+        def cost(state: CameraState) -> RobustCostGradientAndHessian:
             rows = [self.arm.linearized_surface_distances(state, g, reach, along) for g in chosen]
-            return quadratic_robust_cost(rows, reach)
+            return robust_gradient_and_hessian(rows, reach)
 
         for _ in range(rounds):
             hessian, gradient, _ = cost(state).weighted_normal_equations(self.precision)

@@ -190,7 +190,7 @@ class ArmSurface:
                 error = (distance - 1.0) * square  # n . (P - (origin + d (P - origin)))
             kept = (square > _MIN_INCIDENCE_COSINE * np.linalg.norm(ahead, axis=1)) & (np.abs(error) < reach)
         else:
-            error, normal, part = self.robot_surfaces.nearest_moving_surface(points, q, reach)
+            error, normal, part = self.robot_surfaces.moving_surface_distance(points, q, reach)
             kept = np.ones(len(points), bool)
         chosen = np.flatnonzero(kept & (part >= 0) & self._moving[part])
         behind, now, later = (
@@ -230,8 +230,8 @@ class _SurfaceMatches(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RobustCostQuadraticModel:
-    """Quadratic model of the robust cost at a camera state."""
+class RobustCostGradientAndHessian:
+    """Gradient and Hessian of the robust cost at a camera state, and the covariance of its gradient."""
 
     gradient: Array  # (10,)
     hessian: Array  # (10, 10), of Gauss and Newton
@@ -255,8 +255,8 @@ class RobustCostQuadraticModel:
         return np.asarray(bread @ (weight**2 * self.score_covariance + precision) @ bread)
 
 
-def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostQuadraticModel:
-    """Quadratic model of the robust cost over all points of all frames, scaled by their median error."""
+def robust_gradient_and_hessian(rows: Sequence[_CalibrationEquations], reach: float) -> RobustCostGradientAndHessian:
+    """Gradient and Hessian of the robust cost over all points of all frames, scaled by their median error."""
     jacobian, residuals, patches = (np.concatenate(parts) for parts in zip(*rows, strict=True))
     sigma = max(_MAD_TO_STD * float(np.median(np.abs(residuals))) if len(residuals) else reach, _MIN_POINT_STD)
     square = (residuals / min(_ROBUST_SCALE_STDS * sigma, reach)) ** 2
@@ -275,7 +275,7 @@ def quadratic_robust_cost(rows: Sequence[_CalibrationEquations], reach: float) -
         blocks = _at_least(both, summed(frame) + summed(patch) - both)
     curvature = max(bent / max(float(weight.sum()), 1e-12), _MIN_CURVATURE_FRACTION)
     hessian = jacobian.T @ (weight[:, None] * jacobian)
-    return RobustCostQuadraticModel(scores.sum(axis=0), hessian, curvature, blocks)
+    return RobustCostGradientAndHessian(scores.sum(axis=0), hessian, curvature, blocks)
 
 
 def _at_least(least: Array, matrix: Array) -> Array:

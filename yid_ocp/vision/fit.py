@@ -333,7 +333,7 @@ class ShapeFitter:
         corners = self._links_at(q)
         touching = np.linalg.norm(corners[:, :, None] - places, axis=3).min(axis=1) < _TOUCHING_DISTANCE
         # the spread across the links about each point
-        across = shape_evidence.across_links(corners, sight.camera_position)
+        across = shape_evidence.link_normals_perpendicular_to_sight(corners, sight.camera_position)
         wide = np.sqrt(evidence.excess_variance)[:, None] * np.abs(across)
         swath = np.max(np.where(touching[..., None], wide[:, None], 0.0), axis=0)
         off_end, noise = np.zeros(places.shape), max(self.options.surface_noise_std, evidence.noise_std)
@@ -482,7 +482,7 @@ def _expressions(system: System, kinematics: Kinematics, options: ShapeFitOption
             corners += [start, kinematics.frame_position(f"{segment.name}_{i}_tip")]
     rows, gaps = [ca.SX(0, 1)], [ca.SX(0, 1)]
     for grasp in system.grasps:
-        residual, alignment = grasp.constraint_residual(kinematics), grasp.aligned_axis_differences(kinematics)
+        residual, alignment = grasp.constraint_residual(kinematics), grasp.far_start_orientation_error(kinematics)
         gaps.append(residual[:3])
         rows.append(residual[:3] / options.grasp_position_std)
         if grasp.kind != "point":  # the first column of a weld is a roll, which stays unknown

@@ -17,11 +17,11 @@ from yid_ocp.errors import DataError
 from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
 from yid_ocp.vision.calibration import CameraCalibrationOptions, CameraClockOptions
 from yid_ocp.vision.fit import ShapeFitOptions, ShapeFitter
-from yid_ocp.vision.point_cloud import CloudFilterOptions, SkeletonOptions, XyzCoordinates
+from yid_ocp.vision.point_cloud import CloudFilterOptions, SkeletonOptions, XyzTuple
 from yid_ocp.vision.sequence_calibration import (
     ForeignObject,
     SequenceCalibration,
-    TubeDimensionCheck,
+    TubeDimensionEstimates,
     TubeDimensionKind,
 )
 from yid_ocp.vision.shape_evidence import FrameShapeFit
@@ -112,7 +112,7 @@ class TrackOptions:
         ),
     ] = "model"
     approximate_root_position: Annotated[
-        XyzCoordinates | None,
+        XyzTuple | None,
         OptionInfo("place in the world to which the root is nearer than other ends, where root is not model", "m"),
     ] = None
     robot_mesh_kind: Annotated[UrdfMeshKind, OptionInfo("meshes of the robot's self-filter")] = "visual"
@@ -214,7 +214,7 @@ def tracked_states_and_points(
 
 
 def _none_good(
-    frames: Sequence[FrameReport], sizes: TubeDimensionCheck, things: Sequence[ForeignObject], source: str
+    frames: Sequence[FrameReport], sizes: TubeDimensionEstimates, things: Sequence[ForeignObject], source: str
 ) -> DataError:
     kinds: dict[str, list[str]] = {}
     for frame in frames:
@@ -230,12 +230,12 @@ def _none_good(
     return DataError(f"{cause}not one frame could be used: {listed}", where=source, hint=hint)
 
 
-def _because(sizes: TubeDimensionCheck, matters: bool) -> str:
+def _because(sizes: TubeDimensionEstimates, matters: bool) -> str:
     """What begins a refusal where the sizes of the object are the likely cause."""
     return f"{sizes.contradiction_message}: " if matters and sizes.contradiction_message else ""
 
 
-def _hint(sizes: TubeDimensionCheck, things: Sequence[ForeignObject], otherwise: str) -> str:
+def _hint(sizes: TubeDimensionEstimates, things: Sequence[ForeignObject], otherwise: str) -> str:
     """What is known to be wrong with the object or stands about it comes before general advice."""
     notes = [*sizes.messages, *(thing.text for thing in things)]
     return "; ".join([*notes[:_MAX_NOTES], otherwise])

@@ -82,7 +82,7 @@ class _Centerline:
         return self.nodes[way[::-1]]
 
 
-def trace_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
+def cloud_centerline_tree(cloud: WeightedCloud, diameter: float, gap: float, rng: np.random.Generator) -> _Centerline:
     """Centerline of the object in a cloud, a tree of nodes with its loops; empty for too few points.
 
     `diameter` is that of its thickest tube [m]; parts further apart than `gap` [m] do not hang together.

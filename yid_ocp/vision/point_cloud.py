@@ -21,7 +21,7 @@ from yid_ocp.model.system import System
 from yid_ocp.options import OptionInfo, PositiveFloat, UnitIntervalFloat, check_option_bounds
 from yid_ocp.vision.surface_meshes import tube_link_lengths_and_radii
 
-XyzCoordinates = tuple[float, float, float]
+XyzTuple = tuple[float, float, float]
 _ColourComponent = Annotated[float, Ge(0), Le(255)]
 _RgbColour = tuple[_ColourComponent, _ColourComponent, _ColourComponent]
 
@@ -56,9 +56,9 @@ class CloudFilterOptions:
         ),
     ] = 0.03
     box_lower: Annotated[
-        XyzCoordinates | None, OptionInfo("corner of a box in the world outside of which points are left out", "m")
+        XyzTuple | None, OptionInfo("corner of a box in the world outside of which points are left out", "m")
     ] = None
-    box_upper: Annotated[XyzCoordinates | None, OptionInfo("the opposite corner", "m")] = None
+    box_upper: Annotated[XyzTuple | None, OptionInfo("the opposite corner", "m")] = None
     floor_height: Annotated[
         float | None,
         OptionInfo(

@@ -177,7 +177,7 @@ _OUTLIER_END_STDS = 3.0  # robust standard deviations from the other frames' end
 
 
 @dataclass(frozen=True, eq=False)
-class TubeDimensionCheck:
+class TubeDimensionEstimates:
     """Tube lengths and radii estimated from the frames, compared with the model."""
 
     names: tuple[str, ...]  # `T1.length` and so on: lengths of all segments, then their radii
@@ -251,7 +251,7 @@ def estimate_and_check_dimensions(
     estimate: Sequence[TubeDimensionKind],
     std: tuple[float, float],
     fitted: Callable[[Mapping[str, float], Sequence[Array]], list[FrameShapeFit]],
-) -> TubeDimensionCheck:
+) -> TubeDimensionEstimates:
     """Estimate the tubes' dimensions from some frames and compare them with the model.
 
     `std` are the standard deviations of a point's distance from the surface, and of the places' error that all frames
@@ -263,7 +263,7 @@ def estimate_and_check_dimensions(
     names = tuple(f"{s.name}.{kind}" for kind in _DIMENSION_KINDS for s in system.segment_layouts)
     prior = np.diag(np.repeat(1.0 / np.square(_LOG_DIMENSION_PRIOR_STD), many))
     change, starts = np.zeros(count), list[Array]()
-    nothing = TubeDimensionCheck(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
+    nothing = TubeDimensionEstimates(names, told, change, np.asarray(np.linalg.inv(prior)), (False,) * count, 0)
     wanted = np.array([kind in estimate for kind in _DIMENSION_KINDS for _ in range(many)])
     shared = np.concatenate([math.hypot(*std) / told[:many], std[0] ** 2 / (2 * told[many:] ** 2)])
     covariance, frames = nothing.covariance, 0
@@ -286,7 +286,7 @@ def estimate_and_check_dimensions(
         if np.abs(step).max() < _STEP_TOLERANCE:
             break
     known = np.sqrt(np.diag(covariance)) < _MAX_KNOWN_LOG_STD
-    return TubeDimensionCheck(names, told, change, covariance, tuple(bool(x) for x in wanted & known), frames)
+    return TubeDimensionEstimates(names, told, change, covariance, tuple(bool(x) for x in wanted & known), frames)
 
 
 def _believed(fits: Sequence[FrameShapeFit]) -> list[FrameShapeFit]:
@@ -316,5 +316,5 @@ class SequenceCalibration:
     """Camera calibration, object dimensions and background of a sequence."""
 
     camera_calibration: CameraCalibration  # where the camera stands, how it scales depth, and its clock
-    dimensions: TubeDimensionCheck  # what the frames say of the object's lengths and radii
+    dimensions: TubeDimensionEstimates  # what the frames say of the object's lengths and radii
     background: BackgroundPoints  # what stands there in all frames

@@ -75,8 +75,8 @@ def link_axes(link_ends: Array) -> Array:
     return np.asarray(edge / np.linalg.norm(edge, axis=1)[:, None])
 
 
-def across_links(link_ends: Array, camera: Array) -> Array:
-    """Unit vectors across links (K, 2, 3) as a camera at (3,) sees them, shape (K, 3)."""
+def link_normals_perpendicular_to_sight(link_ends: Array, camera: Array) -> Array:
+    """Unit vectors at right angles to links (K, 2, 3) and to the sight of a camera at (3,), shape (K, 3)."""
     across = np.cross(link_ends[:, 1] - link_ends[:, 0], link_ends.mean(axis=1) - camera)
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None])
 
@@ -280,7 +280,7 @@ def _coverage(
 
 def _swath(tubes: TubeLinks, seen: ProcessedFrameCloud, counted: BoolArray, link: IntArray, offset: Array) -> Array:
     """Variance of points across each link, seen from the camera, beyond that of a tube of its radius."""
-    across, count = across_links(tubes.link_ends, seen.camera_position), len(tubes.link_ends)
+    across, count = link_normals_perpendicular_to_sight(tubes.link_ends, seen.camera_position), len(tubes.link_ends)
     square = np.einsum("ij,ij->i", offset, across[link]) ** 2
     weight = np.bincount(link[counted], seen.point_weights[counted], minlength=count)
     total = np.bincount(link[counted], (seen.point_weights * square)[counted], minlength=count)

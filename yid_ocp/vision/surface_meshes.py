@@ -178,7 +178,7 @@ class ArticulatedSurfaces:
                 result[asked[near]] = distance.astype(np.float64) <= reach
         return result
 
-    def nearest_moving_surface(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
+    def moving_surface_distance(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
         """Distance [m], unit normal towards the point and surface part; infinite, zero and -1 beyond `within` [m]."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)

@@ -31,9 +31,14 @@ from yid_ocp.vision.camera_registration import ArmSurface, CalibrationFrame
 from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_selection import TrackOptions
 from yid_ocp.vision.frames import FrameSequence, OcclusionMap
-from yid_ocp.vision.initial_shapes import InitialShapeFinder, system_with_free_root, trace_centerline_tree
+from yid_ocp.vision.initial_shapes import InitialShapeFinder, cloud_centerline_tree, system_with_free_root
 from yid_ocp.vision.point_cloud import CloudSkeleton, ReachableObjectRegion, WeightedCloud
-from yid_ocp.vision.sequence_calibration import BackgroundPoints, ForeignObject, SequenceCalibration, TubeDimensionCheck
+from yid_ocp.vision.sequence_calibration import (
+    BackgroundPoints,
+    ForeignObject,
+    SequenceCalibration,
+    TubeDimensionEstimates,
+)
 from yid_ocp.vision.shape_evidence import FrameShapeFit, ProcessedFrameCloud
 from yid_ocp.vision.surface_meshes import ArticulatedSurfaces, CameraScene, TriangleMesh
 from yid_ocp.vision.track_result import FrameProcessingStages, FrameReport, TrackResult
@@ -222,7 +227,7 @@ class FrameTracker:
             where = self.sequence.source
             raise DataError(f"{spans}: their clocks are not the same", where=where, hint=f"{hint} together")
 
-    def _shape(self, sizes: TubeDimensionCheck) -> ShapeFitter:
+    def _shape(self, sizes: TubeDimensionEstimates) -> ShapeFitter:
         """The object with the sizes that were estimated."""
         key = tuple(np.where(sizes.is_estimated, sizes.log_ratio, 0.0).tolist()) if any(sizes.is_estimated) else ()
         if key not in self._shapes:
@@ -310,7 +315,7 @@ class FrameTracker:
         filtered = None if work.filtered is None else work.filtered.points
         return FrameProcessingStages(frame, calibration.camera_position, cloud, filtered, work.skeleton)
 
-    def unprocessed_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
+    def initial_frame_report(self, index: int, calibration: CameraCalibration, reason: str) -> FrameReport:
         """Report of a frame before processing, with the reason if it is dropped."""
         stamp = float(self.sequence.stamps[index])
         t = float(calibration.camera_state.stamps_to_joint_clock(stamp))
@@ -366,7 +371,7 @@ class FrameTracker:
         self, index: int, calibration: CameraCalibration, background: BackgroundPoints
     ) -> tuple[_Work, _Look | None]:
         """What a frame shows of the object, None with the reason in its report."""
-        work = _Work(self.unprocessed_frame_report(index, calibration, self._reasons.get(index, "")))
+        work = _Work(self.initial_frame_report(index, calibration, self._reasons.get(index, "")))
         try:
             return work, None if work.report.drop_reason else self._prepared(work, calibration, background)
         except DataError as error:
@@ -429,7 +434,7 @@ class FrameTracker:
     ) -> _Look:
         """What is seen of an object whose root is sought, with the ends that it may have where."""
         diameter, options = 2.0 * self._widest, self.options
-        course = trace_centerline_tree(cloud, diameter, options.skeleton.max_edge_length, rng)
+        course = cloud_centerline_tree(cloud, diameter, options.skeleton.max_edge_length, rng)
         work.skeleton = course.to_skeleton
         work.say(n_skeleton_nodes=len(course.nodes))
         if len(course.loop_positions):

@@ -17,7 +17,7 @@ from yid_ocp.data.recording import PointGroup, Recording, validate_recording
 from yid_ocp.files import atomic_write, make_folder
 from yid_ocp.vision.calibration import CameraCalibration
 from yid_ocp.vision.point_cloud import CloudSkeleton
-from yid_ocp.vision.sequence_calibration import ForeignObject, TubeDimensionCheck
+from yid_ocp.vision.sequence_calibration import ForeignObject, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 
 _CAMERA_POINT_GROUP = "points_camera"
@@ -74,7 +74,7 @@ class TrackResult:
     shared_std: Array  # the part that all frames have in common, from the camera's pose, depth and clock
     frame_reports: tuple[FrameReport, ...]  # all of them, by time stamp
     camera_calibration: CameraCalibration
-    dimensions: TubeDimensionCheck  # what the frames say of the object's lengths and radii
+    dimensions: TubeDimensionEstimates  # what the frames say of the object's lengths and radii
     foreign_objects: tuple[ForeignObject, ...]  # what stood about the object
     root_note: str  # how the root was told from other ends; empty where the model says where it is
     _place: Callable[[Array], Array]  # from a configuration to the points
@@ -95,7 +95,7 @@ class TrackResult:
         return count_drop_reasons(self.frame_reports)
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def dimension_and_foreign_object_notes(self) -> tuple[str, ...]:
         """Messages about the object's dimensions and foreign objects."""
         return (*self.dimensions.messages, *(thing.text for thing in self.foreign_objects))
 

@@ -26,7 +26,7 @@ from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.diagnosis_result import decision_statistics_to_dict
 from yid_ocp.errors import ConfigError, ModelError, OutputError, YidError
-from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_json, write_text
+from yid_ocp.files import read_input_json, read_input_text, to_json_types, write_strict_json, write_text
 from yid_ocp.parallel import LOCAL_WORKER_CONFIG, Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.diagnosis_summaries import blind_tables_markdown
@@ -126,9 +126,9 @@ def run_blind(
         found = blind_scores.calibrate_thresholds(labels, marks, answers, runs[0].diagnosis)
         result["calibration_of_thresholds"] = found
         made = {key: result[key] for key in ("cases", "seed", "code", "code_of_cases", "command", "date", "versions")}
-        write_json(proof.folder / "thresholds.json", to_json_types(found | made))
+        write_strict_json(proof.folder / "thresholds.json", to_json_types(found | made))
     folder, written = proof.folder, to_json_types(result)
-    write_json(folder / "result.json", written)
+    write_strict_json(folder / "result.json", written)
     write_text(folder / "table.md", "\n".join(blind_tables_markdown(written)) + "\n")
     draw_blind_results(folder, written)
     if all(entry.output.write_report for entry in runs):
@@ -205,9 +205,9 @@ class _Proof:
         made = self.done(_draw_case, tasks, "sealed/drawn")
         text, digest = blind.sealed_labels_and_hash([blind.CaseGroundTruth.from_dict(entry["label"]) for entry in made])
         write_text(self.folder / "sealed/labels.json", text)
-        write_json(cases / "cases.json", [entry["case"] for entry in made])
+        write_strict_json(cases / "cases.json", [entry["case"] for entry in made])
         said = {"sha256": digest, "cases": self.count, "seed": self.seed, "purpose": self.purpose}
-        write_json(commitment, said | {"configs": dict(configs), "code": package_source_hash()})
+        write_strict_json(commitment, said | {"configs": dict(configs), "code": package_source_hash()})
 
     def best_closures(
         self, cases: Sequence[Task], labels: Sequence[blind.CaseGroundTruth], answers: Sequence[Mapping[str, Any]]
@@ -240,7 +240,7 @@ def _prepare_experiment(experiment: Mapping[str, Any], folder: str, name: str) -
     BlindExperiment(**experiment)._write_first_recording(first)
     _, ensemble = BlindExperiment(**experiment)._build_ensemble(first)
     detectable = ensemble.candidate_sensitivities_to_json()
-    write_json(Path(folder) / f"{name}.json", detectable)
+    write_strict_json(Path(folder) / f"{name}.json", detectable)
     return {"candidates": len(detectable)}
 
 

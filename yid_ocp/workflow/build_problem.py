@@ -29,7 +29,7 @@ from yid_ocp.model.objects.base import CableTopology, ClampedObject, ClampPoseDe
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
-from yid_ocp.sensors.base import channel_kinds_of_group
+from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, free_parameter_names
@@ -170,7 +170,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
             hint = f"say it of {JOINT_EFFORT_GROUP_NAME}, or leave it out"
             raise run.config_error(f"'{name}' holds no efforts", "sensors", name, "effort_kind", hint=hint)
         group, _, quantity = name.rpartition(".")
-        constants = next((c.constants for c in channel_kinds_of_group(group) if c.quantity == quantity), {})
+        constants = next((c.constants for c in channel_kinds_for_group_name(group) if c.quantity == quantity), {})
         for constant in said.constants:
             if constant not in constants:
                 details = unknown_name_details(constant, constants)

@@ -130,7 +130,7 @@ def _recording(problem: EstimationProblem, role: str, episode: Episode, warnings
         moves = system.driven or any(samples.sensor.effort_joints for samples in episode.measurements)
         if moves and not system.servos and arm.effort is not None and arm.effort_kind is None:
             said = "nothing says whether joints/effort is a sample, a mean or a command (attribute effort_kind)"
-            warnings.append(f"{episode.name}: {said}; it is taken as a {arm.effort_kind_or_default}")
+            warnings.append(f"{episode.name}: {said}; it is taken as a {arm.effort_sampling_kind_or_default}")
     rests = problem.options.initial_state != "fitted_to_points"
     if rests and (system.driven or system.prescribed or system.elastic_joints):
         torque = episode.torque[0] if system.driven else None

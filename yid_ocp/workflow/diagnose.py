@@ -21,7 +21,13 @@ from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
 from yid_ocp.diagnosis.refit import PrecomputedFits
 from yid_ocp.errors import DataError, OutputError
-from yid_ocp.files import dataclass_from_plain_data, json_sha256, read_input_json, to_lossless_plain_data, write_json
+from yid_ocp.files import (
+    dataclass_from_plain_data,
+    json_sha256,
+    read_input_json,
+    to_lossless_plain_data,
+    write_strict_json,
+)
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -239,7 +245,7 @@ class JsonRefitStore:
             try:
                 self.file.parent.mkdir(parents=True, exist_ok=True)
                 data = {"format": _STORE_FORMAT, "key": self._key, "refits": to_lossless_plain_data(self._known)}
-                write_json(self.file, data)
+                write_strict_json(self.file, data)
             except (OSError, OutputError) as error:
                 if not self._warned:
                     log.warning("finished refits cannot be kept (%s); the diagnosis goes on without", error)

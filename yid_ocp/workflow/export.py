@@ -21,7 +21,7 @@ from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.export import models
 from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FormatSupport
 from yid_ocp.export.signals import RosTopicTimeSeries, export_csv, export_mcap, ros_signals_from_recording
-from yid_ocp.files import file_sha256, named_attributes, to_json_types, write_json, write_text
+from yid_ocp.files import file_sha256, named_attributes, to_json_types, write_strict_json, write_text
 from yid_ocp.model.system import System
 from yid_ocp.progress import Progress
 from yid_ocp.report.summaries import export_summary
@@ -177,7 +177,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
     manifest = to_json_types(manifest)
     write_text(out, text)
     try:
-        write_json(out.with_name(f"{out.name}.manifest.json"), manifest)
+        write_strict_json(out.with_name(f"{out.name}.manifest.json"), manifest)
     except BaseException:
         out.unlink(missing_ok=True)  # a model without its manifest would be silent about what it lacks
         raise

@@ -16,7 +16,7 @@ from yid_ocp.config.schema import config_json_schema
 from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_details
 from yid_ocp.files import atomic_write, write_text
-from yid_ocp.model.objects.base import InitObjectConfiguration, comma_separated_numbers, init_object_builders
+from yid_ocp.model.objects.base import InitObjectConfiguration, comma_separated_numbers, init_object_templates
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.progress import Progress
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _object_from_arguments(arguments: argparse.Namespace) -> InitObjectConfiguration:
     """The described object; `ConfigError` for a number that is missing or impossible, which names its option."""
-    templates, word = init_object_builders(), arguments.object
+    templates, word = init_object_templates(), arguments.object
     if word not in templates:
         said = unknown_name_details(word, templates)
         raise ConfigError(f"there is no choice of --object '{word}'", where="yid-ocp init", **said)

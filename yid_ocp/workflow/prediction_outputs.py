@@ -132,7 +132,7 @@ def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | N
         carried = predictions.interpolated_displacement_baseline
         arrays = {
             "stays": predictions.constant_position_baseline(recording, points, _START_FRAMES),
-            "moves_with_clamps": predictions.clamp_displacement_baseline(recording, points, held, _START_FRAMES),
+            "moves_with_clamps": predictions.mean_clamp_displacement_baseline(recording, points, held, _START_FRAMES),
             "linear_carry": carried(recording, points, parents, children, given=_START_FRAMES),
         }
         return {name: array[inside].reshape(len(samples.value), -1) for name, array in arrays.items()}

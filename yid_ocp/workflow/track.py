@@ -40,7 +40,7 @@ from yid_ocp.vision.fit import ShapeFitter
 from yid_ocp.vision.frame_folder import write_frame_folder
 from yid_ocp.vision.frame_reading import read_frames
 from yid_ocp.vision.frames import FrameSequence, look_at_pose
-from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionCheck
+from yid_ocp.vision.sequence_calibration import ForeignObject, SequenceCalibration, TubeDimensionEstimates
 from yid_ocp.vision.shape_evidence import FrameShapeFit
 from yid_ocp.vision.surface_meshes import CameraScene, VirtualFrames
 from yid_ocp.vision.track import FrameTracker
@@ -161,7 +161,7 @@ def _frame_result(frame: FrameReport, fit: FrameShapeFit | None) -> dict[str, An
     return found | named_attributes(frame, f"{names} nodes=n_skeleton_nodes delay=stamp_delay seconds=cpu_seconds")
 
 
-def _sizes_result(sizes: TubeDimensionCheck) -> dict[str, Any]:
+def _sizes_result(sizes: TubeDimensionEstimates) -> dict[str, Any]:
     fits = sizes.model_values * np.exp(sizes.log_ratio)
     return {
         "frames": sizes.n_frames,
@@ -308,7 +308,7 @@ class _FrameTasks:
         results = self._run(_track_frame_task, tasks, workers, progress.report_parts_done)
         require_task_values([result for result in results if "abruptly" not in result.error])
         return [
-            tracker.unprocessed_frame_report(i, common.camera_calibration, f"work on it failed: {result.error}")
+            tracker.initial_frame_report(i, common.camera_calibration, f"work on it failed: {result.error}")
             if "abruptly" in result.error
             else dataclass_from_plain_data(FrameReport, result.value)
             for i, result in zip(tracker.frame_order, results, strict=True)

@@ -143,7 +143,7 @@ class InitObjectConfiguration:
 
 
 @dataclass(frozen=True)
-class InitObjectBuilder:
+class InitObjectTemplate:
     """What one word of `init --object` stands for: how the object is built and which numbers it needs.
 
     `build` makes it of what was given by name (flags of `init`, and `--number`) and the number of links per segment;
@@ -198,7 +198,7 @@ class ObjectKind:
 
     # whether `solve` looks at twice the links where nothing is said: not where the links are the object's definition
     default_link_refinement: ClassVar[bool] = False
-    init_templates: ClassVar[Mapping[str, InitObjectBuilder]] = {}  # words of `init --object`
+    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {}  # words of `init --object`
     settings_examples: ClassVar[Mapping[str, str]] = {}  # YAML for the page of settings, by section
 
     kind: Annotated[str, OptionInfo("what the object is")]
@@ -286,6 +286,6 @@ class MountedObject(ObjectKind):
 OBJECT_KINDS: Registry[type[ObjectKind]] = Registry("kind")
 
 
-def init_object_builders() -> dict[str, InitObjectBuilder]:
+def init_object_templates() -> dict[str, InitObjectTemplate]:
     """Templates of all kinds of objects, by the word of `init --object` that selects them."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}

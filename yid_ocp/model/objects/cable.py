@@ -37,7 +37,7 @@ from yid_ocp.model.flexible import (
     flexible_object,
     relative_parallel_transport_rotations,
 )
-from yid_ocp.model.mechanism import Frame, LinkChain, Mechanism, Placement
+from yid_ocp.model.mechanism import ArcLengthChain, Frame, Mechanism, Placement
 from yid_ocp.model.objects.base import END_CLAMP, OBJECT_KINDS, START_CLAMP, CableTopology, ObjectKind
 from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
@@ -212,7 +212,7 @@ def _with_vertices(
     frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
     parent = tree.link_chains[cable.parent_segment]
     edges = np.array([lengths[edge] for edge in pairwise(cable.parent_branch_points)])
-    whole = LinkChain((cable.parent_branch_points[1], *parent.tip_frames), tuple(map(float, edges / edges.sum())))
+    whole = ArcLengthChain((cable.parent_branch_points[1], *parent.tip_frames), tuple(map(float, edges / edges.sum())))
     lines = {**tree.link_chains, cable.parent_segment: whole}
     return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
 

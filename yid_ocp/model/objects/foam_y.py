@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Ge, Le
 
 from yid_ocp.model.flexible import FlexibleObject, Segment, flexible_object
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectBuilder, InitObjectConfiguration, MountedObject
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectConfiguration, InitObjectTemplate, MountedObject
 from yid_ocp.model.rotations import homogeneous_transform, rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
@@ -46,7 +46,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitObjectConfigurat
 class FoamY(MountedObject):
     """The paper's foam letter Y; its foot stands where the paper's does when there is no mount."""
 
-    init_templates: ClassVar[Mapping[str, InitObjectBuilder]] = {"foam_y": InitObjectBuilder(4, _init_object)}
+    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {"foam_y": InitObjectTemplate(4, _init_object)}
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: foam_y": """\
 model:

@@ -11,7 +11,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model.flexible import Segment
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectBuilder, InitObjectConfiguration, MountedObject
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectConfiguration, InitObjectTemplate, MountedObject
 from yid_ocp.model.rotations import rotation_from_rpy
 from yid_ocp.options import OptionInfo
 
@@ -173,10 +173,10 @@ class SegmentedObject(MountedObject):
     """A flexible object built from segments, such as a beam or a tube with branches."""
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitObjectBuilder]] = {
-        "cable": InitObjectBuilder(8, _cable),
-        "beam": InitObjectBuilder(6, _beam),
-        "tree": InitObjectBuilder(4, _tree, has_branches=True),
+    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {
+        "cable": InitObjectTemplate(8, _cable),
+        "beam": InitObjectTemplate(6, _beam),
+        "tree": InitObjectTemplate(4, _tree, has_branches=True),
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: segments": """\

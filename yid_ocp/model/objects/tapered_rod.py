@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le
 from yid_ocp.model.flexible import FlexibleObject, Segment
 from yid_ocp.model.mechanism import Inertia, Joint
 from yid_ocp.model.objects import base
-from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectBuilder, InitObjectConfiguration, MountedObject
+from yid_ocp.model.objects.base import OBJECT_KINDS, InitObjectConfiguration, InitObjectTemplate, MountedObject
 from yid_ocp.model.parameters import Parameter
 from yid_ocp.options import OptionInfo
 
@@ -39,8 +39,8 @@ class TaperedRod(MountedObject):
     """
 
     default_link_refinement = True
-    init_templates: ClassVar[Mapping[str, InitObjectBuilder]] = {
-        "tapered_rod": InitObjectBuilder(8, _init_object, _FURTHER_NUMBERS)
+    init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {
+        "tapered_rod": InitObjectTemplate(8, _init_object, _FURTHER_NUMBERS)
     }
     settings_examples: ClassVar[Mapping[str, str]] = {
         "model.object, kind: tapered_rod": """\
