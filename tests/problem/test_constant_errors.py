@@ -13,9 +13,9 @@ from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import (
     estimated_constant_errors,
-    measurement_sensitivities_to_biases,
     subtract_estimated_biases,
     whitened_by_constant_errors,
+    whitened_sensitivities_to_unit_biases,
 )
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
@@ -123,7 +123,7 @@ def test_held_out_rows_count_it_and_rows_without_a_constant_stay(urdf_folder):
     counted = problem.whitened_held_out_residual(0, episode, result).residual
     pairs = zip(episode.measurements, result.predicted_outputs, strict=True)
     plain = np.concatenate([samples.residual_and_jacobian(y).residual for samples, y in pairs])
-    slopes = measurement_sensitivities_to_biases(episode.measurements)
+    slopes = whitened_sensitivities_to_unit_biases(episode.measurements)
     rows = np.any(slopes != 0, axis=1)
     np.testing.assert_allclose(counted[~rows], plain[~rows], rtol=1e-14)
     covariance = np.eye(len(plain)) + slopes @ slopes.T

@@ -175,7 +175,7 @@ class PositionServo:
         return 0.5 * self.gain * error**2
 
     @property
-    def gain_damping_delay_limit(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
+    def gain_damping_delay_limit_tightness(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
         """Gain, damping, command delay and torque limit tightness (limit^-p)."""
         return self.gain, self.damping, self.command_delay, self.torque_limit_tightness
 

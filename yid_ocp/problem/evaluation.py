@@ -16,8 +16,8 @@ from yid_ocp.problem.measurements import (
     Measurements,
     ResidualAndJacobian,
     huber_loss_and_residual_factors,
-    measurement_sensitivities_to_biases,
     whitened_by_constant_errors,
+    whitened_sensitivities_to_unit_biases,
 )
 
 EquilibriumGuesses = tuple[Array | None, ...]
@@ -118,7 +118,7 @@ def whitened_episode_residual(
 
     Constant sensor errors count as noise, see `whitened_by_constant_errors`.
     """
-    by_constants = measurement_sensitivities_to_biases(episode.measurements)
+    by_constants = whitened_sensitivities_to_unit_biases(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
         return _sensor_whitened_residual(episode.measurements, result, threshold)
     plain = _sensor_whitened_residual(episode.measurements, result)

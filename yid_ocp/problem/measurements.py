@@ -273,7 +273,7 @@ def estimated_constant_errors(slopes: Array, residual: Array) -> Array:
     return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
 
 
-def measurement_sensitivities_to_biases(samples: Sequence[Measurements]) -> Array:
+def whitened_sensitivities_to_unit_biases(samples: Sequence[Measurements]) -> Array:
     """Derivatives of whitened measurements by constant sensor errors of one standard deviation, shape (r, m).
 
     Those of the residual, prediction minus measurement, have the opposite sign.
@@ -294,7 +294,7 @@ def subtract_estimated_biases(samples: Sequence[Measurements], predicted: Sequen
 
     `predicted` has the shape (M, k) for each.
     """
-    slopes = measurement_sensitivities_to_biases(samples)
+    slopes = whitened_sensitivities_to_unit_biases(samples)
     if not slopes.shape[1]:
         return tuple(samples)
     pairs = zip(samples, predicted, strict=True)

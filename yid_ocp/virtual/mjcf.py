@@ -120,7 +120,7 @@ def model_aspects_of_parameters(system: System, symbols: ca.SX) -> set[str]:
             part for grasp in held for part in (grasp.compliance, grasp.relaxation_time) if part is not None
         ),
         "sprung_joint": system.joint_compliances.values(),
-        "servo": (part for servo in system.servos.values() for part in servo.gain_damping_delay_limit),
+        "servo": (part for servo in system.servos.values() for part in servo.gain_damping_delay_limit_tightness),
         "clock": (system.recorded_time_scale,),
     }
     return {name for name, parts in entered.items() if any(_depends(part, symbols) for part in parts)}
@@ -421,7 +421,7 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element,
         attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)
         bias, between = [-offset, 0.0, 0.0], "linear"
         if servo is not None:
-            own, damping, late, tightness = (float(value(x)[0]) for x in servo.gain_damping_delay_limit)
+            own, damping, late, tightness = (float(value(x)[0]) for x in servo.gain_damping_delay_limit_tightness)
             damping = 0.0 if servo.motor_kind == "dc" else damping
             gain, bias, delay = own * gain, [own * bias[0], -own, -damping], delay + late
             between = "zoh" if servo.command_interpolation == "held" else "linear"
