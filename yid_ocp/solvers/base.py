@@ -255,6 +255,9 @@ _MIN_SCANNED_RELATIVE_STD, _MAX_COST_RISE_RATIO, _MAX_LOCAL_MINIMUM_STARTS = 0.0
 _SCAN_FACTORS = (1 / 2.5, 1 / 1.6, 1.6, 2.5)
 # Noise that drives the motion is linearised where a pass begins; passes end when one changes nothing.
 _MAX_WHITENING_PASSES = 6
+# A search that comes this near to a known fit takes that fit [standard deviations]. Two searches may well end farther
+# apart in one minimum, by the tolerance of a solver or the weights of the last pass, and the better end counts.
+_SAME_FIT_STDS = 0.01
 _STALLED_REMEDY = "start nearer, widen the bounds, or use gauss_newton"
 
 
@@ -436,7 +439,7 @@ def _fit_from(
         # the second pass is the first about torque offsets that are not guessed
         if number and len(result.history) < 2:
             break
-        # a search that has come to a known fit is not weighted again: it would end there
+        # a search that has come to a known fit is not weighted again
         if passes > 1 and (same := next((fit for fit in known if _is_at(fit, x)), None)) is not None:
             return replace(same, n_evaluations=evaluations, history=history)
     if problem.has_process_noise and passes == 1 and _accounts_for_process_noise(solver):
@@ -446,9 +449,9 @@ def _fit_from(
 
 
 def _is_at(fit: _Fit, x: Array) -> bool:
-    """Whether a point lies within the noise of a fit: its chi2 there, to second order, is the fit's and less than 1."""
+    """Whether a point differs from a fit by d with |J d| next to nothing; no |d_i| / std_i is larger than that."""
     slopes = fit.evaluation.jacobian if fit.evaluation.ok else None
-    return slopes is not None and float(np.sum((slopes @ (x - fit.result.x)) ** 2)) < 1.0
+    return slopes is not None and float(np.linalg.norm(slopes @ (x - fit.result.x))) < _SAME_FIT_STDS
 
 
 def _doubtful(fit: _Fit, first: Array) -> BoolArray:
