@@ -7,10 +7,13 @@ from yid_ocp.progress import Progress
 
 class Heard(Progress):
     def __init__(self) -> None:
-        self.stages, self.parts = [], []
+        self.stages, self.parts, self.table = [], [], []
 
     def begin_stage(self, text):
         self.stages.append(text)
 
     def report_parts_done(self, done, total, text):
         self.parts.append((done, total, text))
+
+    def report_table(self, rows):
+        self.table = rows

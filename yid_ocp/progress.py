@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +20,9 @@ class Progress:
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Report that `done` of `total` parts of the stage are finished; `text` names the last or next one."""
+
+    def report_table(self, rows: Sequence[Sequence[str]]) -> None:
+        """Report all results so far, header first and then the best, in place of those reported before."""
 
 
 NULL_PROGRESS = Progress()
@@ -46,8 +50,10 @@ class ParallelProgress:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()
         progress.report_parts_done(0, total, first)
 
-    def count_done(self, text: str) -> None:
-        """Report one more finished part; may be called from any thread."""
+    def count_done(self, text: str, table: Callable[[], Sequence[Sequence[str]]] | None = None) -> None:
+        """Report one more finished part, with the table of results if there is one; may be called from any thread."""
         with self._lock:
             self._count += 1
             self._progress.report_parts_done(self._count, self._total, text)
+            if table is not None:
+                self._progress.report_table(table())

@@ -291,6 +291,8 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     assert by_kind["friction"] == ("problem", ["base", "friction"], {"k": 2.0, A: 0.7}, "store", "", LIMITS)
     assert by_kind["offset"][2] == {"k": 3.0}
     assert heard.stages == ["refitting with each of 3 effects beside base@x"]
+    both = [(f"base@x and {label}", "1.234") for label in ("friction@elbow", "offset@elbow")]
+    assert (heard.table[0], sorted(heard.table[1:])) == (("effects", "held-out chi2/n"), both)
     assert sorted(text for done, _, text in heard.parts if done) == [
         "no fit with third@x",
         "refitted with friction@elbow: held-out chi2/n 1.234",
@@ -301,6 +303,33 @@ def test_all_are_refitted_from_the_fit_and_their_own_steps(solved, monkeypatch):
     assert sorted(name for *_, name, _ in asked[3:]) == [
         f"base@x and {label} from there" for label in ("friction@elbow", "offset@elbow", "third@x")
     ]
+
+
+def test_within_a_limit_refits_begin_best_first_as_long_as_they_may_end(monkeypatch):
+    """Of ten seconds each: one, from which the pace is known, the two that end within 35 s, one more, and no other."""
+    now, tried, batches = [0.0], [((effect(f"{kind}@x"),), {}) for kind in "abcdef"], []
+
+    def one(problem, effects, start, store, name, limits):
+        now[0] += 10.0
+        left = 9.0 - ord(effects[-1].kind)
+        return SimpleNamespace(**vars(fit(effects, loss(left, left))) | {"is_from_store": False})
+
+    def batched(function, entries):
+        batches.append([of.kind for (of,), _ in entries])
+        return [function(entry) for entry in entries]
+
+    monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    monkeypatch.setattr(module, "refit_with_effects", one)
+    monkeypatch.setattr(module, "map_with_batched_calls", batched)
+    search, march = RefitContext("problem", LIMITS, Heard(), deadline=35.0), [["a"], ["b", "c"], ["d"]]
+    found = refit_with_each_effect(search, (), tried, {})
+    assert ([f.effects[-1].kind for f in found], batches, search.skipped) == ([*"abcd"], march, ["e@x", "f@x"])
+    assert refit_with_each_effect(search, (), tried[:1], {}) == []
+    assert [name for name, _ in search.progress.table[1:]] == ["d@x", "c@x", "b@x", "a@x"]
+    # without one all march together, as ever
+    batches.clear()
+    assert len(refit_with_each_effect(RefitContext("problem", LIMITS, Heard()), (), tried, {})) == 6
+    assert batches == [[*"abcdef"]]
 
 
 # -- held-out recordings ----------------------------------------------------------------------------------------------

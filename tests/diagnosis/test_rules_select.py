@@ -332,8 +332,8 @@ class Rounds:
         kinds = "".join(sorted(of.kind for of in effects))
         return None if kinds in self.fails else self.fit(effects)
 
-    def compose(self, moved=False, **limits):
-        search = RefitContext(SimpleNamespace(), Thresholds(**limits), self.heard, None)
+    def compose(self, moved=False, deadline=math.inf, **limits):
+        search = self.search = RefitContext(SimpleNamespace(), Thresholds(**limits), self.heard, deadline=deadline)
         nominal = fit((), loss(*self.losses[""]), values={"k": 0.0})
         first, added = select_effects(search, nominal, self.screened(), moved=moved)
         return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
@@ -348,6 +348,30 @@ def test_one_effect_that_leaves_no_gap_is_enough(monkeypatch):
     assert added[0].cumulative_closure.fraction == pytest.approx(1 - 0.05 / 2.1)
     assert [of.kind for of in added[0].equivalent_effects] == ["a"]
     assert rounds.heard.stages == ["added a@x: 97.6 % of the held-out gap closed", "scoring what is left beside a@x"]
+
+
+def test_a_search_out_of_time_keeps_what_it_has_and_says_what_it_leaves(monkeypatch):
+    losses = {"": (3.0, 3.2), "a": (2.0, 2.2), "b": (2.9, 3.1), "c": (2.9, 3.1)}
+    rounds = Rounds(monkeypatch, losses, before={}, left=1e-3)
+    first, chosen, _ = rounds.compose(moved=True, deadline=0.0)
+    assert (first, chosen) == (["a", "b", "c"], ["a"])
+    assert rounds.search.skipped == ["candidates from the earlier run's parameters", "what is left beside a@x"]
+    assert rounds.screens == []
+
+
+def test_what_looks_alike_and_was_not_tried_stays_beside_what_was_added(monkeypatch):
+    rounds = Rounds(monkeypatch, {"": (3.0, 3.2), "a": (1.0, 1.1)}, left=1e-3)
+    shared = alike(["a@x", "b@x", "c@x"], [[1.0, 0.95, 0.1], [0.95, 1.0, 0.1], [0.1, 0.1, 1.0]])
+    monkeypatch.setattr(rounds, "screened", lambda *base: replace(Rounds.screened(rounds, *base), confusability=shared))
+    tried = rounds.refit_all
+
+    def first_alone(search, base, *rest):
+        search.skipped.extend(["b@x", "c@x"])
+        return tried(search, base, *rest)
+
+    monkeypatch.setattr(select, "refit_with_each_effect", first_alone)
+    [entry] = rounds.compose(deadline=0.0)[2]
+    assert [of.kind for of in entry.equivalent_effects] == ["a", "b"]
 
 
 def test_where_a_fit_has_left_an_earlier_run_candidates_are_tried_from_there_too(monkeypatch):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from yid_ocp.diagnosis import Thresholds, diagnose
 from yid_ocp.diagnosis.diagnosis_result import diagnosis_summary_text
 from yid_ocp.errors import YidError
 from yid_ocp.problem import ProblemOptions, SensorOptions
+from yid_ocp.progress import Progress
 
 FRICTION = ("joint_coulomb", "link_mass@elbow", "effort_offset@elbow")
 
@@ -61,6 +64,38 @@ def test_a_withheld_effect_is_named_placed_and_measured(bench):
     damping = next(entry for entry in finding.nominal_changes if entry.name == "elbow.damping")
     assert damping.value_before > damping.value_after, "friction hides in the damping until it is named"
     assert "joint_coulomb@elbow with tau_c" in result["summary"]
+
+
+def test_a_spent_budget_ends_with_the_verdict_of_what_was_refitted(bench, monkeypatch):
+    """Time stands still until the first refit is done, and is over then; without any it is over before."""
+    recordings = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.1}}, seed) for seed in (1, 2)]
+    clock = [0.0]
+
+    class Hurried(Progress):
+        def report_parts_done(self, done, total, text):
+            clock[0] = math.inf if done else 0.0
+
+    def stopped(progress):
+        limits = Thresholds(max_effects=2, budget=1e4)
+        finding = diagnose(
+            bench.problem(recordings[:1]), FRICTION, recordings[1:], thresholds=limits, progress=progress
+        )
+        assert finding.summary.count("The search stopped after 10000 s; it would go on with ") == 1
+        return json.loads(json.dumps(finding.to_dict(), allow_nan=False))
+
+    monkeypatch.setattr("yid_ocp.diagnosis.refit.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    result = stopped(Hurried())
+    assert (result["verdict"], result["effects"]) == ("effect", [{"kind": "joint_coulomb", "location": "elbow"}])
+    assert [entry["closure"] is not None for entry in result["which"]] == [True, False, False, False]
+    assert result["stopped"]["after"] == 1e4
+    assert result["stopped"]["next"][-1] == "what is left beside joint_coulomb@elbow"
+    assert result["carried_over"], "what was named was held against the held-out recordings as ever"
+    clock[0] = math.inf
+    result = stopped(Progress())
+    assert (result["verdict"], result["reason"], result["effects"]) == ("unknown", "none", [])
+    assert result["where"][0]["location"] == "elbow"
+    assert all(entry["closure"] is None for entry in result["which"])
+    assert "joint_coulomb@elbow" in result["stopped"]["next"]
 
 
 def test_a_model_that_is_right_has_no_gap(bench):

@@ -90,6 +90,22 @@ def test_an_interrupted_diagnosis_resumes_its_finished_refits(rubbing, whole, tm
     assert not list(tmp_path.glob(".*"))
 
 
+def test_a_spent_budget_leaves_a_whole_run_folder_that_says_so(rubbing, whole, tmp_path):
+    settings = ["diagnosis.budget=1e-9", "output.write_report=true"]
+    hurried = run_diagnose(load_config(rubbing, settings), tmp_path / "run")
+    assert whole[0].result["stopped"] is None
+    result = json.loads((hurried.folder / "result.json").read_text())
+    assert (result["verdict"], result["effects"], result["stopped"]["after"]) == ("unknown", [], 1e-9)
+    assert result.keys() == json.loads((whole[0].folder / "result.json").read_text()).keys()
+    said = f"The search stopped after 1e-09 s; it would go on with {result['stopped']['next'][0]}"
+    assert said in result["summary"]
+    assert said in (hurried.folder / "report.html").read_text("utf-8")
+    assert load_config(hurried.folder / "config.yaml").diagnosis.budget == 1e-9
+    both = [{path.name for path in run.folder.iterdir()} for run in (hurried, whole[0])]
+    assert both[0] == both[1] | {"report.html"}
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
 def test_a_changed_configuration_resumes_nothing(rubbing, tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(KeyboardInterrupt):

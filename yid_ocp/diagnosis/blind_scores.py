@@ -60,12 +60,12 @@ class BlindCaseScore:
         return self.confusable or tuple(self.answer.split(" + ")[:1])
 
     @property
-    def true_class_label(self) -> str:
+    def _true_class_label(self) -> str:
         """Name of the case's row in the confusion matrix: the kind of a single effect, else the category."""
         return self.truth.partition("@")[0] if self.category == "single" else self.category
 
     @property
-    def answered_class_label(self) -> str:
+    def _answered_class_label(self) -> str:
         """Name of the answer's column in the confusion matrix: the kind of the first effect added, else the verdict."""
         return self.verdict if self.answer == "-" else self.answer.partition("@")[0]
 
@@ -215,7 +215,7 @@ def _experiment_rates(own: Sequence[BlindCaseScore]) -> dict[str, Any]:
 
 def _confusion_matrix(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
     """The confusion matrix: true classes (rows), answers (columns) and counts."""
-    pairs = [(m.true_class_label, m.answered_class_label) for m in marks]
+    pairs = [(m._true_class_label, m._answered_class_label) for m in marks]
     rows = sorted({true for true, _ in pairs}, key=lambda name: (name in _CATEGORIES, name))
     columns = sorted({answered for _, answered in pairs}, key=lambda name: (name in _VERDICTS, name))
     counts = [[pairs.count((row, column)) for column in columns] for row in rows]

@@ -130,7 +130,9 @@ def diagnose(
             problem = with_baseline_prior(problem, earlier.combined_estimates)
         composed = _composed(problem, candidates, exclude, held_out, told)
         clock["compose"] = time.perf_counter()
-        search = RefitContext(composed, thresholds or DEFAULT_THRESHOLDS, told, known.store)
+        limits = thresholds or DEFAULT_THRESHOLDS
+        until = clock[""] + (limits.budget or math.inf)
+        search = RefitContext(composed, limits, told, known.store, until)
         return _diagnosed(_examined(problem, search, known.solution, clock), earlier, clock)
 
 
@@ -165,7 +167,8 @@ def _examined(
     clock["events"] = time.perf_counter()
     found = _tested(search, nominal, cuts, whole, events, smoothed)
     clock["screening"] = time.perf_counter()
-    if found.has_gap and found.has_enough_samples and found.before.chi2_per_dof < limits.restart_chi2:
+    poor = found.has_gap and found.has_enough_samples and found.before.chi2_per_dof < limits.restart_chi2
+    if poor and not search.skip_if_late("the nominal model from other starts"):
         other = _better_nominal_fit(found.search, nominal)
         if other is not None:
             # what the smoother says is about another fit
@@ -245,6 +248,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
         counterfactual=earlier.predict_with_effects_removed_and_added(nominal, final, search.progress),
+        untried=tuple(dict.fromkeys(search.skipped)),
     )
     return replace(finding, summary=diagnosis_summary_text(finding))
 

@@ -90,6 +90,7 @@ class DiagnosisResult(ReprMixin):
     explained_fraction: float = 1.0  # what the effects explain over what the smoother explains
     transfer_checks: tuple[ParameterTransferCheck, ...] = ()
     events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
+    untried: tuple[str, ...] = ()  # what `Thresholds.budget` left no time for, best first; empty where all was done
 
     def _summary(self) -> ReprSummary:
         effects, closed = ", ".join(effect.label for effect in self.accepted_effects), self.gap_closure.fraction
@@ -167,6 +168,7 @@ class DiagnosisResult(ReprMixin):
             "noise": {
                 f.channel: attributes_to_json(f, "std=noise_std unit samples=n_samples") for f in self.noise_floor
             },
+            "stopped": {"after": self.thresholds.budget, "next": list(self.untried)} if self.untried else None,
             "baseline": None if since is None else _baseline_to_json(since),
             "counterfactual": None if self.counterfactual is None else self.counterfactual.to_dict(),
             "seconds": dict(self.stage_seconds),
@@ -324,8 +326,8 @@ _NEXT_EXPERIMENT_TEXTS = {
 }
 """Texts of the recommended next experiment, by situation."""
 _UNKNOWN_REASON_TEXTS = {
-    "nothing": "No known effect explains it.",
-    "none": "No known effect explains it (the best, {best}, is not sure to be there and to close a part).",
+    "nothing": "{no} explains it.",
+    "none": "{no} explains it (the best, {best}, is not sure to be there and to close a part).",
     "unsure": "{names} close{s} {closure:.3g} % of it, but not surely: at least {low:.3g} %, where {least:.3g} % are "
     "asked.",
     "little": "{names} explain{s} {explained:.3g} % of what unknown forces, offsets and biases explain, and surely "
@@ -393,6 +395,9 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
         text += _effects(finding)
     elif finding.verdict == "unknown":
         text.append(_nameless(finding))
+    if finding.untried:
+        rest = ", ".join(finding.untried[:8]) + (", ..." if len(finding.untried) > 8 else "")
+        text.append(f"The search stopped after {finding.thresholds.budget:g} s; it would go on with {rest}.")
     text += [held_out_truncation_message(cut) for cut in finding.truncated_recordings]
     if finding.baseline_comparison is not None:
         text += _since(finding.baseline_comparison, bool(finding.accepted_effects))
@@ -452,6 +457,7 @@ def _nameless(finding: DiagnosisResult) -> str:
         asked=f"of the former are asked of {count} assumptions" if count > 1 else "of either are asked",
         enough=100 * required_fraction_of_smoother_chi2(added, finding.thresholds),
         apart="; ".join(apart[:2]),
+        no="No effect tried so far" if finding.untried else "No known effect",
     )
 
 

@@ -7,8 +7,9 @@ differences between models are paired. G = max(0, chi2/n - 1) is the gap.
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -116,12 +117,21 @@ class PrecomputedFits:
 
 @dataclass(frozen=True)
 class RefitContext:
-    """Problem, thresholds, progress and store shared by all refits of one diagnosis."""
+    """Problem, thresholds, progress, store and time shared by all refits of one diagnosis."""
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
     progress: Progress
     store: RefitStore | None = None
+    deadline: float = math.inf  # of `time.perf_counter`, from which on nothing more is tried [s]
+    skipped: list[str] = field(default_factory=list)  # what was not tried, of all copies of this context
+    left_by: dict[str, float] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
+
+    def skip_if_late(self, *what: str) -> bool:
+        """Whether the time for refits is spent; what it leaves untried is noted."""
+        is_late = time.perf_counter() >= self.deadline
+        self.skipped.extend(what if is_late else ())
+        return is_late
 
 
 @dataclass(frozen=True)
@@ -325,7 +335,8 @@ def refit_with_each_effect(
     """Refit the model with each of several effects or pairs added to those of `base`; return the refits that succeed.
 
     Each of those `tried` stands beside the parameters at which it begins, `values` is where all other unknowns begin,
-    and `where` says so in the store if the same effects are refitted from elsewhere too.
+    and `where` says so in the store if the same effects are refitted from elsewhere too. What the context's deadline
+    leaves no time for is noted there.
     """
     if not tried:
         return []
@@ -342,11 +353,27 @@ def refit_with_each_effect(
         text = f"no fit with {label}"
         if fit is not None:
             how = "resumed the refit" if fit.is_from_store else "refitted"
-            text = f"{how} with {label}: held-out chi2/n {fit.held_out_loss.chi2_per_sample:.4g}"
-        parts.count_done(text)
+            search.left_by[join_effect_labels(effects)] = left = fit.held_out_loss.chi2_per_sample
+            text = f"{how} with {label}: held-out chi2/n {left:.4g}"
+        parts.count_done(text, lambda: _ranking(search.left_by))
         return fit
 
-    return [fit for fit in map_with_batched_calls(one, tried) if fit is not None]
+    fits: list[RefittedModel | None] = []
+    rest, begun = list(tried), time.perf_counter()
+    while rest and not search.skip_if_late(*(join_effect_labels(effects) for effects, _ in rest)):
+        # a batch costs less than its refits one by one; within a limit, so many as will end before it, best first
+        count, now = len(rest), time.perf_counter()
+        if search.deadline < math.inf:
+            count = int((search.deadline - now) * len(fits) / (now - begun)) if fits else 1
+        batch, rest = rest[: max(count, 1)], rest[max(count, 1) :]
+        fits += map_with_batched_calls(one, batch)
+    return [fit for fit in fits if fit is not None]
+
+
+def _ranking(left_by: Mapping[str, float]) -> list[tuple[str, str]]:
+    """Table of what refits leave of the held-out recordings, best first."""
+    ranked = sorted(left_by.items(), key=lambda entry: entry[1])
+    return [("effects", "held-out chi2/n"), *((name, f"{left:.4g}") for name, left in ranked)]
 
 
 def _block_duration(episodes: Sequence[Episode]) -> float:

@@ -259,14 +259,17 @@ def select_effects(
     while len(added) < limits.max_effects:
         base = tuple(entry.effect for entry in added)
         if added:
+            if search.skip_if_late(f"what is left beside {join_effect_labels(base)}"):
+                break
             search.progress.begin_stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
             screened = screen_candidates(search.problem, base, current.values, limits)
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
             p_value = bonferroni_min_p_value(screened.candidate_scores)
             if _little_is_left(current, limits) and p_value >= limits.candidate_significance_level:
                 break
-        fits = refit_with_each_effect(search, base, _refit_shortlist(screened, limits, base, places), current.values)
-        if moved and not base:
+        shortlist = _refit_shortlist(screened, limits, base, places)
+        fits = refit_with_each_effect(search, base, shortlist, current.values)
+        if moved and not base and not search.skip_if_late("candidates from the earlier run's parameters"):
             fits = _likelier([*fits, *_from_before(search)])
         if len(base) == 1:
             pairs = _pairs_to_refit(alone, limits, base[0])
@@ -293,6 +296,9 @@ def select_effects(
             added = _rebuilt(search, nominal, pair, chosen)
         else:
             beside = [fit.effects[-1] for fit in near if fit is not chosen and fit.effects[:-1] == base]
+            # what looks alike and was not tried cannot be told from it yet
+            alike = screened.confusability.confusable_with(chosen.effects[-1].label, limits.signature_overlap)
+            beside += [own[0] for own, _ in shortlist if own[0].label in {*alike}.intersection(search.skipped)]
             added = (*added, SelectedEffect(chosen.effects[-1], chosen, total, (chosen.effects[-1], *beside)))
         current = chosen
     kept = _reconsidered(search, nominal, added, paired)
@@ -351,7 +357,7 @@ def _reconsidered(
     while len(kept) > 1:
         others = [_labels(kept) - {entry.effect.label} for entry in kept]
         position = next((i for i, own in enumerate(others) if own not in tried), None)
-        if position is None:
+        if position is None or search.skip_if_late("each effect without the others' company"):
             break
         tried.add(others[position])
         revised = _revised(search, nominal, kept, kept[position])

@@ -404,7 +404,7 @@ def _ensemble(experiment: BlindExperiment, first: Path, written: int) -> tuple[R
     del written
     varied, simulated_run = EXPERIMENT_VARIATIONS[experiment.variation], experiment.simulation_settings()
     simulated = build_system(simulated_run)
-    begun = (f"recordings.estimate=[{json.dumps(str(first))}]", "recordings.held_out=[]")
+    begun = (f"recordings.estimate=[{json.dumps(str(first))}]", "recordings.held_out=[]", "diagnosis.budget=null")
     run = load_config(experiment.config_file, (*varied.diagnosis_overrides(simulated.driven), *begun))
     ensemble = blind.BlindCaseGenerator(
         build_problem(run),

@@ -130,6 +130,9 @@ class _LoggedProgress(Progress):
         self.folder.log_event("part", done=done, total=total, text=text)
         self.shown.report_parts_done(done, total, text)
 
+    def report_table(self, rows: Sequence[Sequence[str]]) -> None:
+        self.shown.report_table(rows)
+
 
 def _flags(run: RunSettings) -> list[str]:
     said = run.key_locations
