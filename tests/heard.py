@@ -9,7 +9,7 @@ class Heard(Progress):
     def __init__(self) -> None:
         self.stages, self.parts, self.table = [], [], []
 
-    def begin_stage(self, text):
+    def begin_stage(self, text, work=0.0, ahead=None):
         self.stages.append(text)
 
     def report_parts_done(self, done, total, text):

@@ -174,7 +174,7 @@ class Killing(Progress):
     def __init__(self, scheduler: Any) -> None:
         self.scheduler, self.diagnosing, self.killed = scheduler, False, 0
 
-    def begin_stage(self, text: str) -> None:
+    def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         self.diagnosing = text.startswith("diagnosing")
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:

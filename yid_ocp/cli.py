@@ -16,6 +16,7 @@ import os
 import re
 import sys
 import tempfile
+import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -69,6 +70,7 @@ def _configured(parser: argparse.ArgumentParser, optional: bool = False) -> None
 
 def _printing(parser: argparse.ArgumentParser, path: str) -> None:
     _switch(parser, "--quiet", f"print nothing but the {path}")
+    _switch(parser, "--verbose", "list every iteration, also on a terminal, where one line is renewed otherwise")
     _switch(parser, "--json", "print the result as JSON, errors as well, and nothing else on standard output")
 
 
@@ -487,7 +489,7 @@ def _carried_out(arguments: argparse.Namespace, as_json: bool) -> int:
     # matrices are small: threads of the linear algebra library cost more than they give, in workers as well
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        run = arguments.run
+        run, arguments.begin_time = arguments.run, time.monotonic()
         if isinstance(run, str):
             module, _, function = run.rpartition(".")
             gc.disable()  # imports leave nothing to collect, and looking for it takes a tenth of their time

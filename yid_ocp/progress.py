@@ -12,8 +12,13 @@ from typing import Any
 class Progress:
     """Receiver of progress reports, called by one thread at a time; this one ignores them."""
 
-    def begin_stage(self, text: str) -> None:
-        """Report that a new stage of the work begins."""
+    def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
+        """Report that a new stage of the work begins.
+
+        `work` is the time that it usually takes and `ahead` that of all stages after it, on one scale [s]; `work` is
+        zero where the time that it takes says nothing of those after it, as where it may compile, and is then a part
+        of `ahead`. What was ahead becomes less by `work` where `ahead` is absent.
+        """
 
     def report_iterate(self, entry: Any) -> None:
         """Report that a search accepted a point: a `solvers.base.Iterate`."""
@@ -34,7 +39,7 @@ class LoggingProgress(Progress):
 
     log: logging.Logger
 
-    def begin_stage(self, text: str) -> None:
+    def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Log the name of the stage."""
         self.log.info("%s", text)
 

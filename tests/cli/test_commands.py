@@ -59,7 +59,7 @@ def test_every_command_is_a_function_of_workflow_and_prints_json():
             assert callable(getattr(importlib.import_module(f"yid_ocp.workflow.{module}"), function))
             made = argparse.ArgumentParser()
             row.add_arguments(made)
-            assert {"--json", "--quiet"} <= set(made._option_string_actions), row.name
+            assert {"--json", "--quiet", "--verbose"} <= set(made._option_string_actions), row.name
     assert len({row.name for row in COMMANDS}) == len(COMMANDS)
 
 

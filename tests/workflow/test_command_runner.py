@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import io
+import math
+import re
 import sys
 
 import numpy as np
@@ -18,8 +20,8 @@ from yid_ocp.workflow import command_runner
 ENTRY = Iterate(3, 12.5, np.zeros(1), 0.1, 4, 1.25, "first 2 s")
 
 
-def asked(quiet: bool = False, program: bool = False) -> argparse.Namespace:
-    return argparse.Namespace(quiet=quiet, json=program)
+def asked(quiet: bool = False, program: bool = False, verbose: bool = False) -> argparse.Namespace:
+    return argparse.Namespace(quiet=quiet, json=program, verbose=verbose, begin_time=100.0)
 
 
 @pytest.fixture
@@ -71,6 +73,50 @@ def test_slow_parts_have_a_line_each_and_quick_ones_one_in_ten(capsys, clock):
     assert capsys.readouterr().err == ""
 
 
+STAGES = {
+    "solve": {"building": 4.0, "solving": 5.0, "half": 2.5, "held out": 1.2, "report": 1.5},
+    "diagnose": {"building": 2.5, "composing": 2.5, "nominal": 3.0, "events": 2.0, "none": 0.0, "screening": 3.0,
+                 "locating": 1.0, "refitting": 4.0, "scoring": 1.0, "held out": 1.0, "report": 1.5},
+}  # fmt: skip
+"""Stages of a command, with the time that each usually takes [s]."""
+
+
+@pytest.mark.parametrize("imports", [1.6, None])
+@pytest.mark.parametrize("compiling", [1.0, 4.0])
+@pytest.mark.parametrize("pace", [0.7, 1.0, 5.0, 20.0])
+@pytest.mark.parametrize("command", STAGES)
+def test_the_time_left_is_right_within_a_factor_of_two_by_the_first_third(clock, command, pace, compiling, imports):
+    """At any pace, whether imports show it or not, and until the end where the first stage has nothing to compile."""
+    works = STAGES[command]
+    before, told = imports or 1.6 * pace, []
+    lengths = [work * pace * (compiling if name == "building" else 1.0) for name, work in works.items()]
+    end = before + sum(lengths)
+    clock[0] = before
+    left = command_runner._RemainingTime(before)
+    for k, ((name, work), length) in enumerate(zip(works.items(), lengths, strict=True)):
+        may_compile = name in ("building", "composing")
+        left.begin_stage(0.0 if may_compile else work, sum([*works.values()][k + (not may_compile) :]))
+        for _ in range(20):
+            told.append((clock[0] / end, left.seconds_left() / (end - clock[0])))
+            clock[0] += length / 20
+            if name == "solving":
+                left.count_iterate()
+    assert math.isfinite(told[0][1])
+    late = [ratio for part, ratio in told if 1 / 3 <= part <= 0.95]
+    assert 0.5 <= late[0] <= 2.0
+    if compiling == 1.0 and (pace <= 5.0 or imports is None):
+        assert min(late) >= 0.5
+        assert max(late) <= 2.0
+
+
+def test_the_time_left_of_a_command_is_said_where_its_first_stage_plans(capsys, clock):
+    for plan, told in (((2.0, 8.0), " about 10 s left"), ((2.0, None), "")):
+        progress = command_runner.StderrLogLinesProgress()
+        progress.begin_stage("building", *plan)
+        progress.begin_stage("writing", 1.5, 6.0)
+        assert capsys.readouterr().err.splitlines()[0] == f"building ...{told}"
+
+
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
@@ -91,6 +137,36 @@ def test_a_bar_moves_with_its_stage_and_is_a_line_when_the_next_begins(monkeypat
     for words in ("solving: 0 s", "tracking: 1 of 4, frame 1", "tracking: 0 s"):
         assert words in said
     assert "before any stage" not in said
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_a_terminal_renews_one_line_of_iterations_and_a_table_of_results(monkeypatch, verbose):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    monkeypatch.setenv("COLUMNS", "200")
+    update = Bars.update
+    monkeypatch.setattr(Bars, "update", lambda self, task, **what: update(self, task, refresh=True, **what))
+    with command_runner.stderr_progress_display(asked(verbose=verbose)) as progress:
+        progress.begin_stage("solving", 2.0, 60.0)
+        for _ in range(2):
+            progress.report_iterate(ENTRY)
+        progress.report_table([("effects", "chi2/n"), *((f"a{k}@x", str(k)) for k in range(30))])
+        progress.report_iterate(ENTRY)
+    said = sys.stderr.getvalue()
+    assert "\x1b" in said
+    assert " left" in said
+    assert len(re.findall(r"\[2K  iteration 3, cost 12.5", said)) == (3 if verbose else 0)
+    assert "effects" in said
+    assert "a9@x" in said
+    assert "a10@x" not in said
+
+
+def test_lines_have_no_control_characters(capsys, clock):
+    with command_runner.stderr_progress_display(asked(verbose=True)) as progress:
+        progress.begin_stage("solving", 2.0, 60.0)
+        progress.report_iterate(ENTRY)
+        progress.report_parts_done(1, 2, "frame 1")
+        progress.report_table([("effects", "chi2/n"), ("a@x", "1")])
+    assert set(capsys.readouterr().err) <= {*map(chr, range(32, 127)), "\n"}
 
 
 def test_who_does_not_look_is_shown_nothing_or_lines():

@@ -156,7 +156,7 @@ class BaselineData:
         without, known = self.reference_recordings, self.combined_estimates
         if not last.effects or not without:
             return None
-        progress.begin_stage("predicting the world without the effects")
+        progress.begin_stage("predicting the world without the effects", 1.0, 1.5)
         shared = nominal.problem.shared_parameters
         now = {name: last.values[name] for name in shared}
         effects = {name: last.values[name] for effect in last.effects for name in effect.parameters.names}

@@ -157,11 +157,11 @@ def _examined(
     problem: EstimationProblem, search: RefitContext, solution: Solution | None, clock: dict[str, float]
 ) -> _Examined:
     limits, progress = search.thresholds, search.progress
-    progress.begin_stage("fitting the nominal model")
+    progress.begin_stage("fitting the nominal model", 3.0, 10.5)
     nominal = fit_nominal_model(problem, search.problem, solution, search.store, limits)
     search, nominal, cuts = _followed(search, nominal)
     clock["nominal"] = time.perf_counter()
-    progress.begin_stage("looking for events")
+    progress.begin_stage("looking for events", 2.0, 8.5)
     whole = _undivided(search.problem, problem)
     search, nominal, events, smoothed = _without_events(search, nominal, whole)
     clock["events"] = time.perf_counter()
@@ -185,7 +185,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
     moved = changed and not seen.has_gap
     gap, smoothed, trusted = seen.has_gap or moved, None, None
     if gap and enough:
-        search.progress.begin_stage("locating the gap")
+        search.progress.begin_stage("locating the gap", 1.0, 8.5)
         # where nothing happened it was run on all that was fitted already
         smoothed = None if search.problem.is_split_in_blocks else seen.smoothed
         smoothed = _smooth_about_model(nominal, limits) if smoothed is None else smoothed
@@ -309,7 +309,7 @@ def _without_events(
         if not events:
             break
         less = replace(first, problem=problem_corrected_for_events(first.problem, events))
-        search.progress.begin_stage(f"fitting the nominal model without {len(events.disturbances)} events")
+        search.progress.begin_stage(f"fitting the nominal model without {len(events.disturbances)} events", 3.0, 8.5)
         cleaned = replace(search, problem=less)
         again = _settled(cleaned, nominal.values, f"the nominal model without events, round {round_ + 1}")
         if again is None:
@@ -335,7 +335,7 @@ def _tested(
     effects = tuple(effect.with_prior_ranges_for_angles(angles) for effect in search.problem.candidate_effects)
     composed = replace(search.problem, problem=nominal.problem, candidate_effects=effects)
     before, held = _estimation_null_test(nominal, limits), _held_out_null_test(nominal, limits)
-    search.progress.begin_stage(f"screening {len(effects)} candidates")
+    search.progress.begin_stage(f"screening {len(effects)} candidates", 3.0, 5.5)
     screened = screen_candidates(composed, (), nominal.values, limits)
     gap = has_significant_gap(before, held, limits, screened.candidate_scores, _offsets_stated(nominal.problem))
     enough = before.degrees_of_freedom >= limits.min_samples_per_unknown * len(nominal.values)
@@ -373,7 +373,7 @@ def _offsets_stated(problem: EstimationProblem) -> bool:
 
 def _better_nominal_fit(search: RefitContext, nominal: RefittedModel) -> RefittedModel | None:
     """The nominal model refitted from a start that ends far likelier; None if no start does."""
-    search.progress.begin_stage("fitting the nominal model from other starts")
+    search.progress.begin_stage("fitting the nominal model from other starts", 6.0, 9.5)
     problem, limits = search.problem.problem, search.thresholds
 
     def begun(factor: float) -> RefittedModel | None:
@@ -414,7 +414,7 @@ def _composed(
         raise SolverError(what, where="problem.weighting", allowed="whitened", hint=hint)
     effects = make_candidate_effects(problem.system, [episode.recording for episode in problem.episodes], candidates)
     exclude_candidates(effects, leave_out)  # refused before anything is compiled
-    progress.begin_stage(f"composing {len(effects)} candidates into one step")
+    progress.begin_stage(f"composing {len(effects)} candidates into one step", ahead=16.0)
     composed = AllCandidatesProblem.from_problem(problem, effects, held_out)
     return replace(composed, candidate_effects=tuple(exclude_candidates(composed.candidate_effects, leave_out)))
 

@@ -342,7 +342,9 @@ def refit_with_each_effect(
         return []
     beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
     noun = "effects" if len(tried[0][0]) == 1 else "pairs"
-    search.progress.begin_stage(f"refitting with each of {len(tried)} {noun}{beside}")
+    # one effect is often enough; where it is not, pairs, more effects and others in their places follow
+    ahead = 11.0 if noun == "pairs" else {0: 8.0, 1: 14.0}.get(len(base), 9.0)
+    search.progress.begin_stage(f"refitting with each of {len(tried)} {noun}{beside}", 2 + 0.5 * len(tried), ahead)
     parts = ParallelProgress(search.progress, len(tried), join_effect_labels(tried[0][0]))
 
     def one(entry: tuple[Sequence[EffectBase], Mapping[str, float]]) -> RefittedModel | None:

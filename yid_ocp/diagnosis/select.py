@@ -261,7 +261,8 @@ def select_effects(
         if added:
             if search.skip_if_late(f"what is left beside {join_effect_labels(base)}"):
                 break
-            search.progress.begin_stage(f"scoring what is left beside {', '.join(e.label for e in base)}")
+            ahead = 3.5 if _little_is_left(current, limits) else 20.0
+            search.progress.begin_stage(f"scoring what is left beside {', '.join(e.label for e in base)}", 1.0, ahead)
             screened = screen_candidates(search.problem, base, current.values, limits)
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
             p_value = bonferroni_min_p_value(screened.candidate_scores)
@@ -384,7 +385,7 @@ def _revised(
     if not _needed(without, full, entry.effect, limits):
         search.progress.begin_stage(f"left {label} out again: the others do as well")
         return _rebuilt(search, nominal, [other for other in kept if other is not entry], without)
-    search.progress.begin_stage(f"looking for others in the place of {label}")
+    search.progress.begin_stage(f"looking for others in the place of {label}", 1.0, 12.0)
     screened = screen_candidates(search.problem, rest, without.values, limits)
     tried = _refit_shortlist(screened, limits)[: limits.n_refit_per_round]
     own = replace(full, effects=(*rest, entry.effect))

@@ -60,7 +60,7 @@ def check_parameter_transfer(search: RefitContext, fit: RefittedModel) -> tuple[
     """
     if search.problem.is_split_in_blocks or not fit.effects:
         return ()
-    search.progress.begin_stage("fitting the held-out recordings with the same effects")
+    search.progress.begin_stage("fitting the held-out recordings with the same effects", 1.0, 2.5)
     problem = search.problem.problem
     turned = replace(search.problem, problem=problem.with_episodes(problem.held_out, problem.episodes))
     if problem.has_process_noise:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import math
 import os
 import sys
 import time
@@ -95,18 +96,74 @@ def print_json(result: Mapping[str, Any]) -> None:
 
 
 _MIN_LINE_INTERVAL = 5.0  # least time between two lines of one tenth of a stage [s]
+_BAR_WIDTH = 12  # on a terminal [characters]
+_MAX_TABLE_ROWS = 10  # results that are shown beside the bar on a terminal
 _MIN_ESTIMATE_TIME = 2.0  # time that a stage has to last before the rest of it is guessed [s]
 
 
+_USUAL_IMPORT_TIME = 1.6  # of a command at the pace in which stages say what they take [s]
+_USUAL_ITERATIONS = 20  # of a search, from its start to its end
+_MIN_REST_RATIO = 1.25  # what is left at least over what a stage has lasted whose length says nothing
+_MAX_PACE_RATIO = 4.0  # how much a stage that is done may differ in pace from those before it
+
+
 class _RemainingTime:
-    def __init__(self) -> None:
+    """Time left: of a command whose stages say what they usually take, else of a stage whose parts are counted.
+
+    The pace, time spent over time usually spent, is that of the command's imports and of the stages so far, each
+    counting half as much as the one after it; one that is not done counts where it lasts longer than expected.
+    """
+
+    def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
+        self._spent = min(max(import_time, _USUAL_IMPORT_TIME / 4), _USUAL_IMPORT_TIME * 32)
+        self._usual, self._work, self._ahead = _USUAL_IMPORT_TIME, 0.0, math.nan
+        self._is_first_stage = True  # which says whether those after it are planned
+        self._begun, self._n_iterates = time.monotonic(), 0
         self._first: tuple[int, float] | None = None
 
-    def remaining_text(self, done: int, total: int) -> str:
+    def begin_stage(self, work: float, ahead: float | None) -> None:
+        now = time.monotonic()
+        if self._work > 0:
+            as_before = self._work * self._spent / self._usual
+            most, least = as_before * _MAX_PACE_RATIO, as_before / _MAX_PACE_RATIO
+            self._spent = self._spent / 2 + min(max(now - self._begun, least), most)
+            self._usual = self._usual / 2 + self._work
+        if ahead is not None and (self._is_first_stage or not math.isnan(self._ahead)):
+            self._ahead = ahead
+        else:
+            self._ahead = max(self._ahead - work, 0.0)
+        self._is_first_stage = False
+        if work > 0 or self._work > 0:
+            self._begun = now
+        self._work, self._n_iterates, self._first = work, 0, None
+
+    def count_iterate(self) -> None:
+        self._n_iterates += 1
+
+    def of_command(self) -> str:
+        """Text of the time left until the command's end; empty where its stages do not say what they take."""
+        seconds = self.seconds_left()
+        return "" if math.isnan(seconds) else f", about {_format_duration(seconds)} left"
+
+    def seconds_left(self) -> float:
+        spent, pace = time.monotonic() - self._begun, self._spent / self._usual
+        if self._work == 0:
+            return max(self._ahead * pace, _MIN_REST_RATIO * spent)
+        expected = self._work * pace
+        if self._n_iterates:
+            expected = spent * (_USUAL_ITERATIONS + 1) / (self._n_iterates + 1)
+        if self._n_iterates or spent > expected:
+            pace = (self._spent / 2 + max(spent, expected)) / (self._usual / 2 + self._work)
+            expected = expected if self._n_iterates else self._work * pace
+        # what has lasted longer than expected goes on for as long again as it is beyond that
+        return abs(expected - spent) + self._ahead * pace
+
+    def of_parts(self, done: int, total: int) -> str:
+        """Text of the time left of a stage of so many parts; empty where that of the command is known."""
         now = time.monotonic()
         # what stood there before this run began took no time
         known, begun = self._first = self._first or (done, now)
-        if done <= known or done >= total or now - begun < _MIN_ESTIMATE_TIME:
+        if not math.isnan(self._ahead) or done <= known or done >= total or now - begun < _MIN_ESTIMATE_TIME:
             return ""
         return f", about {_format_duration((now - begun) * (total - done) / (done - known))} left"
 
@@ -125,50 +182,61 @@ def _format_iterate(entry: Iterate) -> str:
 class StderrLogLinesProgress(Progress):
     """Progress as lines on standard error: for every stage, iterate, tenth of a stage, and some seconds of silence."""
 
-    def __init__(self) -> None:
-        self._tenths, self._last, self._left = 0, 0.0, _RemainingTime()
+    def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
+        self._tenths, self._last, self._left = 0, 0.0, _RemainingTime(import_time)
 
-    def begin_stage(self, text: str) -> None:
-        """Print a line with the name of the stage."""
+    def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
+        """Print a line with the name of the stage and the time left."""
         interruption.raise_if_requested()
-        self._tenths, self._last, self._left = 0, time.monotonic(), _RemainingTime()
-        print(f"{text} ...", file=sys.stderr, flush=True)
+        self._tenths, self._last = 0, time.monotonic()
+        self._left.begin_stage(work, ahead)
+        print(f"{text} ...{self._left.of_command().removeprefix(',')}", file=sys.stderr, flush=True)
 
     def report_iterate(self, entry: Iterate) -> None:
         """Print a line for the accepted point."""
+        self._left.count_iterate()
         print(f"  {_format_iterate(entry)}", file=sys.stderr, flush=True)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Print a line for every tenth of the stage, or where the last one is some seconds old."""
-        tenths, left = 10 * done // max(total, 1), self._left.remaining_text(done, total)
+        tenths, left = 10 * done // max(total, 1), self._left.of_parts(done, total)
         # a line for every frame would be too many
         if tenths > self._tenths or time.monotonic() > self._last + _MIN_LINE_INTERVAL:
             self._tenths, self._last = tenths, time.monotonic()
-            print(f"  {done} of {total}, {text}{left}", file=sys.stderr, flush=True)
+            print(f"  {done} of {total}, {text}{left or self._left.of_command()}", file=sys.stderr, flush=True)
 
 
 class _BarProgress(Progress):
-    """Progress as one bar for the running stage, below a line for each finished stage."""
+    """Progress as one bar for the running stage and a table of results, below a line for each finished stage."""
 
-    def __init__(self, bars: rich.progress.Progress) -> None:
-        self._bars = bars
+    def __init__(
+        self, bars: rich.progress.Progress, left: _RemainingTime, table: list[Sequence[str]], is_verbose: bool
+    ) -> None:
+        self._bars, self._left, self._table, self._is_verbose = bars, left, table, is_verbose
         self._task: rich.progress.TaskID | None = None
-        self._text, self._left, self._begun = "", _RemainingTime(), 0.0
+        self._text, self._begun = "", 0.0
 
-    def begin_stage(self, text: str) -> None:
+    def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         interruption.raise_if_requested()
         self.finish_stage()
-        self._text, self._left, self._begun = text, _RemainingTime(), time.monotonic()
+        self._text, self._begun = text, time.monotonic()
+        self._left.begin_stage(work, ahead)
         self._task = self._bars.add_task(text, total=None)
 
     def report_iterate(self, entry: Iterate) -> None:
+        self._left.count_iterate()
         if self._task is not None:
             self._bars.update(self._task, description=f"{self._text}: {_format_iterate(entry)}")
+            if self._is_verbose:
+                self._bars.console.print(f"  {_format_iterate(entry)}", markup=False, highlight=False)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         if self._task is not None:
-            words = f"{self._text}: {done} of {total}, {text}{self._left.remaining_text(done, total)}"
+            words = f"{self._text}: {done} of {total}, {text}{self._left.of_parts(done, total)}"
             self._bars.update(self._task, description=words, completed=done, total=total)
+
+    def report_table(self, rows: Sequence[Sequence[str]]) -> None:
+        self._table[:] = rows[: _MAX_TABLE_ROWS + 1]
 
     def finish_stage(self) -> None:
         if self._task is not None:
@@ -181,18 +249,45 @@ class _BarProgress(Progress):
 @contextlib.contextmanager
 def stderr_progress_display(arguments: argparse.Namespace) -> Iterator[Progress]:
     """Context manager for progress on standard error: bars on a terminal, else lines; nothing if `--quiet`."""
-    terminal = sys.stderr.isatty()
+    terminal, import_time = sys.stderr.isatty(), time.monotonic() - arguments.begin_time
     if arguments.quiet or (arguments.json and not terminal):
         yield NULL_PROGRESS
     elif not terminal:
-        yield StderrLogLinesProgress()
+        yield StderrLogLinesProgress(import_time)
     else:
-        from rich.console import Console
-        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-        from rich.progress import Progress as Bars
-
-        columns = (BarColumn(bar_width=24), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
-        with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
-            progress = _BarProgress(bars)
+        with _terminal_bars(import_time, arguments.verbose) as progress:
             yield progress
-            progress.finish_stage()
+
+
+@contextlib.contextmanager
+def _terminal_bars(import_time: float, is_verbose: bool) -> Iterator[Progress]:
+    """Context manager for bars, of which nothing but the lines of finished stages stays on the terminal."""
+    from rich.console import Console, RenderableType
+    from rich.progress import BarColumn, ProgressColumn
+    from rich.progress import Progress as Bars
+    from rich.table import Table
+    from rich.text import Text
+
+    console, left, rows = Console(stderr=True), _RemainingTime(import_time), list[Sequence[str]]()
+
+    class TimesAndStage(ProgressColumn):
+        def render(self, task: rich.progress.Task) -> Text:
+            text = Text(f"{_format_duration(task.elapsed or 0.0)}{left.of_command()}: {task.description}", no_wrap=True)
+            text.truncate(max(console.width - _BAR_WIDTH - 2, 1), overflow="ellipsis")
+            return text
+
+    class BarsBelowTable(Bars):
+        def get_renderables(self) -> Iterator[RenderableType]:
+            head, *results = tuple(rows) or ((),)
+            if results:
+                table = Table(*head, box=None)
+                for row in results:
+                    table.add_row(*row)
+                yield table
+            yield from super().get_renderables()
+
+    columns = (BarColumn(_BAR_WIDTH), TimesAndStage())
+    with BarsBelowTable(*columns, console=console, transient=True) as bars:
+        progress = _BarProgress(bars, left, rows, is_verbose)
+        yield progress
+        progress.finish_stage()

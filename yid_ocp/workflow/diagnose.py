@@ -63,7 +63,7 @@ def run_diagnose(
         folder.record_run_start(run, "diagnose", _flags(run))
         refits = JsonRefitStore(folder, folder.input_hashes, dump_config(run), software_and_plugin_versions())
         logged = _LoggedProgress(progress, folder)
-        progress.begin_stage("building the model and its compiled step")
+        progress.begin_stage("building the model and its compiled step", ahead=18.5)
         runs = run_history.baseline_estimates(run)
         without, said = run_history.load_recordings_without_effect(run)
         if said:
@@ -77,7 +77,7 @@ def run_diagnose(
         try:
             if run.diagnosis.noise_fraction_of_std < 1 and problem.held_out:
                 # in units of noise the solver would take any fit for a bad one and start again elsewhere
-                logged.begin_stage("solving the nominal model")
+                logged.begin_stage("solving the nominal model", 5.0, 16.0)
                 nominal = solve(problem, run.solver, callback=logged.report_iterate)
             finding = diagnose(
                 _with_noise_only_stds(problem, run),
@@ -119,9 +119,9 @@ class _LoggedProgress(Progress):
     shown: Progress
     folder: RunFolder
 
-    def begin_stage(self, text: str) -> None:
+    def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         self.folder.log_event("stage", text=text)
-        self.shown.begin_stage(text)
+        self.shown.begin_stage(text, work, ahead)
 
     def report_iterate(self, entry: Iterate) -> None:
         self.shown.report_iterate(entry)

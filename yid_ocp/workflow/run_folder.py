@@ -78,7 +78,7 @@ class RunFolder:
         """`write_result`, and report.html unless the settings want none; `known`: more attributes of `ReportData`."""
         written = self.write_result(result, name)
         if run.output.write_report:
-            shown.begin_stage("writing the report")
+            shown.begin_stage("writing the report", 1.5)
             write_report(self.path / "report.html", ReportData(run.name, run.description, written, **known))
         return written
 

@@ -49,7 +49,7 @@ def run_solve(
     """
     with atomic_run_folder(run, out) as folder:
         folder.record_run_start(run, "solve")
-        progress.begin_stage("building the model and its compiled step")
+        progress.begin_stage("building the model and its compiled step", ahead=20.0)
         safe = solve_and_decide_cable_memory(run, build_problem(run), folder, progress)
         solution, stability = solution_marked_if_step_unstable(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
@@ -64,7 +64,7 @@ def run_solve(
         sizes = {} if solution.problem is None else typical_parameter_magnitudes(solution.problem, solution.x)
         inflated = discretisation.inflate_estimates_by_discretisation(solution.parameters, shifts, sizes)
         solution = replace(solution, parameters=inflated)
-        progress.begin_stage("predicting the held-out recordings")
+        progress.begin_stage("predicting the held-out recordings", 1.2, 1.5)
         held_out = problem.predict_held_out(solution.x)
         cable = clamped_cable_topology(run)
         solution, doubts = solution_and_fit_issues(problem, solution, held_out, cable)
@@ -94,7 +94,10 @@ def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> CableMemoryDecision:
     """Solution by the run's solver, every iterate logged, and the decision whether a cable keeps its memory."""
-    progress.begin_stage(f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}")
+    coordinates, steps = problem.system.n_coordinates, sum(episode.grid.steps for episode in problem.episodes)
+    small = min(max(steps / 500 * (coordinates / 50) ** 1.7, 0.1), 1.0)
+    text = f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}"
+    progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
 
     def iterate(entry: Iterate) -> None:
         values = {name: float(value) for name, value in zip(problem.shared_parameters, entry.x, strict=False)}
@@ -210,7 +213,7 @@ def measure_discretisation_shifts(
         words = "twice the links" if key == "links" else "half the time step"
         if key == "links" and (run.model.object is None or run.model.object.links_per_segment_or_total is None):
             continue
-        progress.begin_stage(f"trying {words}")
+        progress.begin_stage(f"trying {words}", 2.5, 2.7)
         try:
             refined = _refined_problem(run, problem, key)
             shifts = discretisation.parameter_shifts_in_finer_model
