@@ -4,9 +4,9 @@
 
 First the named breaks of `breaks.yaml`, each against the tests named beside it; then so many mutants, drawn by the seed
 over diagnosis/, analysis/, problem/, inference/ and what all solvers share (see `PACKAGES` and `places.py`), each
-against those tests of its package's folder that run the changed statement, tests of rules first, then file by file,
-the quickest first, up to the first failure or three times the time that they take without a change. Tests marked
-`slow` stay out.
+against those tests of its package's folders (`TEST_FOLDERS`) that run the changed statement, those of its own folder
+first, tests of rules before others, then file by file, the quickest first, up to the first failure or three times the
+time that they take without a change. Tests marked `slow` stay out.
 
 What was found goes to a JSON file as it is found; an interrupted run goes on from there as long as sources and tests
 are the same. `--again` is for the time in which tests are being written: what was killed counts as killed, whatever was
@@ -38,7 +38,9 @@ ROOT = Path(__file__).resolve().parents[2]
 PACKAGES: dict[str, tuple[str, ...]] = {name: (name,) for name in ("diagnosis", "analysis", "problem", "inference")} | {
     "solvers": ("solvers.base",),
 }
-"""Package, whose tests stand in the folder of the same name, and what of it is broken."""
+"""Package and what of it is broken."""
+TEST_FOLDERS = {"inference": ("inference", "problem", "solvers", "diagnosis")}
+"""Folders of `tests` that guard a package, where not the one of its name alone: what is said of fits needs fits."""
 WANTED = 0.85
 
 
@@ -187,9 +189,9 @@ def job_of(mutant: Mutant, package: str, covered: dict[str, Any], rules: bool) -
         file = name.partition("::")[0]
         seconds[file] = seconds.get(file, 0.0) + covered["tests"][name]["seconds"]
 
-    def order(name: str) -> tuple[bool, float, str]:
+    def order(name: str) -> tuple[bool, bool, float, str]:
         file = name.partition("::")[0]
-        return not _of_rules(name), seconds[file], file
+        return not file.startswith(f"tests/{package}/"), not _of_rules(name), seconds[file], file
 
     name = f"{mutant.file}:{mutant.line}: {mutant.was}  ->  {mutant.becomes}"
     limit = 3 * sum(seconds.values()) + 20
@@ -285,8 +287,9 @@ def covering(worker: Worker, package: str, store: Path, digest: str) -> dict[str
         known = json.loads(file.read_text(encoding="utf-8"))
         if known["digest"] == digest:
             return dict(known)
-    print(f"running tests/{package} as they are", flush=True)
-    found = worker.ask(package, {"cover": f"tests/{package}", "of": PACKAGES[package]}) | {"digest": digest}
+    folders = [f"tests/{folder}" for folder in TEST_FOLDERS.get(package, (package,))]
+    print(f"running {', '.join(folders)} as they are", flush=True)
+    found = worker.ask(package, {"cover": folders, "of": PACKAGES[package]}) | {"digest": digest}
     file.write_text(json.dumps(found), encoding="utf-8")
     return found
 

@@ -6,7 +6,7 @@ TREE is a copy of the repository that belongs to this process alone. Everything 
 (libraries, packages to its left) is imported once, so that a child only imports the package itself and runs its tests.
 Jobs come as lines of JSON, answers go out as such:
 
-- `{"cover": FOLDER, "of": [...]}`: the tests of a folder as they are, with the lines of these modules that each runs;
+- `{"cover": FOLDERS, "of": [...]}`: the tests of folders as they are, with the lines of these modules that each runs;
 - `{"file": ..., "text": ..., "tests": [...], "seconds": ...}`: tests against a file with that text, up to the first
   failure, and no longer than so.
 """
@@ -139,8 +139,8 @@ def forked(work: Callable[[], int], seconds: float) -> int | None:
     return status
 
 
-def cover(tree: Path, folder: str, modules: list[str]) -> dict[str, Any]:
-    """Tests of a folder: `tests` {name: seconds and fixtures} and `lines` {file: {line: who runs it}}."""
+def cover(tree: Path, folders: list[str], modules: list[str]) -> dict[str, Any]:
+    """Tests of folders: `tests` {name: seconds and fixtures} and `lines` {file: {line: who runs it}}."""
     import coverage
 
     target = tree / "covered.json"
@@ -151,7 +151,7 @@ def cover(tree: Path, folder: str, modules: list[str]) -> dict[str, Any]:
         measured = coverage.Coverage(data_file=None, include=include, concurrency="thread")
         plugin = Covering(measured)
         measured.start()
-        status = pytest.main([*ARGUMENTS, folder], plugins=[plugin])
+        status = pytest.main([*ARGUMENTS, *folders], plugins=[plugin])
         measured.stop()
         data = measured.get_data()
         lines = {
@@ -165,7 +165,7 @@ def cover(tree: Path, folder: str, modules: list[str]) -> dict[str, Any]:
 
     status = forked(work, 1800.0)
     if status != 0:
-        return {"error": f"the tests of {folder} fail as they are (status {status})"}
+        return {"error": f"the tests of {', '.join(folders)} fail as they are (status {status})"}
     return dict(json.loads(target.read_text(encoding="utf-8")))
 
 
