@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from yid_ocp.config.reader import load_config
+from yid_ocp.data import read_recording
 from yid_ocp.workflow.run_inputs import resolve_recording_path
 
 PAPER = ("single_arm_no_vision", "single_arm_vision", "dual_arm_no_vision", "dual_arm_vision")
@@ -30,6 +31,7 @@ QUICK = {
     "double_pendulum": ("problem.duration=3.0",),
     "servo_arm": ("problem.duration=0.2", "model.object.segments.rod.links=1", *FEW, *UNREFINED),
     "servo_pendulum": ("problem.duration=0.5", *FEW, *UNREFINED),
+    "so101_servo": UNREFINED,
     "panda_beam": ("problem.duration=0.8", "model.object.segments.beam.links=1", "solver.max_iterations=2", *UNREFINED),
     **dict.fromkeys(("springs_series_ends", "springs_series_joint", "springs_torsion"), ()),
     "soft_beam": (
@@ -75,6 +77,14 @@ def test_configuration_runs(carried_out, repository, name):
     if name == "deft_bdlo1":
         assert set(result["held_out"][0]["baselines"]) == {"stays", "moves_with_clamps", "linear_carry"}
         assert result["held_out"][0]["rmse"]["points"] < 0.05
+    if name == "so101_servo":  # made in MuJoCo, whose friction holds at rest
+        truth = read_recording(repository / "configs" / "recordings" / "so101_1.h5").true_parameters
+        wanted = [key for key in truth if key.startswith(("payload@", "joint_coulomb@", "joint_load_friction@"))]
+        free = {key: result["parameters"][key] for key in wanted if result["parameters"].get(key, {}).get("free")}
+        assert len(free) == 14
+        assert result["fit"]["explains"]
+        for key, entry in free.items():
+            assert abs(entry["value"] - truth[key]) < 2 * entry["std"], key
     if name in ("baxter_arm", "panda_beam"):
         assert len([channel for channel in result["residuals"] if channel.startswith("joints.effort.")]) == 7
 

@@ -199,7 +199,8 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
     Before them go those of the sections `model.friction` and `model.arms.servo.motor`. `ConfigError` for a name or
     pattern that matches nothing.
     """
-    result = _section_parameter_settings(run, parameters)
+    sections = _section_parameter_settings(run, parameters)
+    result = dict(sections)
     for key, given in run.parameters.items():
         matches = [name for name in parameters.names if _matches(name, key)]
         if not matches:
@@ -207,7 +208,9 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
             raise run.config_error(f"there is no parameter '{key}'", "parameters", key, hint=hint)
         said = {name: value for name, value in vars(given).items() if value is not None}
         result |= {name: replace(result.get(name, ParameterSettings()), **said) for name in matches}
-    return result
+    # a published figure is the value of what is fixed
+    fixed = (name for name in sections if not result[name].free)
+    return result | {name: replace(result[name], prior_std=None) for name in fixed}
 
 
 def friction_joints(run: RunSettings, system: System) -> tuple[str, ...]:
