@@ -125,7 +125,7 @@ class RefitContext:
     store: RefitStore | None = None
     deadline: float = math.inf  # of `time.perf_counter`, from which on nothing more is tried [s]
     skipped: list[str] = field(default_factory=list)  # what was not tried, of all copies of this context
-    left_by: dict[str, float] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
+    left_by: dict[str, str] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
 
     def skip_if_late(self, *what: str) -> bool:
         """Whether the time for refits is spent; what it leaves untried is noted."""
@@ -355,10 +355,14 @@ def refit_with_each_effect(
         text = f"no fit with {label}"
         if fit is not None:
             how = "resumed the refit" if fit.is_from_store else "refitted"
-            search.left_by[join_effect_labels(effects)] = left = fit.held_out_loss.chi2_per_sample
-            text = f"{how} with {label}: held-out chi2/n {left:.4g}"
-        parts.count_done(text, lambda: _ranking(search.left_by))
+            search.left_by[join_effect_labels(effects)] = left = f"{fit.held_out_loss.chi2_per_sample:.4g}"
+            text = f"{how} with {label}: held-out chi2/n {left}"
+        parts.count_done(text, ranking)
         return fit
+
+    def ranking() -> list[tuple[str, str]]:
+        ranked = sorted(search.left_by.items(), key=lambda entry: float(entry[1]))
+        return [("effects", "held-out chi2/n"), *ranked]
 
     fits: list[RefittedModel | None] = []
     rest, begun = list(tried), time.perf_counter()
@@ -366,16 +370,10 @@ def refit_with_each_effect(
         # a batch costs less than its refits one by one; within a limit, so many as will end before it, best first
         count, now = len(rest), time.perf_counter()
         if search.deadline < math.inf:
-            count = int((search.deadline - now) * len(fits) / (now - begun)) if fits else 1
+            count = int((search.deadline - now) * len(fits) / max(now - begun, 1e-9)) if fits else 1
         batch, rest = rest[: max(count, 1)], rest[max(count, 1) :]
         fits += map_with_batched_calls(one, batch)
     return [fit for fit in fits if fit is not None]
-
-
-def _ranking(left_by: Mapping[str, float]) -> list[tuple[str, str]]:
-    """Table of what refits leave of the held-out recordings, best first."""
-    ranked = sorted(left_by.items(), key=lambda entry: entry[1])
-    return [("effects", "held-out chi2/n"), *((name, f"{left:.4g}") for name, left in ranked)]
 
 
 def _block_duration(episodes: Sequence[Episode]) -> float:

@@ -20,7 +20,7 @@ from yid_ocp.files import to_json_types
 from yid_ocp.parallel import WorkerConfig
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report import diagnosis_summaries, summaries  # noqa: F401, they register
-from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, summary_terminal_lines
+from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, aligned_table_lines, summary_terminal_lines
 
 if TYPE_CHECKING:
     import rich.progress
@@ -99,8 +99,6 @@ _MIN_LINE_INTERVAL = 5.0  # least time between two lines of one tenth of a stage
 _BAR_WIDTH = 12  # on a terminal [characters]
 _MAX_TABLE_ROWS = 10  # results that are shown beside the bar on a terminal
 _MIN_ESTIMATE_TIME = 2.0  # time that a stage has to last before the rest of it is guessed [s]
-
-
 _USUAL_IMPORT_TIME = 1.6  # of a command at the pace in which stages say what they take [s]
 _USUAL_ITERATIONS = 20  # of a search, from its start to its end
 _MIN_REST_RATIO = 1.25  # what is left at least over what a stage has lasted whose length says nothing
@@ -209,10 +207,8 @@ class StderrLogLinesProgress(Progress):
 class _BarProgress(Progress):
     """Progress as one bar for the running stage and a table of results, below a line for each finished stage."""
 
-    def __init__(
-        self, bars: rich.progress.Progress, left: _RemainingTime, table: list[Sequence[str]], is_verbose: bool
-    ) -> None:
-        self._bars, self._left, self._table, self._is_verbose = bars, left, table, is_verbose
+    def __init__(self, bars: rich.progress.Progress, left: _RemainingTime, table: list[str], verbose: bool) -> None:
+        self._bars, self._left, self._table, self._is_verbose = bars, left, table, verbose
         self._task: rich.progress.TaskID | None = None
         self._text, self._begun = "", 0.0
 
@@ -236,7 +232,7 @@ class _BarProgress(Progress):
             self._bars.update(self._task, description=words, completed=done, total=total)
 
     def report_table(self, rows: Sequence[Sequence[str]]) -> None:
-        self._table[:] = rows[: _MAX_TABLE_ROWS + 1]
+        self._table[:] = aligned_table_lines([*rows[: _MAX_TABLE_ROWS + 1]])
 
     def finish_stage(self) -> None:
         if self._task is not None:
@@ -265,10 +261,9 @@ def _terminal_bars(import_time: float, is_verbose: bool) -> Iterator[Progress]:
     from rich.console import Console, RenderableType
     from rich.progress import BarColumn, ProgressColumn
     from rich.progress import Progress as Bars
-    from rich.table import Table
     from rich.text import Text
 
-    console, left, rows = Console(stderr=True), _RemainingTime(import_time), list[Sequence[str]]()
+    console, left, table = Console(stderr=True), _RemainingTime(import_time), list[str]()
 
     class TimesAndStage(ProgressColumn):
         def render(self, task: rich.progress.Task) -> Text:
@@ -278,16 +273,10 @@ def _terminal_bars(import_time: float, is_verbose: bool) -> Iterator[Progress]:
 
     class BarsBelowTable(Bars):
         def get_renderables(self) -> Iterator[RenderableType]:
-            head, *results = tuple(rows) or ((),)
-            if results:
-                table = Table(*head, box=None)
-                for row in results:
-                    table.add_row(*row)
-                yield table
-            yield from super().get_renderables()
+            yield from (*map(Text, table), *super().get_renderables())
 
     columns = (BarColumn(_BAR_WIDTH), TimesAndStage())
     with BarsBelowTable(*columns, console=console, transient=True) as bars:
-        progress = _BarProgress(bars, left, rows, is_verbose)
+        progress = _BarProgress(bars, left, table, is_verbose)
         yield progress
         progress.finish_stage()

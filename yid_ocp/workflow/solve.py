@@ -94,8 +94,8 @@ def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
 ) -> CableMemoryDecision:
     """Solution by the run's solver, every iterate logged, and the decision whether a cable keeps its memory."""
-    coordinates, steps = problem.system.n_coordinates, sum(episode.grid.steps for episode in problem.episodes)
-    small = min(max(steps / 500 * (coordinates / 50) ** 1.7, 0.1), 1.0)
+    steps = sum(episode.grid.steps for episode in problem.episodes)
+    small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
     text = f"solving for {len(problem.initial_unknowns)} unknowns by {run.solver.name}"
     progress.begin_stage(text, 5 * small, 9.5 * small + 1.5)
 
