@@ -128,7 +128,7 @@ def unknown():
     ]:  # fmt: skip
         limits = Thresholds(min_explained_fraction=0.5)
         yield name, finding("unknown", unknown_reason=reason, thresholds=limits, **changed)
-    hurried = {"thresholds": Thresholds(budget=12.5), "untried": tuple(f"{kind}@x" for kind in "abcdefghij")}
+    hurried = {"search_seconds": 12.54, "untried": tuple(f"{kind}@x" for kind in "abcdefghij")}
     yield "stopped before any refit", finding("unknown", **hurried, **NO_EFFECT)
     yield "stopped with an effect", with_effect(FRICTION, 0.5, **hurried | {"untried": ("what is left beside a@x",)})
     best = {"single_effect_models": (fit([OFFSET]), fit([FRICTION])), "selected_effects": ()}

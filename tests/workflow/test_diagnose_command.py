@@ -95,9 +95,10 @@ def test_a_spent_budget_leaves_a_whole_run_folder_that_says_so(rubbing, whole, t
     hurried = run_diagnose(load_config(rubbing, settings), tmp_path / "run")
     assert whole[0].result["stopped"] is None
     result = json.loads((hurried.folder / "result.json").read_text())
-    assert (result["verdict"], result["effects"], result["stopped"]["after"]) == ("unknown", [], 1e-9)
+    assert (result["verdict"], result["effects"]) == ("unknown", [])
     assert result.keys() == json.loads((whole[0].folder / "result.json").read_text()).keys()
-    said = f"The search stopped after 1e-09 s; it would go on with {result['stopped']['next'][0]}"
+    stopped = result["stopped"]
+    said = f"The search stopped after {stopped['after']:.3g} s; it would go on with {stopped['next'][0]}"
     assert said in result["summary"]
     assert said in (hurried.folder / "report.html").read_text("utf-8")
     assert load_config(hurried.folder / "config.yaml").diagnosis.budget == 1e-9

@@ -249,6 +249,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
         baseline_comparison=earlier.compare_with_baseline(final, limits),
         counterfactual=earlier.predict_with_effects_removed_and_added(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
+        search_seconds=clock["refits"] - clock[""],
     )
     return replace(finding, summary=diagnosis_summary_text(finding))
 

@@ -91,6 +91,7 @@ class DiagnosisResult(ReprMixin):
     transfer_checks: tuple[ParameterTransferCheck, ...] = ()
     events: EventSet = NO_EVENTS  # taken out of the recordings before the rest was judged, as far as that can be done
     untried: tuple[str, ...] = ()  # what `Thresholds.budget` left no time for, best first; empty where all was done
+    search_seconds: float = 0.0  # from the start to the end of the search for effects
 
     def _summary(self) -> ReprSummary:
         effects, closed = ", ".join(effect.label for effect in self.accepted_effects), self.gap_closure.fraction
@@ -168,7 +169,7 @@ class DiagnosisResult(ReprMixin):
             "noise": {
                 f.channel: attributes_to_json(f, "std=noise_std unit samples=n_samples") for f in self.noise_floor
             },
-            "stopped": {"after": self.thresholds.budget, "next": list(self.untried)} if self.untried else None,
+            "stopped": {"after": self.search_seconds, "next": list(self.untried)} if self.untried else None,
             "baseline": None if since is None else _baseline_to_json(since),
             "counterfactual": None if self.counterfactual is None else self.counterfactual.to_dict(),
             "seconds": dict(self.stage_seconds),
@@ -397,7 +398,7 @@ def diagnosis_summary_text(finding: DiagnosisResult) -> str:
         text.append(_nameless(finding))
     if finding.untried:
         rest = ", ".join(finding.untried[:8]) + (", ..." if len(finding.untried) > 8 else "")
-        text.append(f"The search stopped after {finding.thresholds.budget:g} s; it would go on with {rest}.")
+        text.append(f"The search stopped after {finding.search_seconds:.3g} s; it would go on with {rest}.")
     text += [held_out_truncation_message(cut) for cut in finding.truncated_recordings]
     if finding.baseline_comparison is not None:
         text += _since(finding.baseline_comparison, bool(finding.accepted_effects))
