@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import numpy as np
@@ -17,6 +19,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data import JointGroup, PointGroup, Recording, read_recording, write_recording
+from yid_ocp.model.servos_and_springs import MotorOptions
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 
 RATE = 125.0
@@ -162,6 +165,47 @@ def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: py
         assert proposed(replace(made, joints=other)).model.arms.mode == "prescribed"
 
 
+def lerobot_dataset(folder: Path, joints: JointGroup) -> Path:
+    """A dataset of one episode, angles in degrees as 32-bit numbers."""
+    pyarrow: Any = pytest.importorskip("pyarrow", reason="LeRobot needs pyarrow: pip install 'yid-ocp[lerobot]'")
+    from pyarrow import parquet
+
+    shape = {"dtype": "float32", "shape": [6], "names": [f"{name}.pos" for name in joints.names]}
+    info = {"codebase_version": "v3.0", "fps": 50, "features": {"action": shape, "observation.state": shape}}
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info | {"total_episodes": 1}))
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    assert joints.position_command is not None
+    both = {"observation.state": joints.position, "action": joints.position_command}
+    columns: dict[str, Any] = {name: np.degrees(x).astype(np.float32).tolist() for name, x in both.items()}
+    columns |= {"frame_index": list(range(len(joints.t))), "episode_index": [0] * len(joints.t)}
+    parquet.write_table(pyarrow.table(columns), folder / "data" / "chunk-000" / "file-000.parquet")
+    return folder
+
+
+def test_a_lerobot_dataset_of_a_known_arm_says_what_the_arm_holds(bench: Path, repository: Path) -> None:
+    made = read_recording(repository / "configs" / "recordings" / "so101_1.h5")
+    assert made.joints is not None
+    lerobot_dataset(bench / "arm", made.joints)
+    assert main(["init", "package:so101", "arm", "--units", "deg", "--out", "run.yaml"]) == 0
+    run = load_config("run.yaml")
+    assert run.model.arms.servo.motor == MotorOptions("dc", "sts3215")
+    assert run.model.friction is not None
+    assert (run.model.friction.law, run.model.friction.joints) == ("load", made.joint_names[:5])  # the gripper is shut
+    assert run.parameters["*.servo_gain_factor"].initial == 16
+    assert main(["solve", "run.yaml", "--out", "solved", "--set", "output.write_report=false"]) == 0
+    result = json.loads(Path("solved/result.json").read_text())
+    assert result["fit"]["explains"]
+    for name in ("mass", "mx", "my", "mz"):
+        key = f"payload@gripper_frame_link.{name}"
+        entry = result["parameters"][key]
+        assert abs(entry["value"] - made.true_parameters[key]) < 2 * entry["std"]
+    # a recording that states the firmware's gain needs none in the file
+    write_recording(made, bench / "stated.h5")
+    assert main(["init", "package:so101", "stated.h5", "--out", "other.yaml"]) == 0
+    assert "*.servo_gain_factor" not in load_config("other.yaml").parameters
+
+
 def test_a_servo_arm_without_commands_is_told_what_is_missing(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert init(*CABLE) == 0
     assert main(["check", "run.yaml", "--out", "checked", "--set", "model.arms.mode=servo"]) == 2
@@ -201,6 +245,8 @@ def test_a_file_of_another_tool_is_imported_along(bench: Path) -> None:
 ONE = ("--length", "1", "--mass", "1")
 TREE = ("--object", "tree", "--branch", "a=1,1,1")
 REFUSED: dict[str, tuple[Sequence[str], str, str]] = {
+    "nothing and no commands": ((), "only an arm of position servos", "add --object"),
+    "a length of nothing": (ONE[:2], "--length describes an object, and none is named", "add --object"),
     "cable without a length": (("--object", "cable"), "a cable needs a length", "--length"),
     "cable without a mass": (("--object", "cable", *ONE[:2]), "a cable needs a mass", "--mass"),
     "cable without a radius": (("--object", "cable", *ONE), "a cable needs a radius", "--radius"),

@@ -18,8 +18,9 @@ from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.files import named_attributes
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
-from yid_ocp.model.urdf import read_urdf
-from yid_ocp.sensors.joints import quantization_step
+from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
+from yid_ocp.sensors import SensorOptions
+from yid_ocp.sensors.joints import is_noise_std_stated, quantization_step
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
 """What the frame at the end of an arm is called, the likeliest first."""
@@ -34,11 +35,13 @@ _COPIED_COMMAND_RATIO = 1e-6  # commands nearer to the measured angles than this
 _MIN_ARM_TRAVEL = 0.1  # joints that turn less than this together do not move [rad]
 _POSITION_STEP_PERCENT = 5  # places along a segment are told apart in so many percent
 _SEEN_NOISE, _STATED_NOISE = "from sample to sample in the recording", "the recording states it"
+_LEROBOT_ARMS = {"so100": ("sts3215", 16.0), "so101": ("sts3215", 16.0)}
+"""Motor and the proportional gain that LeRobot gives its firmware, by how the name of a URDF begins."""
 _KEYS = (
     "joints left_out=unused_joints not_recorded=unrecorded_joints holder=holder_frame grasps mode=arm_mode time_step"
 )
 _MORE_KEYS = "mode_why=arm_mode_reason start=initial_state start_why=initial_state_reason cutoff=path_cutoff"
-_LAST_KEYS = "clocks=clock_descriptions still=still_joints"
+_LAST_KEYS = "clocks=clock_descriptions still=still_joints motor=motor_preset firmware_gain"
 """Keys of `yid-init/1`, with the attribute where it has another name."""
 
 
@@ -88,6 +91,8 @@ class ConfigProposal:
     path_cutoff: float  # [Hz]
     clock_descriptions: Mapping[str, str]
     still_joints: tuple[str, ...]  # hardly turn in any recording
+    motor_preset: str | None  # of its servos, where the robot is known
+    firmware_gain: float | None  # its usual proportional gain, where the motor is known and no recording states one
 
     def to_dict(self) -> dict[str, Any]:
         """The proposal as plain data, under the keys of `yid-init/1`."""
@@ -120,7 +125,7 @@ def propose_config(
     Parameters
     ----------
     branches : sequence of Segment
-        Segments of the object, parents first.
+        Segments of the object, parents first; none for an arm of position servos without an object.
     holder : str, optional
         Frame that carries the object's root; the tool of the arm that moves most when absent.
     grasps : mapping of frame to point, optional
@@ -143,6 +148,8 @@ def propose_config(
         raise ConfigError(what, where=robot, allowed=", ".join(whole.joint_names), hint=hint)
     tree = read_urdf(robot, joints=known)
     arms = tuple(sorted(_arms(tree), key=lambda arm: -_travel(first, arm.joints)))
+    if holder is None and not branches:  # a payload hangs on what looks most like a tool, a fixed frame of it last
+        holder = min(reversed([name for name, at in tree.frames.items() if at.joint_index >= 0]), key=_tool_rank)
     holder, own = _holder(tree, arms, holder, standing)
     held = dict(grasps or {})
     if not held and standing:
@@ -151,8 +158,8 @@ def propose_config(
         held = {arm.tool_frames[0]: f"w_{branches[-1].name}" for arm in [arm for arm in arms if arm is not own][:1]}
     carrying = [tree.frame(name).joint_index for name in (*held, *(() if standing else (holder,)))]
     needed = {j for end in carrying for j in tree.ancestor_joint_indices(end)}
-    joints = tuple(tree.joint_names[j] for j in sorted(needed))
-    mode, why = _mode(first, recorded, bool(held))
+    joints = tuple(tree.joint_names[j] for j in sorted(needed)) if branches else tree.joint_names
+    mode, why = _mode(first, recorded, bool(held), has_object=bool(branches))
     moving = ""
     for recording in recordings:
         start = min(group.t[0] for group in recording.joint_and_point_groups)
@@ -176,7 +183,17 @@ def propose_config(
         min(10.0, 0.2 / period),
         {group.name: _clock(group.t, group.clock) for group in first.joint_and_point_groups},
         tuple(name for name in joints if max(_travel(r, [name]) for r in recordings) < _MIN_FRICTION_TRAVEL),
+        *_motor_and_gain(robot, mode, recordings),
     )
+
+
+def _motor_and_gain(robot: str, mode: str, recordings: Sequence[Recording]) -> tuple[str | None, float | None]:
+    name = resolve_urdf_path(robot).stem.lower()
+    found = next((known for start, known in _LEROBOT_ARMS.items() if name.startswith(start)), None)
+    if mode != "servo" or found is None:
+        return None, None
+    stated = any(r.joints is not None and r.joints.proportional_gain is not None for r in recordings)
+    return found[0], None if stated else found[1]
 
 
 # -- arms -------------------------------------------------------------------------------------------------------------
@@ -215,14 +232,18 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
     return frame, own
 
 
-def _mode(recording: Recording, joints: JointGroup, closed: bool) -> tuple[str, str]:
-    seen = ", ".join(group.name for group in recording.points)
-    if joints.effort is None and not seen:
+def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bool) -> tuple[str, str]:
+    seen, is_servo = ", ".join(group.name for group in recording.points), joints.effort is None and _commanded(joints)
+    if not has_object and not is_servo:
+        what = "without an object only an arm of position servos is described"
+        allowed = "commanded positions that differ from the measured ones, and no efforts"
+        raise ConfigError(what, where=recording.name, allowed=allowed, hint="add --object and its dimensions")
+    if joints.effort is None and not seen and has_object:
         hint = "import points too (`yid-ocp import FILE --preview` lists what there is)"
         allowed = "points on the object, or efforts of the joints that move it"
         what = "nothing in the recording shows what the object does"
         raise ConfigError(what, where=recording.name, allowed=allowed, hint=hint)
-    if joints.effort is None and _commanded(joints):
+    if is_servo:
         return "servo", "commanded positions were recorded and no efforts: the arm's servos follow them"
     if joints.effort is None:
         return "prescribed", "no efforts were recorded, so the arm moves as its encoders say"
@@ -375,7 +396,7 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
         values = recorded.channels.get(channel)
         if values is not None:
             noise = _GroupNoise(None, unit, _STATED_NOISE)
-            if getattr(recorded, f"{channel}_std") is None:
+            if not is_noise_std_stated(recorded, f"joints.{channel}", SensorOptions()):
                 noise = _GroupNoise(max(least, *(_size(recorded.t, values[:, j]) for j in at)), unit, _SEEN_NOISE)
             found[f"joints.{channel}"] = noise
     return found | {group.name: _point_noise(group) for group in recording.points}

@@ -17,6 +17,7 @@ from yid_ocp.data import Recording, read_recording, write_recording
 from yid_ocp.errors import ConfigError, DataError, OutputError, unknown_name_details
 from yid_ocp.files import atomic_write, write_text
 from yid_ocp.model.objects.base import InitObjectConfiguration, comma_separated_numbers, init_object_templates
+from yid_ocp.model.servos_and_springs import MOTOR_PRESETS
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.options import OptionInfo, dataclass_options, split_annotated
 from yid_ocp.progress import Progress
@@ -39,8 +40,8 @@ def run(arguments: argparse.Namespace) -> int:
     with stderr_progress_display(arguments) as progress:
         made = _recordings(arguments, out, progress)
     recordings = [recording or read_recording(file) for file, recording in made.items()]
-    segments, grasps = item.settings.build_segments(), _grasps(arguments.grasp)
-    asked = {"holder": arguments.holder, "grasps": grasps, "standing": item.stands_in_world}
+    segments, grasps = [] if item is None else item.settings.build_segments(), _grasps(arguments.grasp)
+    asked = {"holder": arguments.holder, "grasps": grasps, "standing": item is not None and item.stands_in_world}
     proposal = propose_config(robot, recordings, segments, **asked)
     made = _split(made, recordings, proposal, out)
     written = {file: raw for file, raw in made.items() if raw is not None}
@@ -52,9 +53,10 @@ def run(arguments: argparse.Namespace) -> int:
         return Path(os.path.relpath(Path(path).resolve(), out.parent.resolve())).as_posix()
 
     files, where = list(map(near, made)), robot if robot.startswith(("package:", "default:")) else near(robot)
-    lines = _config_lines(
-        where, arguments.object, item, proposal, files, import_recording.reader_options_from_arguments(arguments)
-    )
+    options = import_recording.reader_options_from_arguments(arguments)
+    about = f"An arm of position servos, {where}, with a payload."
+    about = about if item is None else f"A {arguments.object.replace('_', ' ')} moved by {where}."
+    lines = _config_lines(where, about, item, proposal, files, options)
     _write(out, "\n".join(lines) + "\n", written)
     result = {"format": "yid-init/1", "configuration": str(out), "recordings": files, "proposal": proposal.to_dict()}
     print_result(arguments, result, lambda: _summary_lines(proposal, out), f"configuration: {out}", str(out))
@@ -64,9 +66,15 @@ def run(arguments: argparse.Namespace) -> int:
 # -- what was asked ---------------------------------------------------------------------------------------------------
 
 
-def _object_from_arguments(arguments: argparse.Namespace) -> InitObjectConfiguration:
-    """The described object; `ConfigError` for a number that is missing or impossible, which names its option."""
+def _object_from_arguments(arguments: argparse.Namespace) -> InitObjectConfiguration | None:
+    """The described object, if any; `ConfigError` for a number that is missing or impossible, and names its option."""
     templates, word = init_object_templates(), arguments.object
+    if word is None:
+        for name in ("length", "mass", "radius", "section", "links", "number", "branch", "branches", "grasp"):
+            if getattr(arguments, name):
+                what, hint = f"--{name} describes an object, and none is named", "add --object, or leave it out"
+                raise ConfigError(what, where="--object", allowed=", ".join(templates), hint=hint)
+        return None
     if word not in templates:
         said = unknown_name_details(word, templates)
         raise ConfigError(f"there is no choice of --object '{word}'", where="yid-ocp init", **said)
@@ -177,8 +185,8 @@ _ALWAYS_WRITTEN_SETTINGS = ("kind", "links")
 
 def _config_lines(
     robot: str,
-    noun: str,
-    item: InitObjectConfiguration,
+    about: str,
+    item: InitObjectConfiguration | None,
     proposal: ConfigProposal,
     recordings: Sequence[str],
     imports: Mapping[str, Any],
@@ -187,14 +195,15 @@ def _config_lines(
     yield f"# yaml-language-server: $schema={_SCHEMA_FILE}"
     yield f"# Written by `yid-ocp init` {package_version()}. Everything may be changed; docs/settings.md has all keys."
     yield "# What the recordings say stands beside each line. Next: `yid-ocp check` on this file, then `yid-ocp solve`."
-    about = _text(f"A {noun.replace('_', ' ')} moved by {robot}.")
-    yield _line("", "description", about, "one sentence for the report")
+    yield _line("", "description", _text(about), "one sentence for the report")
     yield ""
     yield "model:"
     yield _line("  ", "robot", _text(robot), "URDF file, or package:NAME of example-robot-data")
     yield from _arms(proposal)
-    yield from _object(item, proposal)
-    yield from _effects(proposal)
+    if item is not None:
+        yield from _object(item, proposal)
+    yield from _friction(proposal)
+    yield from _effects(proposal, has_payload=item is None)
     yield ""
     yield from _recording_lines(recordings, imports)
     yield ""
@@ -267,6 +276,14 @@ def _arms(proposal: ConfigProposal) -> Iterator[str]:
         yield _line("      ", "command_interpolation", "held", held)
         carried = "true where the controller carries the arm's own weight"
         yield _line("      ", "has_gravity_compensation", "false", carried)
+        known = f"{{kind: dc, preset: {proposal.motor_preset or next(iter(MOTOR_PRESETS))}}}"
+        words = "published figures to begin with"
+        yield _line(
+            "      ",
+            "motor" if proposal.motor_preset else "# motor",
+            known,
+            f"{words}; one of {', '.join(MOTOR_PRESETS)}",
+        )
 
 
 def _object(item: InitObjectConfiguration, proposal: ConfigProposal) -> Iterator[str]:
@@ -314,7 +331,17 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
         yield _line(indent, key, f"{value:g}" if isinstance(value, float) else _value(numbers), comment)
 
 
-def _effects(proposal: ConfigProposal) -> Iterator[str]:
+def _friction(proposal: ConfigProposal) -> Iterator[str]:
+    about = "of geared arms, its sizes free; which law, `yid-ocp friction` says"
+    if proposal.motor_preset:
+        moving = [name for name in proposal.joints if name not in proposal.still_joints]
+        law = {"law": "load"} | ({"joints": moving} if proposal.still_joints else {})
+        yield _line("  ", "friction", _value(law), about)
+    elif proposal.arm_mode == "servo" or proposal.is_object_measured_only_by_effort:
+        yield _line("  ", "# friction", "{law: coulomb}", about)
+
+
+def _effects(proposal: ConfigProposal, has_payload: bool) -> Iterator[str]:
     if proposal.arm_mode == "servo":
         kind, words = "rotor_inertia", "what rotors add through their gears, free below"
     elif proposal.is_object_measured_only_by_effort:
@@ -324,6 +351,8 @@ def _effects(proposal: ConfigProposal) -> Iterator[str]:
     yield _line("  ", "effects", "", words)
     for joint in proposal.joints:
         yield f"    - {{kind: {kind}, location: {_text(joint)}}}"
+    if has_payload:
+        yield f"    - {{kind: payload, location: {_text(proposal.holder_frame)}}}   # what the arm holds"
 
 
 def _recording_lines(files: Sequence[str], imports: Mapping[str, Any]) -> Iterator[str]:
@@ -362,17 +391,34 @@ def _sensors(proposal: ConfigProposal) -> Iterator[str]:
         yield f"  # {group} come at {clock}"
 
 
-def _parameters(item: InitObjectConfiguration, proposal: ConfigProposal) -> Iterator[str]:
-    free = "{free: true}"
-    yield _line("", "parameters", "", item.parameters_comment)
-    for name, (value, comment) in item.start_values.items():
-        yield _line("  ", name, f"{{free: true, initial: {_number(value)}}}", comment)
+def _parameters(item: InitObjectConfiguration | None, proposal: ConfigProposal) -> Iterator[str]:
+    free, preset = "{free: true}", proposal.motor_preset
+    if item is None:
+        yield _line("", "parameters", "", "`yid-ocp inspect` lists all that there are")
+        payload = f'"payload@{proposal.holder_frame}.*"'
+        yield _line("  ", payload, free, "mass [kg] and first moments [kg m]; {free: false} where it holds nothing")
+    else:
+        yield _line("", "parameters", "", item.parameters_comment)
+        for name, (value, comment) in item.start_values.items():
+            yield _line("  ", name, f"{{free: true, initial: {_number(value)}}}", comment)
     if proposal.arm_mode == "servo":
-        yield _line("  ", '"*.servo_gain"', free, "begins at a twentieth of a radian for the effort limit")
-        yield _line("  ", '"*.servo_damping"', free, "begins at a tenth of a second times the gain")
-        yield _line("  ", '"*.servo_delay"', free, "from a command to its torque [s]")
+        start = f"published figure of the {preset}" if preset else ""
+        if proposal.firmware_gain is not None:
+            known = f"{{initial: {proposal.firmware_gain:g}}}"
+            said = "the firmware's, as LeRobot sets it; or attribute proportional_gain of the recordings"
+            yield _line("  ", '"*.servo_gain_factor"', known, said)
+        yield _line("  ", '"*.servo_gain"', free, start or "begins at a twentieth of a radian for the effort limit")
+        yield _line("  ", '"*.servo_damping"', free, start or "begins at a tenth of a second times the gain")
+        late = "{free: true, initial: 0.075}" if preset else free
+        yield _line("  ", '"*.servo_delay"', late, "from a command to its torque [s]")
         yield _line("  ", '"rotor_inertia@*.armature"', free, "of the servos' motors, at the joint [kg m^2]")
-        yield '  # "*.servo_torque_limit": {initial: 3.0}   # the URDF\'s effort limit where nothing is said'
+        if preset:
+            yield _line("  ", '"*.servo_torque_limit"', free, "at full duty [N m]")
+            for joint in proposal.still_joints:
+                yield _line("  ", f'"{joint}.*"', "{free: false}", "it hardly turns")
+                yield _line("  ", f"rotor_inertia@{joint}.armature", "{free: false}")
+        else:
+            yield '  # "*.servo_torque_limit": {initial: 3.0}   # the URDF\'s effort limit where nothing is said'
     if proposal.is_object_measured_only_by_effort:
         for joint in proposal.joints:
             said, why = "{free: true, initial: 0.1, bounds: [0.0, 50.0]}", "viscous friction of the arm [N m s/rad]"
