@@ -131,8 +131,7 @@ def diagnose(
         composed = _composed(problem, candidates, exclude, held_out, told)
         clock["compose"] = time.perf_counter()
         limits = thresholds or DEFAULT_THRESHOLDS
-        until = clock[""] + (limits.budget or math.inf)
-        search = RefitContext(composed, limits, told, known.store, until)
+        search = RefitContext(composed, limits, told, known.store, clock[""] + (limits.budget or math.inf))
         return _diagnosed(_examined(problem, search, known.solution, clock), earlier, clock)
 
 

@@ -341,7 +341,7 @@ def refit_with_each_effect(
     if not tried:
         return []
     beside = f" beside {', '.join(effect.label for effect in base)}" if base else ""
-    noun = "effects" if len(tried[0][0]) == 1 else "pairs"
+    noun, head = "effects" if len(tried[0][0]) == 1 else "pairs", ("effects", "held-out chi2/n")
     # one effect is often enough; where it is not, pairs, more effects and others in their places follow
     ahead = 11.0 if noun == "pairs" else {0: 8.0, 1: 14.0}.get(len(base), 9.0)
     search.progress.begin_stage(f"refitting with each of {len(tried)} {noun}{beside}", 2 + 0.5 * len(tried), ahead)
@@ -357,12 +357,8 @@ def refit_with_each_effect(
             how = "resumed the refit" if fit.is_from_store else "refitted"
             search.left_by[join_effect_labels(effects)] = left = f"{fit.held_out_loss.chi2_per_sample:.4g}"
             text = f"{how} with {label}: held-out chi2/n {left}"
-        parts.count_done(text, ranking)
+        parts.count_done(text, lambda: [head, *sorted(search.left_by.items(), key=lambda entry: float(entry[1]))])
         return fit
-
-    def ranking() -> list[tuple[str, str]]:
-        ranked = sorted(search.left_by.items(), key=lambda entry: float(entry[1]))
-        return [("effects", "held-out chi2/n"), *ranked]
 
     fits: list[RefittedModel | None] = []
     rest, begun = list(tried), time.perf_counter()

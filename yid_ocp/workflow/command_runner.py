@@ -115,7 +115,6 @@ class _RemainingTime:
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
         self._spent = min(max(import_time, _USUAL_IMPORT_TIME / 4), _USUAL_IMPORT_TIME * 32)
         self._usual, self._work, self._ahead = _USUAL_IMPORT_TIME, 0.0, math.nan
-        self._is_first_stage = True  # which says whether those after it are planned
         self._begun, self._n_iterates = time.monotonic(), 0
         self._first: tuple[int, float] | None = None
 
@@ -126,11 +125,11 @@ class _RemainingTime:
             most, least = as_before * _MAX_PACE_RATIO, as_before / _MAX_PACE_RATIO
             self._spent = self._spent / 2 + min(max(now - self._begun, least), most)
             self._usual = self._usual / 2 + self._work
-        if ahead is not None and (self._is_first_stage or not math.isnan(self._ahead)):
+        # only a stage that is a part of what is ahead says that those after it are planned
+        if ahead is not None and (work == 0 or not math.isnan(self._ahead)):
             self._ahead = ahead
         else:
             self._ahead = max(self._ahead - work, 0.0)
-        self._is_first_stage = False
         if work > 0 or self._work > 0:
             self._begun = now
         self._work, self._n_iterates, self._first = work, 0, None
@@ -152,7 +151,6 @@ class _RemainingTime:
             expected = spent * (_USUAL_ITERATIONS + 1) / (self._n_iterates + 1)
         if self._n_iterates or spent > expected:
             pace = (self._spent / 2 + max(spent, expected)) / (self._usual / 2 + self._work)
-            expected = expected if self._n_iterates else self._work * pace
         # what has lasted longer than expected goes on for as long again as it is beyond that
         return abs(expected - spent) + self._ahead * pace
 
