@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,11 +58,17 @@ def test_two_runs_together_are_their_weighted_mean_also_without_full_rank():
     assert mean.values == pytest.approx(expected, rel=1e-10)
     assert mean.covariance == pytest.approx(sum_of, rel=1e-8)
     assert chi2 == pytest.approx(apart @ np.linalg.solve(COVARIANCE + other, apart), rel=1e-8)
-    assert degrees == 2
+    assert (degrees, mean.run_name) == (2, "2 runs")
+    alone, chi2, degrees = pool_estimates([first])
+    assert (alone.run_name, chi2, degrees) == ("x", pytest.approx(0.0, abs=1e-20), 0)
+    assert alone.covariance == pytest.approx(COVARIANCE, rel=1e-8)
     flat = np.array([[1.0, 1.0], [1.0, 1.0]]) * np.outer([1e-3, 1e4], [1e-3, 1e4])
     found = nearby_positive_definite_covariance(flat)
     assert np.sqrt(np.diag(found)) == pytest.approx([1e-3, 1e4], rel=1e-9)
     assert np.all(np.isfinite(np.linalg.cholesky(found)))
+    tiny = COVARIANCE * 1e-16
+    assert nearby_positive_definite_covariance(tiny) == pytest.approx(tiny, rel=1e-9, abs=0.0)
+    assert np.diag(nearby_positive_definite_covariance(np.array([[4.0, 3.0], [3.0, 1.0]]))) == pytest.approx([4.0, 1.0])
 
 
 def test_runs_that_differ_widen_the_mean_and_a_parameter_counts_where_it_is():
@@ -72,6 +79,8 @@ def test_runs_that_differ_widen_the_mean_and_a_parameter_counts_where_it_is():
     assert mean.parameter_names == ("a", "b")
     assert degrees == 1
     assert mean.std[0] < 0.01
+    misfit = replace(run("y", [1.0, 2.0]), is_fit_adequate=False)
+    assert (mean.is_fit_adequate, pool_estimates([run("x", [1.0, 2.0]), misfit])[0].is_fit_adequate) == (True, False)
 
 
 def test_without_drift_chi2_is_distributed_as_it_should_and_alarms_stay_at_their_level():
@@ -82,6 +91,30 @@ def test_without_drift_chi2_is_distributed_as_it_should_and_alarms_stay_at_their
     found = [assess_drift_and_outlier_runs(drawn(rng, [1.0, 2.0], 4), level=0.05) for _ in range(40)]
     assert np.mean([bool(drifted(entry)) for entry in found]) < 0.16
     assert np.mean([bool(outliers(entry)) for entry in found]) < 0.16
+
+
+def test_each_run_is_tested_against_all_others_at_its_share_of_the_level():
+    values = np.array([[1.0, 2.0], [1.03, 2.01], [0.98, 2.03]])
+    runs = [run(f"day{i}", own) for i, own in enumerate(values)]
+    found = assess_drift_and_outlier_runs(runs)
+    assert (found.significance_level, found.degrees_of_freedom) == (0.01, 4)
+    for i, entry in enumerate(found.run_outlier_tests):
+        one, other = np.delete(values, i, axis=0)
+        birge = max(1.0, (one - other) @ np.linalg.solve(2 * COVARIANCE, one - other) / 2)
+        apart = values[i] - (one + other) / 2
+        expected = apart @ np.linalg.solve(COVARIANCE * (1 + birge / 2), apart)
+        assert (entry.chi2, entry.degrees_of_freedom) == (pytest.approx(expected, rel=1e-6), 2)
+        assert entry.p_value == pytest.approx(scipy.stats.chi2.sf(expected, 2), rel=1e-5)
+    for i, entry in enumerate(found.parameter_drifts):
+        chi2 = np.sum((values[:, i] - values[:, i].mean()) ** 2) / COVARIANCE[i, i]
+        assert (entry.chi2, entry.p_value) == pytest.approx((chi2, scipy.stats.chi2.sf(chi2, 2)), rel=1e-6)
+        assert (entry.mean, entry.mean_std) == pytest.approx(
+            (values[:, i].mean(), np.sqrt(COVARIANCE[i, i] / 3 * max(1, chi2 / 2))), rel=1e-6
+        )
+        shares = [assess_drift_and_outlier_runs(runs, level=share * entry.p_value) for share in (1.9, 2.1)]
+        assert [drifted(share).count(entry.name) for share in shares] == [0, 1]
+    strange = assess_drift_and_outlier_runs([*runs, run("z", [1.0], [[1.0]], ("c",))]).run_outlier_tests[-1]
+    assert (strange.chi2, strange.degrees_of_freedom, strange.p_value, strange.worst_parameter) == (0.0, 0, 1.0, "")
 
 
 def test_the_run_that_stands_apart_is_the_one_to_distrust():
@@ -102,6 +135,14 @@ def test_a_steady_drift_and_two_runs_that_differ_make_no_outlier():
     found = assess_drift_and_outlier_runs([run("x", [1.0, 2.0]), run("y", [2.0, 2.0])])
     assert drifted(found) == ["a"]
     assert outliers(found) == []
+    # the others differ too, but far less than from that one
+    runs = [run(f"day{i}", [value, 2.0]) for i, value in enumerate((1.0, 1.1, 9.0, 1.2))]
+    assert outliers(assess_drift_and_outlier_runs(runs)) == ["day2"]
+    three = [run("x", [1.0, 2.0]), run("y", [1.08, 2.0]), run("z", [1.001, 2.0])]
+    found = assess_drift_and_outlier_runs(three)
+    assert outliers(found) == ["y"]
+    p = next(entry.p_value for entry in found.run_outlier_tests if entry.is_outlier)
+    assert [outliers(assess_drift_and_outlier_runs(three, level=share * p)) for share in (2.9, 3.1)] == [[], ["y"]]
 
 
 KINDS = {"a": ("a_1", "a_2"), "b": ("b_1",), "c": ("c_1",)}
@@ -158,6 +199,7 @@ def test_kinds_go_by_name_and_a_true_law_predicts_to_its_noise_and_shows_in_the_
     assert all(error < 1.3e-3 for error in fit.left_out_errors.values())
     assert fit.parameters["joint_coulomb@shoulder.tau_c"].value == pytest.approx(1.2, abs=0.05)
     [cloud] = friction_torque_clouds(driven, solution, ["joint_coulomb@shoulder.tau_c"])
+    assert (cloud.joint, cloud.speed.shape, cloud.load.shape) == ("shoulder", (4 * 79,), (4 * 79,))
     moving = np.abs(cloud.speed) > 0.5
     # friction is against the motion, in the data as in the law
     assert np.median(cloud.measured[moving] * np.sign(cloud.speed[moving])) == pytest.approx(1.2, abs=0.15)

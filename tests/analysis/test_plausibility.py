@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from small_problems import joints, measured, pendulum_step, points, recording, seen
 
 from yid_ocp.analysis.clock_checks import check_fit_for_drift_and_noise
 from yid_ocp.analysis.joint_checks import (
@@ -16,21 +19,34 @@ from yid_ocp.analysis.joint_checks import (
     check_joint_excitation,
     check_joint_limits,
 )
-from yid_ocp.analysis.point_checks import check_cable_point_geometry, check_point_distances, check_robot_held_points
+from yid_ocp.analysis.point_checks import (
+    check_cable_point_geometry,
+    check_object_points_by_rollout,
+    check_point_distances,
+    check_robot_held_points,
+)
 from yid_ocp.config.reader import load_config
 from yid_ocp.data import read_recording
+from yid_ocp.data.issues import QUALITY_LIMITS
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.model.system import System
 from yid_ocp.model.urdf import _example_robot_urdf, read_urdf
 from yid_ocp.problem import EstimationProblem, SensorOptions
-from yid_ocp.solvers import solve
+from yid_ocp.solvers import GaussNewton, solve
 from yid_ocp.virtual.experiment import baxter_foam_y_system
 from yid_ocp.workflow.build_problem import build_problem
 
 
 def usual(_group: str) -> SensorOptions:
     return SensorOptions()
+
+
+def free_arm(source, **how) -> RecordedJointsModel:
+    """Joints that hold nothing."""
+    robot = read_urdf(source, **how)
+    system = System.build(robot, prescribed=robot.joint_names)
+    return RecordedJointsModel.from_system(system, system.parameters.vector())
 
 
 @pytest.fixture(scope="module")
@@ -57,11 +73,9 @@ def with_points(recording: Recording, name: str, change) -> Recording:
 
 def test_inverse_dynamics_are_pinocchios():
     pin = pytest.importorskip("pinocchio")
-    robot = read_urdf("package:baxter", joints=[f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")])
-    system = System.build(robot, prescribed=robot.joint_names)
-    arm = RecordedJointsModel.from_system(system, system.parameters.vector())
+    arm = free_arm("package:baxter", joints=[f"left_{j}" for j in ("s0", "s1", "e0", "e1", "w0", "w1", "w2")])
     whole = pin.buildModelFromUrdf(str(_example_robot_urdf("baxter")))
-    others = [whole.getJointId(name) for name in whole.names[1:] if name not in robot.joint_names]
+    others = [whole.getJointId(name) for name in whole.names[1:] if name not in arm.joint_names]
     model = pin.buildReducedModel(whole, others, pin.neutral(whole))
     data = model.createData()
     q, v, a = np.random.default_rng(1).uniform(-1, 1, (3, 5, 7))
@@ -83,102 +97,188 @@ def test_slopes_of_places_are_their_derivatives(arms):
 
 def times(factor, *columns):
     def change(joints):
-        effort = np.array(joints.effort)
-        effort[:, list(columns) or slice(None)] *= factor
-        return effort
+        chosen = np.isin(np.arange(len(joints.names)), columns) if columns else True
+        return joints.effort * np.where(chosen, factor, 1.0)
 
     return change
 
 
-def late(by):
+def late(rows):
+    return lambda joints: np.vstack([joints.effort[rows:0:-1], joints.effort[: len(joints.t) - rows]])
+
+
+def offset(torque, column, *, rubs=False):
+    """An offset, with what else lives in a joint: viscous and dry friction and a spring."""
+
     def change(joints):
-        rows = round(by / 0.01)
-        return np.vstack([joints.effort[rows:0:-1], joints.effort[: len(joints.t) - rows]])
+        angle = joints.position[:, column] - joints.position[:, column].mean()
+        speed = np.gradient(angle, joints.t)
+        more = 0.3 * (speed + np.tanh(speed / 0.02) + angle) if rubs else 0.0
+        return joints.effort + np.outer(torque + more, np.arange(joints.effort.shape[1]) == column)
 
     return change
 
 
+ARM_FLIPPED = {"right_s0": 1.390, "right_s1": 2.551, "right_e0": 1.165, "right_e1": 1.364, "right_w0": 1.022}
+THOUSAND = [("effort_limits", "right_s1", 562.7, "732 times what it can bear (50 N m)")]
+THOUSAND += [("effort_gain", "", 388.8, "about 1.2e+03 times")]
 EFFORTS = {
-    "as recorded": (1, lambda j: j.effort, set()),
-    "as recorded by two": (2, lambda j: j.effort, set()),
-    "a tenth": (1, times(0.1), {"effort_gain"}),
-    "a thousand times": (2, times(1e3), {"effort_gain", "effort_limits"}),
-    "flipped": (2, times(-1.0), {"effort_sign"}),
-    "one flipped": (1, times(-1.0, 3), {"effort_sign"}),
-    "one arm flipped": (2, times(-1.0, *range(7, 14)), {"effort_sign"}),
-    "zero": (1, times(0.0), {"effort_zero"}),
-    "one zero": (1, times(0.0, 1), {"effort_zero"}),
-    "late": (2, late(0.3), {"effort_lag"}),
-    "wrist off": (1, lambda j: j.effort + 5.0 * (np.arange(7) == 6), {"effort_offset"}),
+    "as recorded": (1, lambda j: j.effort, []),
+    "as recorded by two": (2, lambda j: j.effort, []),
+    "a tenth": (1, times(0.1), [("effort_gain", "", 2.559, "about 0.13 times")]),
+    "a thousand times": (2, times(1e3), THOUSAND),
+    "flipped": (2, times(-1.0), [("effort_sign", "", 2.551, "all efforts have the opposite sign")]),
+    "one flipped": (1, times(-1.0, 3), [("effort_sign", "left_e1", 1.915, "of left_e1 has the opposite sign")]),
+    "one arm flipped": (
+        *(2, times(-1.0, *range(7, 14))),
+        [("effort_sign", name, ratio, f"of {name} has") for name, ratio in ARM_FLIPPED.items()],
+    ),
+    "zero": (1, times(0.0), [("effort_zero", "", 1e3, "left_s1, left_e1 is zero throughout")]),
+    "one next to zero": (1, times(1e-4, 1), [("effort_zero", "", 1e3, "of left_s1 is zero")]),
+    "late": (2, late(30), [("effort_lag", "", 3.0, "0.3 s earlier")]),
+    "wrist off": (1, offset(5.0, 6), [("effort_offset", "left_w2", 2.223, "off by +5 N m")]),
+    "wrist far off": (1, offset(12.0, 6), [("effort_offset", "left_w2", 5.334, "off by +12 N m")]),
+    "a wrist that rubs off": (1, offset(-5.0, 6, rubs=True), [("effort_offset", "left_w2", 2.207, "off by -4.97 N m")]),
+    "wrist ten times": (1, times(10.0, 6), [("effort_gain", "left_w2", 1.545, "10 times what gravity")]),
+    "what hangs on the gripper": (1, offset(10.0, 2), []),
 }
 
 
-@pytest.mark.parametrize("case", EFFORTS)
-def test_efforts_beside_inverse_dynamics(arms, runs, case):
+@pytest.mark.parametrize(("case", "begun"), [*((case, 0.0) for case in EFFORTS), ("late", 1e4)])
+def test_efforts_beside_inverse_dynamics(arms, runs, case, begun):
     count, change, expected = EFFORTS[case]
-    found = check_efforts_by_inverse_dynamics(arms[count], with_joints(runs[count], effort=change))
-    assert {doubt.cause for doubt in found} == expected
-    if case == "one flipped":
-        assert [doubt.channel for doubt in found] == ["effort.left_e1"]
-    if case == "flipped":
-        assert [doubt.channel for doubt in found] == ["effort"]
-    if case == "late":
-        assert "0.3 s earlier" in found[0].what
+    run = with_joints(runs[count], effort=change, t=lambda j: j.t + begun)
+    found = check_efforts_by_inverse_dynamics(arms[count], run)
+    assert_issues(found, expected)
+    assert {(doubt.recording, doubt.weight) for doubt in found} <= {(runs[count].name, "not_trusted")}
+
+
+def assert_issues(found, expected):
+    """Cause, joint, evidence and a part of the words of every issue; a channel is that of an effort."""
+    named = [(cause, f"effort.{joint}" if joint else "effort") for cause, joint, *_ in expected]
+    assert [(doubt.cause, doubt.channel) for doubt in found] == named
+    for doubt, (*_, ratio, words) in zip(found, expected, strict=True):
+        assert doubt.evidence_ratio == pytest.approx(ratio, rel=2e-3)
+        assert words in doubt.what
+
+
+@pytest.fixture(scope="module")
+def drives(repository) -> RecordedJointsModel:
+    return free_arm(repository / "models" / "urdf" / "two_drives.urdf")
+
+
+def swing(t, size=1.0, rate=2.0):
+    """Angles, speeds and accelerations."""
+    angle, rate = size * np.array([1.0, 0.4]), rate * np.array([1.0, 1.5])
+    phase = rate * t[:, None]
+    return angle * np.sin(phase), angle * rate * np.cos(phase), -angle * rate**2 * np.sin(phase)
+
+
+def swung(drives, change=lambda e: e, size=1.0, rate=2.0, behind=0.0, noise=0.0, length=12.0, seed=0, **more):
+    """Two drives that swing, with the efforts that they need, changed, and noise."""
+    t = np.arange(0.0, length, 0.005)
+    effort = change(drives._inverse_dynamics(*swing(t - behind, size, rate)))
+    effort = effort + noise * np.random.default_rng(seed).standard_normal(effort.shape)
+    return Recording(JointGroup(drives.joint_names, t, swing(t, size, rate)[0], effort=effort, **more), name="run")
+
+
+LIMIT = ("effort_limits", "shoulder", 3.218, "of shoulder is 4.18 times what it can bear (6 N m)")
+SWUNG = {
+    "as needed": (lambda e: e, 0.0, []),
+    "one a tenth": (lambda e: e * [0.1, 1.0], 0.0, [("effort_gain", "shoulder", 3.124, "0.1 times what gravity")]),
+    "other a tenth": (lambda e: e * [1.0, 0.1], 0.0, [("effort_gain", "elbow", 3.175, "0.1 times what gravity")]),
+    "ten times": (lambda e: 10 * e, 0.0, [LIMIT, ("effort_gain", "", 10 / 3, "about 10 times")]),
+    "a tenth": (lambda e: 0.1 * e, 0.0, [("effort_gain", "", 10 / 3, "about 0.1 times")]),
+    "flipped": (lambda e: -e, 0.0, [("effort_sign", "", 7.172, "all efforts")]),
+    "one flipped": (lambda e: e * [-1.0, 1.0], 0.0, [("effort_sign", "shoulder", 7.061, "of shoulder has")]),
+    "one off": (lambda e: e + np.array([0.0, 1.0]), 0.0, [("effort_offset", "elbow", 1.051, "off by +0.946 N m")]),
+    "other off": (lambda e: e + np.array([3.0, 0.0]), 0.0, [("effort_offset", "shoulder", 2.390, "off by +2.15 N m")]),
+    "a little off": (lambda e: e + np.array([0.0, 0.9]), 0.0, []),
+    "balanced": (lambda e: e - [3.0, 0.0], 0.0, []),
+    "late": (lambda e: e, 0.1, [("effort_lag", "", 1.0, "0.1 s earlier")]),
+    "early": (lambda e: e, -0.3, [("effort_lag", "", 3.0, "0.3 s later")]),
+    "a little late": (lambda e: e, 0.04, []),
+}
+
+
+@pytest.mark.parametrize("case", SWUNG)
+def test_efforts_of_two_drives_that_swing(drives, case):
+    change, behind, expected = SWUNG[case]
+    found = check_efforts_by_inverse_dynamics(drives, swung(drives, change, behind=behind))
+    assert_issues(found, expected)
+    lag = f"model.effects: [{{kind: effort_delay, location: gripper, values: {{delay: {behind:g}}}}}]"
+    assert [doubt.setting for doubt in found if "lag" in doubt.cause] == {0.1: [lag], -0.3: [""]}.get(behind, [])
 
 
 @pytest.mark.parametrize(("kind", "least", "expected"), [("command", 0.3, set()), ("sample", 0.3, {"effort_zero"}),
                                                          ("command", 2.0, {"effort_zero"})])  # fmt: skip
-def test_a_joint_of_which_nothing_is_asked_may_swing(repository, kind, least, expected):
+def test_a_joint_of_which_nothing_is_asked_may_swing(drives, kind, least, expected):
     """Friction and what the model lacks are all that it then seems to need; what holds an arm up is more."""
-    robot = read_urdf(str(repository / "models" / "urdf" / "two_drives.urdf"))
-    system = System.build(robot, prescribed=robot.joint_names)
-    arm = RecordedJointsModel.from_system(system, system.parameters.vector())
-    t = np.arange(0.0, 6.0, 0.005)
-    q = np.stack([np.sin(2 * t), 0.4 * np.sin(3 * t)], axis=1)
-    v = np.stack([2 * np.cos(2 * t), 1.2 * np.cos(3 * t)], axis=1)
-    a = np.stack([-4 * np.sin(2 * t), -3.6 * np.sin(3 * t)], axis=1)
-    q, v, a = (values * least / 2.4 for values in (q, v, a))
-    needed = arm._inverse_dynamics(q, v, a)
-    assert np.sqrt(np.mean(needed[:, 0] ** 2)) == pytest.approx(least, rel=0.3)
-    effort = needed * [0.0, 1.0]
-    recording = Recording(JointGroup(tuple(robot.joint_names), t, q, effort=effort, effort_kind=kind))
-    assert {doubt.cause for doubt in check_efforts_by_inverse_dynamics(arm, recording)} == expected
+    needed = swung(drives, size=least / 2.4, length=6.0).joints.effort[:, 0]
+    assert np.sqrt(np.mean(needed**2)) == pytest.approx(least, rel=0.3)
+    recording = swung(drives, lambda e: e * [0.0, 1.0], least / 2.4, length=6.0, effort_kind=kind)
+    assert {doubt.cause for doubt in check_efforts_by_inverse_dynamics(drives, recording)} == expected
 
 
 def test_motion_of_another_robot_or_with_a_counterbalance(arms, runs):
     quick = with_joints(runs[1], t=lambda j: j.t / 10)
-    robot = read_urdf("package:baxter", joints=arms[1].joint_names)
-    system = System.build(robot, prescribed=robot.joint_names)
-    free = RecordedJointsModel.from_system(system, system.parameters.vector())
+    free = free_arm("package:baxter", joints=arms[1].joint_names)
     # nothing else can load an arm that holds nothing
-    assert "effort_unlike" in {doubt.cause for doubt in check_efforts_by_inverse_dynamics(free, quick)}
+    for arm, many, times_off, ratio in ((arms[1], 4, "4.3", 1.425), (free, 7, "6.6", 2.212)):
+        (doubt,) = check_efforts_by_inverse_dynamics(arm, quick)
+        assert (doubt.cause, doubt.evidence_ratio) == ("effort_unlike", pytest.approx(ratio, rel=2e-3))
+        assert f"efforts of {many} of 7 joints are not" in doubt.what
+        assert f"{times_off} times what a robot's model is off by" in doubt.what
     balanced = with_joints(runs[1], effort=lambda j: j.effort + 20.0 * (np.arange(7) == 1))
     assert check_efforts_by_inverse_dynamics(arms[1], balanced) == []
+
+
+def test_too_little_of_a_recording_says_nothing(arms, runs, drives):
+    arm, few = arms[1], runs[1].time_slice(-1.0, float(runs[1].joints.t[8]))
+    blind = replace(with_joints(few, position=lambda j: 9.0 * j.position), joints=None)
+    deaf = with_joints(runs[1], effort=lambda _: None)
+    for check in (check_efforts_by_inverse_dynamics, lambda *given: check_inertial_effort_excitation(*given, USUAL)):
+        assert [list(check(arm, run)) for run in (few, blind, deaf)] == [[], [], []]
+    assert list(check_joint_limits(arm, with_joints(few, t=lambda j: j.t / 30))) == []
+    assert list(check_joint_limits(arm, blind)) == list(check_robot_held_points(arm, blind, usual)) == []
+    assert list(check_joint_excitation([blind, runs[1]], {"else": ("else.damping",)}, USUAL)) == []
+    assert list(check_inertial_effort_excitation(drives, swung(drives, size=1e-3, **SLOW), USUAL)) == []
 
 
 def test_limits_of_joints(arms, runs):
     arm, run = arms[1], runs[1]
     assert list(check_joint_limits(arm, run)) == []
-    wide = with_joints(run, position=lambda j: j.position + 3.0 * (np.arange(7) == 3))
-    assert [(d.cause, d.channel) for d in check_joint_limits(arm, wide)] == [("angle_limits", "position.left_e1")]
-    degrees = with_joints(run, position=lambda j: np.degrees(j.position))
-    assert [(d.cause, d.weight) for d in check_joint_limits(arm, degrees)] == [("degrees", "refused")]
-    quick = with_joints(run, t=lambda j: j.t / 30)
-    assert "speed_limits" in {d.cause for d in check_joint_limits(arm, quick)}
+    for shift, past, ratio in ((3.0, 1.74, 17.44), (-3.0, 1.94, 19.42)):
+        wide = with_joints(run, position=lambda j, by=shift: j.position + by * (np.arange(7) == 3))
+        (doubt,) = check_joint_limits(arm, wide)
+        assert (doubt.cause, doubt.channel, doubt.group) == ("angle_limits", "position.left_e1", "joints")
+        assert (doubt.evidence_ratio, doubt.recording) == (pytest.approx(ratio, rel=1e-3), run.name)
+        assert f"left_e1 goes {past} rad beyond its limits of -0.05 to 2.62" in doubt.what
+    (doubt,) = check_joint_limits(arm, with_joints(run, position=lambda j: np.degrees(j.position)))
+    assert (doubt.cause, doubt.weight, doubt.evidence_ratio) == ("degrees", "refused", pytest.approx(754.1, rel=1e-3))
+    assert "angles reach 78 rad" in doubt.what
+    (doubt,) = check_joint_limits(arm, with_joints(run, t=lambda j: j.t / 30))
+    assert (doubt.cause, doubt.channel, doubt.evidence_ratio) == ("speed_limits", "t", pytest.approx(6.959, rel=1e-3))
+    assert "left_e1 turns 10.4 times as fast as it can (1.5 rad/s)" in doubt.what
 
 
-MIRROR = np.array([1.0, -1.0, 1.0])
+MIRROR, WALK = np.array([1.0, -1.0, 1.0]), np.cumsum(0.02 * np.random.default_rng(0).standard_normal((501, 1, 3)), 0)
 TURN = np.array([[0.9, -np.sqrt(0.19), 0.0], [np.sqrt(0.19), 0.9, 0.0], [0.0, 0.0, 1.0]])
 HELD = {
     "as recorded": (1, lambda p: p, None, ""),
     "as recorded by two": (2, lambda p: p, None, ""),
-    "mirrored": (1, lambda p: MIRROR * p, "point_mirrored", "(x, -y, z)"),
-    "axes exchanged": (2, lambda p: p[..., [1, 0, 2]], "point_mirrored", "(y, x, z)"),
-    "in millimetres": (1, lambda p: 1e3 * p, "point_scale", "divided by 1000"),
+    "mirrored": (1, lambda p: MIRROR * p, "point_mirrored", "(x, -y, z) for (x, y, z), a mirror image, it is"),
+    "turned about x": (1, lambda p: p * [1, -1, -1], "point_mirrored", "with (x, -y, -z) for (x, y, z) it is"),
+    "axes exchanged": (2, lambda p: p[..., [1, 0, 2]], "point_mirrored", "(y, x, z) for (x, y, z), a mirror"),
     "shifted": (2, lambda p: p + np.array([0.1, 0.0, 0.2]), "point_frame", "shifted by (-0.1"),
     "turned": (2, lambda p: p @ TURN.T, "point_frame", "turned by 25.8 degrees"),
     "exchanged": (2, lambda p: p[:, ::-1], "point_swapped", "w_T2 and w_T3 exchanged"),
+    "walking away": (1, lambda p: p + WALK[: len(p)], "point_unlike", "and no simple change explains it"),
 }
+# millimetres, centimetres, inches, decimetres and feet, and read as such
+for unit in (1e-3, 1e-2, 0.0254, 0.1, 0.3048):
+    for scale in (unit, 1 / unit):
+        HELD[f"times {scale:.3g}"] = (2, lambda p, by=scale: by * p, "point_scale", f"; divided by {scale:g} it is")
 
 
 @pytest.mark.parametrize("case", HELD)
@@ -186,7 +286,12 @@ def test_points_that_the_arm_holds(arms, runs, case):
     count, change, cause, words = HELD[case]
     found = list(check_robot_held_points(arms[count], with_points(runs[count], "points_arm", change), usual))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
-    assert not found or words in found[0].what
+    for doubt in found:
+        assert words in doubt.what
+        assert doubt.what.endswith("explains it" if case == "walking away" else f"it is 0.001{6 + count} m")
+        seen = next(group.position for group in runs[count].points if group.name == "points_arm")
+        apart = np.sqrt(np.nanmean(np.sum((change(seen) - seen) ** 2, axis=2)))
+        assert (doubt.group, doubt.evidence_ratio) == ("points_arm", pytest.approx(min(apart / 0.01, 1e3), rel=5e-3))
 
 
 @pytest.mark.parametrize("joint", [1, 3, 5])
@@ -195,18 +300,24 @@ def test_an_encoder_whose_zero_is_off_is_named_with_its_size(arms, runs, joint, 
     moved = with_joints(runs[1], position=lambda j: j.position + offset * (np.arange(7) == joint))
     (doubt,) = check_robot_held_points(arms[1], moved, usual)
     name = arms[1].joint_names[joint]
-    assert (doubt.cause, name in doubt.setting) == ("encoder_offset", True)
-    assert f"with {-offset:+.3g}"[:9] in doubt.what.replace("+0.0499", "+0.05").replace("-0.0499", "-0.05")
+    assert (doubt.cause, doubt.group, doubt.channel) == ("encoder_offset", "joints", f"position.{name}")
+    size, found = re.search(r"([-+\d.]+) rad more.*location: (\S+, .*)}}", f"{doubt.what} {doubt.setting}").groups()
+    assert float(size) == pytest.approx(-offset, abs=2e-4)
+    assert found == f"{name}, values: {{offset: {-float(size):.3g}"
 
 
 def test_clocks_that_are_far_apart(arms, runs):
+    (doubt,) = check_robot_held_points(arms[2], stamped(runs[2], 0.2, -0.05), usual)
+    assert "taken +0.202 s from the joints, by a clock that runs -52.4 parts per thousand fast" in doubt.what
     groups = [replace(g, t=g.t + 0.4) if g.name == "points_arm" else g for g in runs[2].points]
     (doubt,) = check_robot_held_points(arms[2], replace(runs[2], points=tuple(groups)), usual)
-    assert doubt.cause == "clock_offset"
-    assert "taken +0.4 s" in doubt.what
+    assert (doubt.cause, doubt.evidence_ratio) == ("clock_offset", pytest.approx(6.603, rel=2e-3))
+    assert ("taken +0.4 s" in doubt.what, doubt.advice) == (True, "subtract 0.4 s from their times")
     (doubt,) = check_robot_held_points(arms[1], stamped(runs[1], drift=0.05), usual)
-    assert doubt.cause == "clock_drift"
+    assert (doubt.cause, doubt.evidence_ratio) == ("clock_drift", pytest.approx(1.392, rel=2e-3))
     assert re.search(r"\+4[78][.\d]* parts per thousand fast", doubt.what)
+    late, drift, middle = map(float, re.search(r"by t (\S+) (\S+) \(t - (\S+)\)", doubt.advice).groups())
+    assert (late, drift, middle) == (pytest.approx(0.0, abs=2e-4), pytest.approx(-0.05 / 1.05, rel=5e-3), 2.5)
 
 
 def stamped(recording: Recording, late: float = 0.0, drift: float = 0.0) -> Recording:
@@ -215,6 +326,7 @@ def stamped(recording: Recording, late: float = 0.0, drift: float = 0.0) -> Reco
     return replace(recording, points=tuple(groups))
 
 
+KEPT = np.arange(501)[:, None, None] % 9 > 0
 CLOCKS = {
     "as recorded": (1, 0.0, 0.0, None),
     "as recorded by two": (2, 0.0, 0.0, None),
@@ -230,7 +342,8 @@ CLOCKS = {
 @pytest.mark.parametrize("case", CLOCKS)
 def test_a_clock_that_is_a_little_off(arms, runs, case):
     count, late, drift, cause = CLOCKS[case]
-    found = list(check_robot_held_points(arms[count], stamped(runs[count], late, drift), usual))
+    gaps = with_points(stamped(runs[count], late, drift), "points_arm", lambda p: np.where(KEPT[: len(p)], p, np.nan))
+    found = list(check_robot_held_points(arms[count], gaps, usual))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
     for doubt in found:
         size, std = (float(number) for number in re.search(r"([-+\d.]+) ± ([\d.]+)", doubt.what).groups())
@@ -238,6 +351,12 @@ def test_a_clock_that_is_a_little_off(arms, runs, case):
         assert told == pytest.approx(drift if drift else late, rel=0.05, abs=3e-3 * std)
         assert (doubt.group, doubt.weight) == ("points_arm", "not_trusted")
         assert doubt.setting == "sensors.points_arm.use: false"
+        # over the limit of half a period of both, at the end of the recording for a drift
+        whole = 5.0 * drift if drift else late
+        assert doubt.evidence_ratio == pytest.approx(abs(whole) / 0.01, rel=0.03)
+        if drift:
+            begin, end = map(float, re.findall(r"([-+][.\d]+) ms", doubt.what))
+            assert (end - begin, end + begin) == pytest.approx((5e3 * drift, 2e3 * late), abs=2.0)
 
 
 def test_a_camera_that_is_late_is_answered_by_its_latency(arms, runs):
@@ -260,20 +379,56 @@ def test_what_is_a_little_off_or_at_rest_is_no_wrong_clock(arms, runs):
         assert list(check_robot_held_points(arms[1], moved, usual)) == []
 
 
-def test_what_no_change_explains_is_said_so(arms, runs):
-    rng = np.random.default_rng(0)
-    walk = np.cumsum(0.02 * rng.standard_normal((501, 1, 3)), axis=0)
-    (doubt,) = check_robot_held_points(arms[1], with_points(runs[1], "points_arm", lambda p: p + walk), usual)
-    assert doubt.cause == "point_unlike"
-
-
 @pytest.mark.parametrize(
-    ("factor", "cause"), [(1.0, None), (10.0, "point_scale"), (1 / 0.3048, "point_reach"), (-1.0, "point_reach")]
+    ("factor", "cause", "ratio"),
+    [(1.0, None, 0), (10.0, "point_scale", 7.587), (1 / 0.3048, "point_reach", 2.005), (-1.0, "point_reach", 1.970)],
 )
-def test_the_object_does_not_stretch(arms, runs, factor, cause):
+def test_the_object_does_not_stretch(arms, runs, factor, cause, ratio):
     recording = with_points(runs[1], "points_camera", lambda p: factor * p)
     found = check_point_distances(arms[1], arms[1].system, arms[1].theta, recording, usual)
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
+    for doubt in found:
+        assert doubt.evidence_ratio == pytest.approx(ratio, rel=1e-3)
+        assert re.fullmatch(r"w_T1 from the object's root is \S+ m, 0.813 m along the object", doubt.what)
+
+
+POSE = np.eye(4)
+POSE[:3, :3], POSE[:3, 3] = [[0.0, 0.6, 0.8], [1.0, 0.0, 0.0], [0.0, 0.8, -0.6]], [2.0, 0.5, 1.0]
+BACK = np.linalg.inv(POSE)
+
+
+def applied(pose):
+    return lambda p: p @ pose[:3, :3].T + pose[:3, 3]
+
+
+ROLLED = {
+    "as predicted": (lambda p: p + 0.1, True, None, ""),
+    "in the camera's frame": (applied(BACK), True, "point_frame", "with the camera's pose applied"),
+    "pose inverted": (applied(BACK @ BACK), True, "point_frame", "with the camera's pose the other way round"),
+    "axis turned": (applied(POSE @ np.diag([1, -1, 1, 1]) @ BACK), True, "point_mirrored", "camera's y axis turned"),
+    "no pose is known": (applied(BACK), False, None, ""),
+    "in millimetres": (lambda p: 1e3 * p, False, "point_scale", "divided by 1000"),
+    "exchanged": (lambda p: p[:, [1, 0, 2]], False, "point_swapped", "with a and b exchanged"),
+    "elsewhere": (lambda p: p + 5.0 * np.sin(np.arange(3))[:, None], True, None, ""),
+}
+
+
+@pytest.mark.parametrize("case", ROLLED)
+def test_points_far_from_a_rollout_are_explained_or_left_alone(case):
+    change, posed, cause, words = ROLLED[case]
+    place = np.random.default_rng(4).uniform(-1, 1, (20, 3, 3)) + np.arange(3.0)
+    sensor, at = points("a", "b", "c", pose=POSE if posed else None, group="points_camera"), np.arange(20)
+    samples = measured(sensor, at, 0.0 * at, change(place).reshape(20, 9))
+    episode = SimpleNamespace(name="run", measurements=(samples,))
+    result = SimpleNamespace(predicted_outputs=(place.reshape(20, 9),))
+    found = list(check_object_points_by_rollout(episode, result, 2.0))
+    assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
+    for doubt in found:
+        apart = np.sqrt(np.mean(np.sum((change(place) - place) ** 2, axis=2)))
+        assert (doubt.recording, doubt.group, doubt.weight) == ("run", "points_camera", "not_trusted")
+        assert doubt.evidence_ratio == pytest.approx(min(apart / (0.25 * 2.0), 1e3))
+        assert words in doubt.what
+    assert list(check_object_points_by_rollout(episode, result, 0.0)) == []
 
 
 REST = {f"p{i}": (0.1 * i, 0.0, 0.0) for i in range(9)} | {f"a{i}": (0.4, 0.07 * i, 0.0) for i in (1, 2, 3)}
@@ -295,18 +450,25 @@ def hanging(seed: int = 0) -> Recording:
 
 
 @pytest.mark.parametrize(
-    ("change", "cause", "words"),
+    ("change", "cause", "words", "ratio"),
     [
-        (lambda p: p, None, ""),
-        (lambda p: 10 * p, "point_scale", "9.98 times as long"),
-        (lambda p: p * [1, 1, -1], "point_mirrored", "above its clamps"),
-        (lambda p: p[:, [0, 1, 2, 10, 4, 5, 6, 7, 8, 9, 3, 11]], "point_swapped", "a2 and p3 exchanged"),
+        (lambda p: p, None, "", 0.0),
+        (lambda p: 10 * p, "point_scale", "9.98 times as long", math.log(9.98) / math.log(1.2)),
+        (lambda p: 0.5 * p, "point_scale", "0.499 times as long", math.log(2.0) / math.log(1.2)),
+        (lambda p: p * [1, 1, -1], "point_mirrored", "on average 0.192 m above its clamps", 3.798),
+        (
+            lambda p: p[:, [0, 1, 2, 10, 4, 5, 6, 7, 8, 9, 3, 11]],
+            *("point_swapped", "a2 to a3 is 3.45 times as long as undeformed; with a2 and p3 exchanged, 3 edges are"),
+            math.log(3.45) / math.log(1.6),
+        ),
     ],
 )
-def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words):
+def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words, ratio):
     found = list(check_cable_point_geometry(CABLE, with_points(hanging(), "points", change), GRAVITY))
     assert [doubt.cause for doubt in found] == ([] if cause is None else [cause])
-    assert not found or words in found[0].what
+    for doubt in found:
+        assert words in doubt.what
+        assert (doubt.recording, doubt.group, doubt.evidence_ratio) == ("c", "points", pytest.approx(ratio, rel=5e-3))
 
 
 def test_joints_of_another_name_leave_nothing_to_compare(arms, runs):
@@ -319,50 +481,48 @@ def test_joints_of_another_name_leave_nothing_to_compare(arms, runs):
 USUAL = SensorOptions()
 
 
-@pytest.fixture(scope="module")
-def pendulum_arm(urdf_folder) -> RecordedJointsModel:
-    robot = read_urdf(urdf_folder / "double_pendulum.urdf")
-    system = System.build(robot, prescribed=robot.joint_names)
-    return RecordedJointsModel.from_system(system, system.parameters.vector())
+SLOW = {"rate": 0.12, "noise": 0.05, "effort_std": 0.05, "length": 30.0}
 
 
-def swung(pendulum_arm: RecordedJointsModel, hertz: float, size: float = 0.3, seed: int = 0) -> Recording:
-    """Both joints to and fro, with the efforts that they need and noise."""
-    rng, noise = np.random.default_rng(seed), 0.05
-    t = 0.01 * np.arange(3001)
-    phase = 2 * np.pi * hertz * t[:, None] + np.array([0.0, 1.0])
-    rate = 2 * np.pi * hertz
-    q, v, a = size * np.sin(phase), size * rate * np.cos(phase), -size * rate**2 * np.sin(phase)
-    effort = pendulum_arm._inverse_dynamics(q, v, a) + noise * rng.standard_normal(q.shape)
-    return Recording(JointGroup(pendulum_arm.joint_names, t, q, effort=effort, effort_std=noise), name="run")
-
-
-@pytest.mark.parametrize(("hertz", "said"), [(0.02, True), (0.5, False), (1.0, False)])
-def test_a_motion_so_slow_that_only_postures_tell(pendulum_arm, hertz, said):
+@pytest.mark.parametrize(("rate", "said"), [(0.12, True), (3.0, False), (6.0, False)])
+def test_a_motion_so_slow_that_only_postures_tell(drives, rate, said):
+    q, v, a = swing(np.arange(0.0, 30.0, 0.005), 0.03, rate)
+    moving = drives._inverse_dynamics(q, v, a) - drives._inverse_dynamics(q, 0 * v, 0 * a)
+    # beside friction of 4 % of the largest effort per rad/s
+    seen = np.linalg.norm(np.hypot(moving, 6 * 0.04 * v) / 0.05)
     for seed in range(3):
-        found = list(check_inertial_effort_excitation(pendulum_arm, swung(pendulum_arm, hertz, 0.03, seed=seed), USUAL))
+        recording = swung(drives, size=0.03, seed=seed, **{**SLOW, "rate": rate})
+        found = list(check_inertial_effort_excitation(drives, recording, USUAL))
         assert [(d.cause, d.weight) for d in found] == ([("weak_excitation", "warning")] if said else [])
+        for doubt in found:
+            assert doubt.evidence_ratio == pytest.approx(5.0 / seen, rel=0.02)
+            assert (doubt.group, doubt.channel) == ("joints", "position")
 
 
-def test_less_noise_sees_more_and_efforts_that_nobody_uses_do_not_count(pendulum_arm):
-    slow = swung(pendulum_arm, 0.02, 0.03)
-    assert list(check_inertial_effort_excitation(pendulum_arm, slow, replace(USUAL, std=1e-4))) == []
-    assert len(list(check_inertial_effort_excitation(pendulum_arm, slow, replace(USUAL, std=10.0)))) == 1
-    assert list(check_inertial_effort_excitation(pendulum_arm, slow, replace(USUAL, use=False))) == []
+def test_less_noise_sees_more_and_efforts_that_nobody_uses_do_not_count(drives):
+    slow = swung(drives, size=0.03, **SLOW)
+    (unstated,) = check_inertial_effort_excitation(drives, with_joints(slow, effort_std=lambda _: None), USUAL)
+    assert "beside noise of 0.049 N m from sample to sample" in unstated.what
+    assert list(check_inertial_effort_excitation(drives, slow, replace(USUAL, std=1e-4))) == []
+    assert len(list(check_inertial_effort_excitation(drives, slow, replace(USUAL, std=10.0)))) == 1
+    assert list(check_inertial_effort_excitation(drives, slow, replace(USUAL, use=False))) == []
 
 
-def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(pendulum_arm):
+def test_a_joint_that_never_turns_tells_nothing_of_its_own_spring(drives):
     asked = {"elbow": ("elbow.stiffness", "elbow.damping")}
-    recording = swung(pendulum_arm, 0.5)
+    recording = swung(drives, size=0.75)
     still = replace(recording.joints, position=recording.joints.position * [1.0, 0.01])
     held = replace(recording, joints=still, name="held")
     (doubt,) = check_joint_excitation([held], asked, USUAL)
     assert (doubt.cause, doubt.channel, doubt.recording) == ("weak_excitation", "position.elbow", "held")
     assert doubt.setting == "parameters.elbow.stiffness.free: false; parameters.elbow.damping.free: false"
+    assert doubt.evidence_ratio == pytest.approx(QUALITY_LIMITS.min_joint_motion / 0.006, rel=1e-3)
+    assert "elbow turns by 0.006 rad at most, in held" in doubt.what
     assert list(check_joint_excitation([held, recording], asked, USUAL)) == []
     assert list(check_joint_excitation([held], {"shoulder": ("shoulder.damping",)}, USUAL)) == []
     coarse = replace(USUAL, std=0.2)
-    assert len(list(check_joint_excitation([recording], asked, coarse))) == 1
+    (doubt,) = check_joint_excitation([held, recording], asked, coarse)
+    assert (doubt.recording, doubt.evidence_ratio) == ("run", pytest.approx(6 * 0.2 / 0.6, rel=1e-3))
 
 
 @pytest.fixture(scope="module")
@@ -371,12 +531,13 @@ def springs(repository):
     return run, build_problem(run)
 
 
-def doubts(springs, late=0.0, drift=0.0, std=None):
-    """Doubts after a fit of the recording on another clock, or with another noise in the settings."""
+def doubts(springs, late=0.0, drift=0.0, std=None, slow=0.0):
+    """Doubts after a fit of the recording on another clock, with a slow error, or another noise in the settings."""
     run, problem = springs
     recording = problem.episodes[0].recording
     group = recording.points[0]
-    moved = replace(group, t=group.t + late + drift * (group.t - group.t.mean()))
+    error = slow * np.sin(2 * np.pi * (group.t - group.t[0]) / np.ptp(group.t))[:, None, None]
+    moved = replace(group, t=group.t + late + drift * (group.t - group.t.mean()), position=group.position + error)
     inside = (moved.t >= recording.joints.t[0]) & (moved.t <= recording.joints.t[-1])
     moved = replace(moved, t=moved.t[inside], position=moved.position[inside], std=group.std[inside])
     options = problem.options
@@ -400,10 +561,29 @@ def test_a_clock_that_runs_apart_is_told_by_what_the_fit_leaves(springs):
     assert told == pytest.approx(10.0, abs=4 * std + 0.5)
 
 
+def test_a_clock_that_runs_apart_is_told_beside_errors_of_torques(urdf_folder):
+    step, t = pendulum_step(urdf_folder, driven=("shoulder",)), 0.01 * np.arange(301)
+    more = {"effort_std": 0.02, "effort_kind": "command", "position_std": 1e-3}
+    arm = joints(("shoulder",), t, 0.4 * np.sin(5 * t)[:, None], effort=2 * np.cos(5 * t)[:, None], **more)
+    camera = seen(["tip"], t[4:-4:4], np.zeros((74, 1, 3)), "points_camera", std=np.full((74, 1, 3), 2e-3))
+    source = EstimationProblem(step, [recording(arm, camera)], ["elbow.stiffness"])
+    made = source.simulate_recording(seed=1)
+    moved = replace(made.points[0], t=1.5 + 1.02 * (made.points[0].t - 1.5))
+    problem = EstimationProblem(step, [replace(made, points=(moved,))], ["elbow.stiffness"])
+    solution = solve(problem, GaussNewton(), restarts=False)
+    assert solution.problem.has_process_noise
+    (doubt,) = check_fit_for_drift_and_noise(solution.problem, solution.x, solution.evaluation)
+    assert (doubt.cause, doubt.group) == ("clock_drift", "points_camera")
+    assert "its clock runs 20 ± 0.4 parts per thousand too fast" in doubt.what
+
+
 def test_noise_that_settings_state_ten_times_too_large(springs):
     (doubt,) = doubts(springs, std=1e-2)
-    assert (doubt.cause, doubt.weight) == ("noise_overstated", "warning")
+    assert (doubt.cause, doubt.weight, doubt.group) == ("noise_overstated", "warning", "points_camera")
+    assert "the fit leaves 0.001 m of points_camera" in doubt.what
     name, value = doubt.setting.split(": ")
     assert name == "sensors.points_camera.std"
     assert float(value) == pytest.approx(1e-3, rel=0.15)
     assert np.isclose(doubt.evidence_ratio, 1e-2 / (5 * float(value)), rtol=0.05)
+    # what lasts for long counts as what it sums up to
+    assert doubts(springs, std=1e-2, slow=2e-3) == []

@@ -233,14 +233,10 @@ def check_inertial_effort_excitation(
     moving = arm._inverse_dynamics(motion.q, motion.v, motion.a) - arm._inverse_dynamics(motion.q, still, still)
     limit = np.array([joint.effort_limit for joint in arm.joints])
     friction = np.where(np.isfinite(limit), _VISCOUS_FRICTION_FRACTION * limit, 0.0) * motion.v
-    # noise beyond the band of motion is smoothed away, so that so many samples count as one
-    apart = max(1.0, 1 / (2 * _MOTION_BANDWIDTH_HZ * median_sample_period(joints.t)))
-    samples = len(joints.t) / apart
-    band = noise / math.sqrt(apart)
     size = np.sqrt(np.mean(moving**2 + friction**2, axis=0))
-    seen = float(np.sqrt(samples * np.sum((size / band) ** 2)))
+    seen = float(np.sqrt(len(joints.t) * np.sum((size / noise) ** 2)))
     if seen < _MIN_SIGNAL_STDS:
-        j = int(np.argmax(size / band))
+        j = int(np.argmax(size / noise))
         asked = f"speed and acceleration ask {arm.joint_names[j]} for {size[j]:.2g} N m (rms)"
         words = f"{asked}, beside noise of {noise[j]:.2g} N m from sample to sample; no joint tells more"
         advice = "move faster; from postures alone weight and stiffness can be found, no damping, friction or inertia"

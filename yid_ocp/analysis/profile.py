@@ -218,8 +218,6 @@ class _Walk:
             point = self._refit(inside, trial)
             if point is None:
                 barrier, step = trial, 0.5 * abs(trial - s)
-                if step < 1e-3 * max(abs(trial - centre), 1e-12):
-                    break
                 continue
             height = self._added(point)
             if abs(height - _TARGET_HEIGHT) < _ROOT_RTOL * _TARGET_HEIGHT:
