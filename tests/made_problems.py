@@ -97,18 +97,7 @@ class MadeUp:
 
     @property
     def residual_rows(self) -> ResidualVectorLayout:
-        total = self._count
-        data = total - self._stated - self._weak
-        made = ResidualVectorLayout.from_episodes(self.episodes, self._stated, self._weak)
-        return ResidualVectorLayout(
-            made.measurements, slice(0, data), slice(data, data + self._stated), slice(data, total)
-        )
-
-    def linearization_without_weak_priors(self, evaluation: Evaluation) -> tuple[np.ndarray, np.ndarray]:
-        count = len(evaluation.residual) - self._weak
-        unit = np.ones(count)
-        unit[: count - self._stated] = self.rms_noise_of_data_residuals
-        return evaluation.residual[:count] / unit, evaluation.jacobian[:count] / unit[:, None]
+        return ResidualVectorLayout.from_episodes(self.episodes, self._stated, self._weak)
 
     def theta_and_initial_state_offset(self, x: np.ndarray, episode: int) -> tuple[np.ndarray, np.ndarray]:
         theta = self.theta.copy()

@@ -310,3 +310,24 @@ def test_the_smoother_expects_forces_as_large_as_the_torques_noise(step):
     assert np.count_nonzero(model.torque_noise_variance) == 1
     calm = problem_without_input_errors(problem)
     assert not recording_models_with_unknown_forces(calm, x, calm.evaluate(x))[0].torque_noise_variance.any()
+
+
+def test_the_smoother_starts_at_rest_and_counts_priors_once(step):
+    """Rest under constant unknowns stays rest; a prior of a parameter is an observation beside all recordings."""
+    files = [recorded(step, seed) for seed in (1, 2)]
+    plain = problem_whitened_by_sensor_noise(problem_of(step, files))
+    x = 1.1 * plain.initial_unknowns
+    given = plain.with_options(replace(plain.options, prior_stds={"elbow.stiffness": 0.5}))
+    bare, models = (recording_models_with_unknown_forces(own, x, own.evaluate(x)) for own in (plain, given))
+    assert [model.recording for model in models] == ["run_1", "run_2"]
+    for i, (model, other) in enumerate(zip(models, bare, strict=True)):
+        for j, (here, there) in enumerate(zip(model.intervals, other.intervals, strict=True)):
+            row = np.array([(x[0] - 3.0) / 0.5, plain.unknown_scales[0] / 0.5, 0.0]) if i == j == 0 else np.zeros(3)
+            added = here.unreachable_products - there.unreachable_products
+            np.testing.assert_allclose(added, np.outer(row, row), atol=1e-6)
+        first, rest = model.intervals[0], model.initial_state_jacobian
+        forced = [k for k, group in enumerate(model.unknown_groups) if group.kind == "force"]
+        later = first.state_transition @ rest + first.unknown_input_matrix
+        np.testing.assert_allclose(later[:, forced], rest[:, forced], rtol=1e-3, atol=1e-6)
+        assert np.all(np.abs(rest[:, forced]).max(axis=0) > 1e-3)
+        assert not model.initial_state_std.any()

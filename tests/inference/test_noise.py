@@ -7,14 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_problems import H, correlated, pendulum_step, taken
+from held_rod import held_rod
+from small_problems import PENDULUM, H, correlated, joints, pendulum_step, recording, seen, taken
 
 from yid_ocp.errors import ConfigError
+from yid_ocp.inference.smoother_model import recording_models_with_unknown_forces
 from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
     problem_whitened_at,
     torque_biases_and_stds_by_recording,
 )
+from yid_ocp.integrator.step import compile_step
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
@@ -264,3 +267,29 @@ def test_torques_beside_encoders_are_never_exact_and_steps_average_their_samples
     assert errors.torque_std[0] == pytest.approx(0.3 * math.sqrt(0.5))
     assert problem.episodes[0].grid.time_step == H
     assert len(np.unique(errors.sample_of_step)) == problem.episodes[0].grid.steps
+
+
+def test_what_may_act_on_a_held_rod(urdf_folder):
+    system = held_rod(urdf_folder, prescribed=PENDULUM, damping=0.05)
+    t = H * np.arange(13)
+    # the tip stands 2 cm below the end of the rod
+    arm = joints(PENDULUM, t, np.tile([0.6994, -1.6348], (13, 1)), position_std=0.0)
+    felt = seen(["w_T1"], t, np.full((13, 1, 3), 0.5), "points_arm", std=np.full((13, 1, 3), 0.01))
+    step = compile_step(system, H, use_compiler=False)
+    problem = EstimationProblem(step, [recording(arm, felt)], ("T1.bend",), ProblemOptions(initial_state="equilibrium"))
+    x = problem.initial_unknowns
+    evaluation = problem.evaluate(x)
+    [model] = recording_models_with_unknown_forces(problem, x, evaluation)
+    told = zip(model.unknown_names, model.unknown_groups, model.reference_std, strict=True)
+    found = {name: (group.location, group.kind, std) for name, group, std in told}
+    bent = evaluation.episode_predictions[0].rollout.state[:, 2 : system.n_coordinates]
+    load = np.sqrt(np.mean((bent * np.tile([4.0, 4.0, 3.0], 2)) ** 2))
+    expected = {
+        f"T1_{i}_{axis}": ("T1", "force", pytest.approx(0.1 * load, rel=1e-6)) for i in (0, 1) for axis in "xyz"
+    }
+    for axis in "xyz":
+        expected[f"hand.{axis}"] = ("hand", "offset", 2e-3)
+        # the segment weighs 0.1 kg
+        expected[f"T1.push_{axis}"] = ("T1", "push", pytest.approx(0.1 * 0.1 * 9.81))
+        expected[f"points_arm.w_T1.{axis}"] = ("hand", "bias", pytest.approx(3 * 0.01))
+    assert found == expected

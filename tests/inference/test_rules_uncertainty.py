@@ -11,7 +11,7 @@ import pytest
 import scipy.stats
 from made_problems import MadeUp, linear
 from made_series import samples, series
-from small_problems import PENDULUM, pendulum_step, taken
+from small_problems import PENDULUM, H, pendulum_step, taken
 
 from yid_ocp.inference import uncertainty
 from yid_ocp.inference.null_test import (
@@ -39,6 +39,7 @@ from yid_ocp.inference.uncertainty import (
     with_profile_interval,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem.signal_filters import two_pass_effort_filter
 
 GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)
 
@@ -238,12 +239,14 @@ def saturating(top):
 
 @pytest.mark.parametrize(("top", "kept"), [(1e6, True), (20.0, True), (0.5, False)])
 def test_a_standard_deviation_that_the_cost_does_not_bear_out_grows(top, kept):
-    problem = MadeUp(saturating(top), lower=-np.inf, scales=(1.0,))
+    problem = MadeUp(saturating(top), lower=-np.inf, scales=(1.0,), priors={"k0": 100.0})
     x = np.zeros(1)
     found = problem.evaluate(x)
     std = _cost_checked_std(problem, x, found, unknowns_covariance_and_reduced_chi2(problem, found)[0])[0]
     # at 1.96 standard deviations the cost is that of a saturated prediction: 0.5^2 in place of 3.84
     assert std == pytest.approx(1.0 if kept else 1.96 / 0.5, rel=0.01)
+    said = [estimated(problem, x, [[1.0]], fit)["k0"].std for fit in (GOOD, None)]
+    assert said == [pytest.approx(std), 1.0]
 
 
 def estimated(problem, x, covariance, fit=GOOD):
@@ -327,6 +330,33 @@ def test_of_many_parameters_and_of_well_known_ones_none_is_asked(count, std, ask
     assert (len(problem.asked) > before) is asked
 
 
+def test_numbers_of_a_result():
+    known = stiffness(2.0, 0.5, "weak")
+    for interval, ends in (
+        (None, (2 - 0.98, 2 + 0.98)),
+        ((1.0, None), (1.0, math.inf)),
+        ((None, 3.0), (-math.inf, 3.0)),
+    ):
+        assert replace(known, interval=interval).confidence_interval_ends == pytest.approx(ends)
+    matrix = np.array([[4.0, 1.0, 9.0, 1.0], [1.0, 1.0, 9.0, 1.0], [9.0, 9.0, -1.0, 1.0], [1.0, 1.0, 1.0, 1.0]])
+    found = uncertainty.covariance_to_dict(("a", "b", "c", "d"), matrix, (1.0, 3.0, 5.0, math.inf))
+    assert (found["names"], np.ravel(found["matrix"])) == (["a", "b"], pytest.approx([1.0, 1.5, 1.5, 9.0]))
+    lost, fixed = replace(known, verdict="not_identifiable"), replace(known, free=False, verdict="fixed")
+    marked = uncertainty.estimates_marked_not_trusted({"a": known, "b": lost, "c": fixed})
+    assert marked == {"a": replace(known, verdict="not_trusted"), "b": lost, "c": fixed}
+    assert [uncertainty.percent_text(x) for x in (0.1234, 0.994, 0.996, 12.345, 123.4)] == [
+        "12",
+        "99",
+        "100",
+        "1234",
+        "1.2e+04",
+    ]
+    assert [uncertainty.finite_or_none(x) for x in (2.0, math.inf, math.nan)] == [2.0, None, None]
+    problem = MadeUp(linear(COLUMN, [1.0, 2.0, 5.0, 7.0]), stated=1, weak=1, noise=0.1, weighting="paper")
+    cost = uncertainty.cost_without_weak_priors(problem, problem.evaluate([0.0]))
+    assert cost == pytest.approx(0.5 * (1 + 4) / 0.1**2 + 0.5 * 25)
+
+
 TOLD = [(0.1234, None, "22.12 ± 0.12"), (0.1234, (20.0, None), "22.12 (above 20)"), (0.0, None, "22.12 ± 0")]
 TOLD += [(0.1234, (None, 1.23456), "22.12 (below 1.235)"), (None, (20.0, 24.0), "22.12 (20 to 24)")]
 
@@ -374,6 +404,18 @@ def test_the_whole_residual_against_chi_squared(count, value, parameters, colour
     assert found.degrees_of_freedom == pytest.approx(degrees)
     assert found.chi2_per_dof == pytest.approx(ratio)
     assert found.p_value == pytest.approx(CHI2.sf(ratio * degrees, degrees), rel=1e-12)
+
+
+def test_smoothed_efforts_repeat_each_other_as_filtered_white_noise_does(urdf_folder):
+    step = pendulum_step(urdf_folder, prescribed=PENDULUM)
+    problem = EstimationProblem(step, [taken(step, 1, steps=90)], ("elbow.mass",), ProblemOptions(path_cutoff=15.0))
+    low_pass, own = two_pass_effort_filter(15.0), residual_channel_samples(problem)
+    found = next(entry.noise_autocorrelation for entry in own if "effort" in entry.group)
+    noise = low_pass(H * np.arange(200_000), np.random.default_rng(0).standard_normal((200_000, 1)))[:, 0]
+    lags = low_pass.decorrelation_stride(H) * np.arange(1, 4)
+    assert found[0] == 1.0
+    assert found[1:4] == pytest.approx([noise[:-lag] @ noise[lag:] / (noise @ noise) for lag in lags], abs=0.02)
+    assert np.abs(found[5:]).max() < 0.02 < abs(found[1])
 
 
 def test_several_series_add_and_rows_of_no_series_do_not_count():
