@@ -108,9 +108,8 @@ def test_each_run_is_tested_against_all_others_at_its_share_of_the_level():
     for i, entry in enumerate(found.parameter_drifts):
         chi2 = np.sum((values[:, i] - values[:, i].mean()) ** 2) / COVARIANCE[i, i]
         assert (entry.chi2, entry.p_value) == pytest.approx((chi2, scipy.stats.chi2.sf(chi2, 2)), rel=1e-6)
-        assert (entry.mean, entry.mean_std) == pytest.approx(
-            (values[:, i].mean(), np.sqrt(COVARIANCE[i, i] / 3 * max(1, chi2 / 2))), rel=1e-6
-        )
+        std = np.sqrt(COVARIANCE[i, i] / 3 * max(1, chi2 / 2))
+        assert (entry.mean, entry.mean_std) == pytest.approx((values[:, i].mean(), std), rel=1e-6)
         shares = [assess_drift_and_outlier_runs(runs, level=share * entry.p_value) for share in (1.9, 2.1)]
         assert [drifted(share).count(entry.name) for share in shares] == [0, 1]
     strange = assess_drift_and_outlier_runs([*runs, run("z", [1.0], [[1.0]], ("c",))]).run_outlier_tests[-1]

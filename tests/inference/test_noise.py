@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 from held_rod import held_rod
 from small_problems import PENDULUM, H, correlated, joints, pendulum_step, recording, seen, taken
 
-from yid_ocp.errors import ConfigError
 from yid_ocp.inference.smoother_model import recording_models_with_unknown_forces
 from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
@@ -18,7 +16,7 @@ from yid_ocp.inference.whitening import (
     torque_biases_and_stds_by_recording,
 )
 from yid_ocp.integrator.step import compile_step
-from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
+from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
@@ -148,20 +146,8 @@ def small_gap(problem, size=1.0):
     )
 
 
-@pytest.fixture
-def driven(urdf_folder):
-    """driven(steps): a pendulum whose shoulder is driven, and what is recorded of it."""
-    step = pendulum_step(urdf_folder, driven=("shoulder",))
-    return lambda steps=24: (step, taken(step, 3, steps=steps))
-
-
-def sprung(step, recording, **options):
-    return EstimationProblem(step, [recording], ("elbow.stiffness",), ProblemOptions(**TRACKED, **options))
-
-
-def test_without_errors_of_inputs_nothing_changes(urdf_folder, driven):
-    step, made = driven()
-    problem = sprung(step, replace(made, joints=replace(made.joints, effort_std=0.0)))
+def test_without_errors_of_inputs_nothing_changes(urdf_folder):
+    problem = problem_of(urdf_folder, encoders=False, size=0.0)
     assert not problem.has_process_noise
     assert problem_whitened_at(problem, problem.initial_unknowns) is problem
     paper = problem_of(urdf_folder, encoders=False, weighting="paper")
@@ -220,55 +206,6 @@ def test_jacobians_of_innovations_are_those_of_differences(urdf_folder):
     np.testing.assert_allclose(gradient, found.jacobian.T @ found.residual, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("arm", "use", "expected"), [(True, None, False), (False, None, True), (False, False, False), (False, True, True)]
-)
-def test_encoders_are_measurements_where_no_point_of_the_arm_is(driven, arm, use, expected):
-    step, made = driven()
-    group = replace(made.points[0], sensor="arm")
-    made = replace(made, points=(group, made.points[1]) if arm else made.points[1:])
-    problem = sprung(step, made, sensors={} if use is None else {"joints.position": SensorOptions(use=use)})
-    found = [s for s in problem.episodes[0].measurements if s.sensor.group_name == "joints.position"]
-    assert bool(found) == expected
-    assert problem.episodes[0].input_errors.has_encoder_measurements == expected
-    if expected:
-        # the first angle is where the rollout starts
-        assert found[0].node[0] == 1
-        np.testing.assert_allclose(found[0].std, 1e-3)
-
-
-def test_encoders_beside_points_of_the_arm_are_refused(driven):
-    step, made = driven()
-    made = replace(made, points=(replace(made.points[0], sensor="arm"),))
-    with pytest.raises(ConfigError, match=r"points_arm.*both") as caught:
-        sprung(step, made, sensors={"joints.position": SensorOptions(use=True)})
-    assert "sensors.points_arm.use: false" in caught.value.hint
-
-
-@pytest.mark.parametrize("said", [0.02, None])
-def test_noise_that_nobody_states_is_read_from_the_recording(driven, said, caplog):
-    step, made = driven(400)
-    rng = np.random.default_rng(1)
-    noisy = made.joints.effort + 0.02 * rng.standard_normal(made.joints.effort.shape)
-    with caplog.at_level("WARNING"):
-        problem = sprung(step, replace(made, joints=replace(made.joints, effort=noisy, effort_std=said)))
-    assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(0.02, rel=0.15)
-    assert ("neither recorded nor configured" in caplog.text) == (said is None)
-
-
-def test_torques_beside_encoders_are_never_exact_and_steps_average_their_samples(driven):
-    step, made = driven()
-    problem = sprung(step, replace(made, joints=replace(made.joints, effort_std=0.0), points=made.points[1:]))
-    assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(1e-3 * np.std(made.joints.effort))
-    step, made = driven(48)
-    group = replace(made.joints, t=1.0 + 0.5 * (made.joints.t - 1.0))
-    problem = sprung(step, replace(made, joints=group))
-    errors = problem.episodes[0].input_errors
-    assert errors.torque_std[0] == pytest.approx(0.3 * math.sqrt(0.5))
-    assert problem.episodes[0].grid.time_step == H
-    assert len(np.unique(errors.sample_of_step)) == problem.episodes[0].grid.steps
-
-
 def test_what_may_act_on_a_held_rod(urdf_folder):
     system = held_rod(urdf_folder, prescribed=PENDULUM, damping=0.05)
     t = H * np.arange(13)
@@ -285,7 +222,7 @@ def test_what_may_act_on_a_held_rod(urdf_folder):
     bent = evaluation.episode_predictions[0].rollout.state[:, 2 : system.n_coordinates]
     load = np.sqrt(np.mean((bent * np.tile([4.0, 4.0, 3.0], 2)) ** 2))
     expected = {
-        f"T1_{i}_{axis}": ("T1", "force", pytest.approx(0.1 * load, rel=1e-6)) for i in (0, 1) for axis in "xyz"
+        f"T1_{i}": ("T1", "force", pytest.approx(0.1 * load)) for i in ("0_x", "0_y", "0_z", "1_x", "1_y", "1_z")
     }
     for axis in "xyz":
         expected[f"hand.{axis}"] = ("hand", "offset", 2e-3)

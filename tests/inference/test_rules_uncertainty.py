@@ -39,7 +39,7 @@ from yid_ocp.inference.uncertainty import (
     with_profile_interval,
 )
 from yid_ocp.problem import EstimationProblem, ProblemOptions
-from yid_ocp.problem.signal_filters import two_pass_effort_filter
+from yid_ocp.problem.signal_filters import effort_filter_from_path_cutoff
 
 GOOD, BAD = GoodnessOfFit(1.0, 0.5, True), GoodnessOfFit(9.0, 0.0, False)
 
@@ -332,11 +332,7 @@ def test_of_many_parameters_and_of_well_known_ones_none_is_asked(count, std, ask
 
 def test_numbers_of_a_result():
     known = stiffness(2.0, 0.5, "weak")
-    for interval, ends in (
-        (None, (2 - 0.98, 2 + 0.98)),
-        ((1.0, None), (1.0, math.inf)),
-        ((None, 3.0), (-math.inf, 3.0)),
-    ):
+    for interval, ends in {None: (1.02, 2.98), (1.0, None): (1.0, math.inf), (None, 3.0): (-math.inf, 3.0)}.items():
         assert replace(known, interval=interval).confidence_interval_ends == pytest.approx(ends)
     matrix = np.array([[4.0, 1.0, 9.0, 1.0], [1.0, 1.0, 9.0, 1.0], [9.0, 9.0, -1.0, 1.0], [1.0, 1.0, 1.0, 1.0]])
     found = uncertainty.covariance_to_dict(("a", "b", "c", "d"), matrix, (1.0, 3.0, 5.0, math.inf))
@@ -344,13 +340,8 @@ def test_numbers_of_a_result():
     lost, fixed = replace(known, verdict="not_identifiable"), replace(known, free=False, verdict="fixed")
     marked = uncertainty.estimates_marked_not_trusted({"a": known, "b": lost, "c": fixed})
     assert marked == {"a": replace(known, verdict="not_trusted"), "b": lost, "c": fixed}
-    assert [uncertainty.percent_text(x) for x in (0.1234, 0.994, 0.996, 12.345, 123.4)] == [
-        "12",
-        "99",
-        "100",
-        "1234",
-        "1.2e+04",
-    ]
+    parts = {0.1234: "12", 0.994: "99", 0.996: "100", 12.34: "1234", 123.4: "1.2e+04"}
+    assert [uncertainty.percent_text(part) for part in parts] == list(parts.values())
     assert [uncertainty.finite_or_none(x) for x in (2.0, math.inf, math.nan)] == [2.0, None, None]
     problem = MadeUp(linear(COLUMN, [1.0, 2.0, 5.0, 7.0]), stated=1, weak=1, noise=0.1, weighting="paper")
     cost = uncertainty.cost_without_weak_priors(problem, problem.evaluate([0.0]))
@@ -409,7 +400,7 @@ def test_the_whole_residual_against_chi_squared(count, value, parameters, colour
 def test_smoothed_efforts_repeat_each_other_as_filtered_white_noise_does(urdf_folder):
     step = pendulum_step(urdf_folder, prescribed=PENDULUM)
     problem = EstimationProblem(step, [taken(step, 1, steps=90)], ("elbow.mass",), ProblemOptions(path_cutoff=15.0))
-    low_pass, own = two_pass_effort_filter(15.0), residual_channel_samples(problem)
+    low_pass, own = effort_filter_from_path_cutoff(15.0), residual_channel_samples(problem)
     found = next(entry.noise_autocorrelation for entry in own if "effort" in entry.group)
     noise = low_pass(H * np.arange(200_000), np.random.default_rng(0).standard_normal((200_000, 1)))[:, 0]
     lags = low_pass.decorrelation_stride(H) * np.arange(1, 4)

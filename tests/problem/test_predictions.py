@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_problems import pendulum_step, taken
+from small_problems import PENDULUM, H, pendulum_step, taken
 
 import yid_ocp as yid
 from yid_ocp.data.recording import PointGroup, Recording
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.problem import EstimationProblem, ProblemOptions
+from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
 from yid_ocp.problem.predictions import (
     constant_position_baseline,
     interpolated_displacement_baseline,
@@ -56,6 +57,26 @@ def test_its_own_values_without_any_and_noise_by_its_seed(problem):
     assert not np.array_equal(first.points[0].position, other.points[0].position, equal_nan=True)
     spread = np.nanstd(first.points[0].position - plain.points[0].position)
     assert spread == pytest.approx(float(np.nanmedian(samples.std)), rel=0.3)
+
+
+@pytest.mark.parametrize("how", [{"prescribed": PENDULUM}, {"driven": ("shoulder",), "prescribed": ("elbow",)}])
+def test_simulated_joints_are_as_noisy_as_was_stated(urdf_folder, how):
+    step = pendulum_step(urdf_folder, **how)
+    source = taken(step, 1)
+    source = replace(source, joints=replace(source.joints, effort_bias_std=0.5))
+    problem = EstimationProblem(step, [source], ("elbow.mass",), ProblemOptions(path_cutoff=np.inf))
+    plain, *many = (problem.simulate_recording(seed=seed).joints for seed in (None, *range(40)))
+    angle, effort = (np.array([getattr(one, name) for one in many]) for name in ("position", "effort"))
+    angle, effort = angle - plain.position, effort - plain.effort
+    np.testing.assert_allclose(np.std(angle, axis=(0, 1)), 1e-3, rtol=0.1)
+    constant = effort.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(np.std(effort - constant, axis=(0, 1)), 0.3, rtol=0.1)
+    # of what drives the motion one constant a recording
+    stated = np.array([0.5, 0.0] if "driven" in how else [0.0, 0.0])
+    np.testing.assert_allclose(np.std(constant, axis=(0, 1)), np.hypot(stated, 0.3 / 5), rtol=0.3)
+    levels = plain.position_std, plain.effort_std, 0.0 if plain.effort_bias_std is None else plain.effort_bias_std
+    np.testing.assert_allclose(np.array(np.broadcast_arrays(*levels, stated)[:3]), [[1e-3] * 2, [0.3] * 2, stated])
+    assert plain.effort_kind == ("command" if "driven" in how else "sample")
 
 
 def test_a_parameter_that_is_not_there_is_named(problem):
@@ -188,3 +209,64 @@ def test_what_cannot_be_predicted_is_said(recording, call, text):
     hidden = Recording(points=(PointGroup("points", NAMES, recording.points[0].t, seen),), name="hidden")
     with pytest.raises(DataError, match="'p2' is not seen"):
         constant_position_baseline(hidden, ("p2",))
+
+
+@pytest.fixture
+def driven(urdf_folder):
+    """driven(steps): a pendulum whose shoulder is driven, and what is recorded of it."""
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    return lambda steps=24: (step, taken(step, 3, steps=steps))
+
+
+def sprung(step, recording, **options):
+    made = ProblemOptions(feedback="proportional", proportional_gains=(9.0,), **options)
+    return EstimationProblem(step, [recording], ("elbow.stiffness",), made)
+
+
+@pytest.mark.parametrize(
+    ("arm", "use", "expected"), [(True, None, False), (False, None, True), (False, False, False), (False, True, True)]
+)
+def test_encoders_are_measurements_where_no_point_of_the_arm_is(driven, arm, use, expected):
+    step, made = driven()
+    group = replace(made.points[0], sensor="arm")
+    made = replace(made, points=(group, made.points[1]) if arm else made.points[1:])
+    problem = sprung(step, made, sensors={} if use is None else {"joints.position": SensorOptions(use=use)})
+    found = [s for s in problem.episodes[0].measurements if s.sensor.group_name == "joints.position"]
+    assert bool(found) == expected
+    assert problem.episodes[0].input_errors.has_encoder_measurements == expected
+    if expected:
+        # the first angle is where the rollout starts
+        assert found[0].node[0] == 1
+        np.testing.assert_allclose(found[0].std, 1e-3)
+
+
+def test_encoders_beside_points_of_the_arm_are_refused(driven):
+    step, made = driven()
+    made = replace(made, points=(replace(made.points[0], sensor="arm"),))
+    with pytest.raises(ConfigError, match=r"points_arm.*both") as caught:
+        sprung(step, made, sensors={"joints.position": SensorOptions(use=True)})
+    assert "sensors.points_arm.use: false" in caught.value.hint
+
+
+@pytest.mark.parametrize("said", [0.02, None])
+def test_noise_that_nobody_states_is_read_from_the_recording(driven, said, caplog):
+    step, made = driven(400)
+    rng = np.random.default_rng(1)
+    noisy = made.joints.effort + 0.02 * rng.standard_normal(made.joints.effort.shape)
+    with caplog.at_level("WARNING"):
+        problem = sprung(step, replace(made, joints=replace(made.joints, effort=noisy, effort_std=said)))
+    assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(0.02, rel=0.15)
+    assert ("neither recorded nor configured" in caplog.text) == (said is None)
+
+
+def test_torques_beside_encoders_are_never_exact_and_steps_average_their_samples(driven):
+    step, made = driven()
+    problem = sprung(step, replace(made, joints=replace(made.joints, effort_std=0.0), points=made.points[1:]))
+    assert problem.episodes[0].input_errors.torque_std[0] == pytest.approx(1e-3 * np.std(made.joints.effort))
+    step, made = driven(48)
+    group = replace(made.joints, t=1.0 + 0.5 * (made.joints.t - 1.0))
+    problem = sprung(step, replace(made, joints=group))
+    errors = problem.episodes[0].input_errors
+    assert errors.torque_std[0] == pytest.approx(0.3 * math.sqrt(0.5))
+    assert problem.episodes[0].grid.time_step == H
+    assert len(np.unique(errors.sample_of_step)) == problem.episodes[0].grid.steps
