@@ -1,7 +1,5 @@
 """Signals end a run: at once, where they were swallowed, and where a call does not come back."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The mutation run: named breaks fit the sources, and mutants are drawn where something depends on them."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A part of `benchmarks/nonsense.py`: wrong recordings are named with their cause, shipped ones are not in doubt."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import pytest

@@ -1,7 +1,5 @@
 """Objects in a line and in a notebook's cell."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Made-up recordings on a grid, and a pendulum that holds a rod."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

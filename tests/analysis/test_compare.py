@@ -1,7 +1,5 @@
 """Several methods on one problem: cost in time, agreement, and what is said of parameters that nothing informs."""
 
-from __future__ import annotations
-
 import json
 import math
 import time

@@ -1,7 +1,5 @@
 """Which rows a parameter enters and what sensors see of them: known cases, and rollouts with the parameter changed."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """How far estimates move with a finer model, rule by rule, on formulas and on chains."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Experiments that were not made: what could see, what it would tell, how robots would move."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

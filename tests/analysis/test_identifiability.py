@@ -1,7 +1,5 @@
 """What recordings say about parameters: formulas whose information is known, springs, the paper's experiments."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

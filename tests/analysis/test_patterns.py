@@ -1,7 +1,5 @@
 """Patterns: what can differ from zero holds all that does, of matrices, of steps, and of the NLP as it is solved."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What a user gets wrong: exit code 2, a message that says what, where, what is allowed, what to do; nothing left."""
 
-from __future__ import annotations
-
 from operator import delitem, setitem
 
 import h5py

@@ -1,7 +1,5 @@
 """Every command on a small run: exit code, table for people, what stands in the run folder; completion by a shell."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

@@ -1,7 +1,5 @@
 """Every file in configs/ runs, on a shortened horizon and with coarse objects so that this stays quick."""
 
-from __future__ import annotations
-
 import pytest
 
 from yid_ocp.config.reader import load_config

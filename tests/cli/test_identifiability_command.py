@@ -1,7 +1,5 @@
 """The command `identifiability`: table, run folder, report, bad requests, tasks on workers."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

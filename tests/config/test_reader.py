@@ -1,7 +1,5 @@
 """Reading: defaults, numbers, paths, settings over the file, and what is refused with which words."""
 
-from __future__ import annotations
-
 import dataclasses
 import io
 import math

@@ -1,7 +1,5 @@
 """The settings: JSON Schema, page and examples; what they are without a file, and what is written back."""
 
-from __future__ import annotations
-
 import dataclasses
 import runpy
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What differs from an earlier run, on a small beam that carries a load on the second day."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

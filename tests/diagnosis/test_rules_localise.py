@@ -1,7 +1,5 @@
 """Where a gap lies and when: rule by rule."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The blind proof, rule by rule: how answers are given, marked and scored."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

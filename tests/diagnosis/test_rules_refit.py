@@ -1,7 +1,5 @@
 """Refits: when one is tried again, how sure its values are, and how badly held-out recordings are predicted."""
 
-from __future__ import annotations
-
 import importlib
 import math
 from types import SimpleNamespace

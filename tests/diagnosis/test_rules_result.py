@@ -1,7 +1,5 @@
 """A diagnosis as `yid-diagnosis/2`: rule by rule."""
 
-from __future__ import annotations
-
 import math
 from typing import get_args
 

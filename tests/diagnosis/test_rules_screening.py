@@ -1,7 +1,5 @@
 """Screening, rule by rule: what could be seen, how sure a score is, what stands in for what."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Is there a gap, is it chance, what is the verdict: rule by rule."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

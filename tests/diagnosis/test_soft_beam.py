@@ -4,8 +4,6 @@ Minutes long: `python -m pytest -m slow tests/diagnosis/test_soft_beam.py`. Othe
 be named in the environment, with their masses, as `YID_OCP_LOADS=FILE:KG,FILE:KG`.
 """
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """The steps of a diagnosis, each on its own."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

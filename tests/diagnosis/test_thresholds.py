@@ -1,7 +1,5 @@
 """A threshold that is changed changes what it stands for."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 
 import pytest

@@ -1,7 +1,5 @@
 """One case of each verdict, the format of what comes out, and input that is refused."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

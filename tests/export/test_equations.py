@@ -1,7 +1,5 @@
 """Exported equations: files of functions have the step's values; the LaTeX sheet is sound, complete, and in numbers."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Innovations against dense algebra: the covariance of all residuals from rollouts whose inputs are wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

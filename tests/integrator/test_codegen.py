@@ -1,7 +1,5 @@
 """Generated code: the order of elimination, and batches, whose members give what they give one by one."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import shutil

@@ -1,7 +1,5 @@
 """Compiled code: no memory, derivatives that do not fit, and threads that share one step."""
 
-from __future__ import annotations
-
 import ctypes
 import threading
 import time

@@ -1,7 +1,5 @@
 """Compiled code: the private cache, its keys, the compiler's absence, functions at many points at once."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import os

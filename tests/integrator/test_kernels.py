@@ -1,7 +1,5 @@
 """Derivatives of steps and rollouts: forward, adjoint, finite differences; interpreter and compiled code."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The tracking filter: optimal gains, a reference that a true motion follows, what effects do to its momentum."""
 
-from __future__ import annotations
-
 import casadi as ca
 import numpy as np
 import pytest

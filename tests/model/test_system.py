@@ -1,7 +1,5 @@
 """Systems: sizes, parameters, energies, grasps, effects, clamps, and what is refused."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A pendulum whose shoulder is moved and whose elbow is a spring, within limits."""
 
-from __future__ import annotations
-
 import pytest
 from small_problems import pendulum_step
 

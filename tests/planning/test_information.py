@@ -1,7 +1,5 @@
 """Motions that tell more: what they would tell, the criteria and their derivatives, known optima, what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Joint paths: rest at both ends, derivatives, and limits that hold between nodes as well."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Plans of a small system: derivatives, goals, limits, uncertainty, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

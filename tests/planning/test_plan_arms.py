@@ -1,7 +1,5 @@
 """Plans of the shipped configurations, coarsened: one arm and two that hold the Y, two that hold a cable, clamps."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command `plan`: files that others read, parameters and effects of earlier runs, exit codes; and `information`."""
 
-from __future__ import annotations
-
 import html
 import json
 

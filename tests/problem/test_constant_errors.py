@@ -1,7 +1,5 @@
 """Errors of measured efforts that are constant over a recording are noise of all its samples together."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the sensors would have recorded, channels measured beside predicted, and baselines without a model."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What a problem says depends on the question alone: not on what was asked before, and not on who asks beside."""
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import hypothesis.strategies as st

@@ -1,7 +1,5 @@
 """From a recording to what drives the model: torques, loads, paths, clamps, filters; rule by rule."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

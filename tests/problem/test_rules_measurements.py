@@ -1,7 +1,5 @@
 """Samples beside their prediction: weights, losses, nodes in time, lateness; rule by rule."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

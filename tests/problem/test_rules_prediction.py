@@ -1,7 +1,5 @@
 """Predictions and their derivatives: forward, adjoint and differences agree, whatever is driven, late or misread."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

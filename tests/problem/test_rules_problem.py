@@ -1,7 +1,5 @@
 """The estimation problem, rule by rule: unknowns, priors, scales, starts, what is refused."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Starts fitted to the first measured points, or at rest in the shape that these show; errors of predictions."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

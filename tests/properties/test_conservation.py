@@ -1,7 +1,5 @@
 """What a variational step keeps when no force acts, and its order: two for the symmetric force split, one for left."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import casadi as ca

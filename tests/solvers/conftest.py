@@ -1,7 +1,5 @@
 """Virtual experiments from another engine, shared by the tests of solvers."""
 
-from __future__ import annotations
-
 import pytest
 
 from yid_ocp.data import read_recording

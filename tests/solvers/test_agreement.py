@@ -1,7 +1,5 @@
 """All methods reach the same optimum of the same problem, near the truth of the other engine."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

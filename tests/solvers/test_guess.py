@@ -1,7 +1,5 @@
 """Where methods with node states begin, and derivatives of whole problems: adjoint = forward = finite differences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What all solvers share, rule by rule: restarts, horizons, gradients, histories."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """An estimation problem as a program of CasADi: the numbers of the rollout and of the kernel's transcription."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

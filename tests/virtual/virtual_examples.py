@@ -1,7 +1,5 @@
 """Systems and values that the tests of this folder share."""
 
-from __future__ import annotations
-
 import pytest
 
 from yid_ocp.virtual.experiment import baxter_foam_y_system

@@ -1,7 +1,5 @@
 """Virtual frames of one arm moving the foam Y, its joints' recording, its tracks, and a few frames from disk."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Frames in bags of ROS 1 and ROS 2, MCAP and RealSense files, which the tests write themselves."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from ros_bags import START, Bag

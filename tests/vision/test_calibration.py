@@ -1,7 +1,5 @@
 """The camera's pose, depth and clock from an arm of three joints that it sees, with what was true known."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

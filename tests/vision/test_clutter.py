@@ -1,7 +1,5 @@
 """Things about smooth rods: they are set apart, named, and left out where they are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from smooth_rods import COARSE, EYE, TARGET, SmoothY, box, filmed, floor_and_wall, measured, pole, seen

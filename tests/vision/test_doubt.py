@@ -1,7 +1,5 @@
 """Lengths and radii against clouds of smooth rods."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

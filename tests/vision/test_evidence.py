@@ -1,7 +1,5 @@
 """One straight tube before a camera, its points made by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Ropes and branched objects without a robot: smooth curves, not the model's own links, seen from one side."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

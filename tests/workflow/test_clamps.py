@@ -1,7 +1,5 @@
 """Objects held by clamps or the world, frames and markers."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Estimates with finer links and shorter steps."""
 
-from __future__ import annotations
-
 import pytest
 from made_cross import TRUTH, configuration, record
 

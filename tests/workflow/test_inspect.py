@@ -1,7 +1,5 @@
 """Where the command `inspect` looks."""
 
-from __future__ import annotations
-
 import math
 
 import h5py

@@ -1,7 +1,5 @@
 """Trajectories, held-out errors beside guesses, and torque offsets as they are written."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

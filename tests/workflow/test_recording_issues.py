@@ -1,7 +1,5 @@
 """What is in doubt about recordings, and what it does to a run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
