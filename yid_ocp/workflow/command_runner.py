@@ -220,7 +220,7 @@ class _BarProgress(Progress):
     def report_iterate(self, entry: Iterate) -> None:
         self._left.count_iterate()
         if self._task is not None:
-            self._bars.update(self._task, description=f"{self._text}: {_format_iterate(entry)}")
+            self._bars.update(self._task, description=f"{_format_iterate(entry)} ({self._text})")
             if self._is_verbose:
                 self._bars.console.print(f"  {_format_iterate(entry)}", markup=False, highlight=False)
 
