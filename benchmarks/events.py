@@ -21,7 +21,7 @@ from typing import Any
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.diagnosis import DiagnosisResult, diagnose
-from yid_ocp.diagnosis.events import DisturbanceEvent
+from yid_ocp.diagnosis.events import ForceOrFaultEvent
 from yid_ocp.workflow.build_problem import build_problem
 
 ROOT = Path(__file__).parents[1]
@@ -71,14 +71,14 @@ class Score:
         return said + ([f"{self.false_calm} false events in calm runs"] if self.false_calm > BARS["calm"] else [])
 
 
-def matches(event: DisturbanceEvent, label: Mapping[str, Any]) -> bool:
+def matches(event: ForceOrFaultEvent, label: Mapping[str, Any]) -> bool:
     """Same joint and sign, windows that overlap."""
     overlap = event.start_time < label["t_to"] and label["t_from"] < event.end_time
     return event.channel == label["joint"] and overlap and event.peak_value * label["peak"] > 0
 
 
 def scored(
-    events: Sequence[DisturbanceEvent],
+    events: Sequence[ForceOrFaultEvent],
     falls: Mapping[str, float],
     labels: Mapping[str, Sequence[Mapping[str, Any]]],
     apart: tuple[str, float, float] | None = None,
@@ -103,7 +103,7 @@ def scored(
     return Score(total, len(found), false, calm, aside, median(errors) if errors else float("nan"))
 
 
-def _inside(event: DisturbanceEvent, joint: str, begin: float, end: float) -> bool:
+def _inside(event: ForceOrFaultEvent, joint: str, begin: float, end: float) -> bool:
     return event.channel == joint and begin < event.start_time and event.end_time < end and event.peak_value > 0
 
 

@@ -9,16 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 
 from yid_ocp.data.recording import Recording
-from yid_ocp.inference.null_test import ResidualChannelSamples
+from yid_ocp.inference.null_test import ResidualChannelIndices
 
 WHITE = (1.0,)
 
 
-def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> ResidualChannelSamples:
+def series(rows, t=None, recording="run", channel="points.tip", colour=WHITE, period=0.01) -> ResidualChannelIndices:
     """One output of one recording; times at even intervals unless given."""
     rows = np.asarray(rows)
     t = period * np.arange(len(rows)) if t is None else np.asarray(t, float)
-    return ResidualChannelSamples(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
+    return ResidualChannelIndices(recording, channel, "points", "m", t, rows, np.asarray(colour, float))
 
 
 def without(recording: Recording, begin: float, end: float) -> Recording:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from yid_ocp.diagnosis.events import DisturbanceEvent
+from yid_ocp.diagnosis.events import ForceOrFaultEvent
 from yid_ocp.parallel import WorkerConfig
 
 # -- run.py: ratios within one run ------------------------------------------------------------------------------------
@@ -131,8 +131,8 @@ def events(benchmark_module):
     return benchmark_module("events")
 
 
-def event(begin: float, peak: float, joint: str = "elbow", recording: str = "run_pushed_01") -> DisturbanceEvent:
-    return DisturbanceEvent(recording, joint, joint, "force", begin, begin + 0.5, peak, 0.25 * peak, 0.01, "N m")
+def event(begin: float, peak: float, joint: str = "elbow", recording: str = "run_pushed_01") -> ForceOrFaultEvent:
+    return ForceOrFaultEvent(recording, joint, joint, "force", begin, begin + 0.5, peak, 0.25 * peak, 0.01, "N m")
 
 
 LABEL = {"joint": "elbow", "t_from": 1.0, "t_to": 1.5, "peak": 0.6, "impulse": 0.12}

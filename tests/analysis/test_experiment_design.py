@@ -16,8 +16,8 @@ from yid_ocp.analysis import torque_error_propagation as propagation
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    CandidateExperiment,
     CandidateExperimentBuilder,
+    CandidateExperimentSensitivities,
     FrameObservationSchedule,
     RecordedExperiment,
     add_observable_frames_to_step,
@@ -100,7 +100,7 @@ def sloped():
     rng = np.random.default_rng(3)
     slopes = {(i, "camera", frame): rng.standard_normal((5, 3, 2)) for i in range(3) for frame in ("a", "b")}
     problem = SimpleNamespace(episodes=[SimpleNamespace(grid=TimeGrid(10.0, 0.5, 4))] * 3)
-    return CandidateExperiment(problem, np.zeros(2), ("p", "q"), slopes, np.diag([7.0, 0.0]))
+    return CandidateExperimentSensitivities(problem, np.zeros(2), ("p", "q"), slopes, np.diag([7.0, 0.0]))
 
 
 def view(times, std, frame="a"):
@@ -188,7 +188,7 @@ def test_changes_of_mechanics_that_make_sense(settings, possible):
     base = RecordedExperiment(
         SimpleNamespace(system=system, episodes=(episode,)), np.zeros(1), two_arm_system=made.get("second")
     )
-    assert CandidateExperimentBuilder(base).applicable_experiment_changes() == possible.split()
+    assert CandidateExperimentBuilder(base).applicable_mechanical_changes() == possible.split()
 
 
 @pytest.fixture(scope="module")

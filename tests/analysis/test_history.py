@@ -19,7 +19,7 @@ from yid_ocp.analysis.estimate_history import (
 )
 from yid_ocp.analysis.friction_ladder import (
     FrictionLawFit,
-    fit_friction_law,
+    cross_validate_friction_law,
     friction_torque_clouds,
     left_out_error_mean_and_std_error,
     recording_names_by_name_stem,
@@ -193,7 +193,7 @@ def test_kinds_go_by_name_and_a_true_law_predicts_to_its_noise_and_shows_in_the_
     assert recording_names_by_name_stem(dry) == {"slow": ("slow_1", "slow_2"), "fast": ("fast_1",), "turn": ("turn_1",)}
     driven = dry.with_episodes(dry.episodes[:-1], ())
     solution = solve(driven, GaussNewton(), restarts=False)
-    fit = fit_friction_law("coulomb", driven, solution, recording_names_by_name_stem(driven))
+    fit = cross_validate_friction_law("coulomb", driven, solution, recording_names_by_name_stem(driven))
     assert set(fit.left_out_errors) == {"slow_1", "slow_2", "fast_1", "turn_1"}
     assert all(error < 1.3e-3 for error in fit.left_out_errors.values())
     assert fit.parameters["joint_coulomb@shoulder.tau_c"].value == pytest.approx(1.2, abs=0.05)

@@ -11,7 +11,7 @@ from heard import Heard
 
 from yid_ocp.analysis import experiment_design
 from yid_ocp.analysis.experiment_design import (
-    EXPERIMENT_CHANGE_NAMES,
+    MECHANICAL_CHANGE_DESCRIPTIONS,
     CandidateExperimentBuilder,
     RecordedExperiment,
 )
@@ -108,7 +108,7 @@ def test_changes_that_apply(short_run, held_tube):
     for found in names.values():
         for name, change in found.items():
             kind, _, what = name.partition(":")
-            assert change.mechanical_change == (name if name in EXPERIMENT_CHANGE_NAMES else "")
+            assert change.mechanical_change == (name if name in MECHANICAL_CHANGE_DESCRIPTIONS else "")
             assert change.camera_frame == (what if kind == "camera" else "")
             assert change.arm_frame == (what if kind == "arm" else "")
             assert change.camera_rate == (float(what) if kind == "rate" else None)

@@ -11,10 +11,10 @@ import pytest
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import diagnose
 from yid_ocp.diagnosis.events import (
-    DisturbanceEvent,
     EventSet,
+    ForceOrFaultEvent,
     _Overspeed,
-    find_disturbance_events,
+    find_force_and_fault_events,
     problem_corrected_for_events,
 )
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse
@@ -99,7 +99,7 @@ class Twin:
     def events(self, *recordings: Recording) -> EventSet:
         problem = self.problem(*recordings)
         x = solve(problem, GaussNewton()).x
-        return find_disturbance_events(problem, x, problem.evaluate(x), None)
+        return find_force_and_fault_events(problem, x, problem.evaluate(x), None)
 
 
 @pytest.fixture(scope="module")
@@ -175,10 +175,10 @@ def test_a_gap_that_lives_in_events_alone_is_none_and_the_words_tell_of_them(ben
 def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_everywhere(bench, monkeypatch):
     pulse = DetectedForcePulse(1.0, 1.2, -0.1, False, 0.01, 1e-9)
     size = (-0.1, -0.01, 0.001)
-    claimed = DisturbanceEvent("run_1", "elbow", "elbow", "force", 1.0, 1.2, *size, "N m", pulse)
-    odd = DisturbanceEvent("run_1", "elbow", "points_arm.tip.x", "sample", 2.0, 2.01, *size, "m")
+    claimed = ForceOrFaultEvent("run_1", "elbow", "elbow", "force", 1.0, 1.2, *size, "N m", pulse)
+    odd = ForceOrFaultEvent("run_1", "elbow", "points_arm.tip.x", "sample", 2.0, 2.01, *size, "m")
     events = EventSet((claimed, odd))
-    monkeypatch.setattr(sys.modules["yid_ocp.diagnosis.diagnose"], "find_disturbance_events", lambda *_: events)
+    monkeypatch.setattr(sys.modules["yid_ocp.diagnosis.diagnose"], "find_force_and_fault_events", lambda *_: events)
     rubbing = [bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, seed) for seed in (1, 2)]
     for share, expected in ((0.1, (odd,)), (0.0, (claimed, odd))):
         limits = Thresholds(min_event_chi2_fraction=share)
@@ -189,7 +189,7 @@ def test_pushes_that_take_little_of_the_gap_with_them_are_a_model_that_errs_ever
 
 def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
     problem = twin.problem(pushed)
-    event = DisturbanceEvent("run_0", "elbow", "elbow", "force", 3.0, 3.4, -0.8, -0.16, 0.01, "N m")
+    event = ForceOrFaultEvent("run_0", "elbow", "elbow", "force", 3.0, 3.4, -0.8, -0.16, 0.01, "N m")
     cleaned = problem_corrected_for_events(problem, EventSet((event,)))
     (before,), (after,) = problem.episodes[0].measurements, cleaned.episodes[0].measurements
     t = times_since_recording_start(problem.episodes[0], before)
@@ -204,7 +204,7 @@ def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
 def test_after_a_fall_nothing_counts(twin, pushed):
     problem = twin.problem(pushed)
     x = solve(problem, GaussNewton()).x
-    events = find_disturbance_events(problem, x, problem.evaluate(x), None, Thresholds(max_joint_speed=1.0))
+    events = find_force_and_fault_events(problem, x, problem.evaluate(x), None, Thresholds(max_joint_speed=1.0))
     (fall,) = events.overspeeds
     assert (fall.recording, fall.joint in JOINTS) == ("run_0", True)
     assert all(event.end_time < fall.start_time for event in events.disturbances)

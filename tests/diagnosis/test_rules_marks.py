@@ -10,7 +10,7 @@ from factories import amplitude, cases, effect, fit, loss
 
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.blind import BlindCase, CaseGroundTruth, open_sealed_labels, sealed_labels_and_hash
-from yid_ocp.diagnosis.blind_scores import ensemble_success_rates, score_blind_case
+from yid_ocp.diagnosis.blind_scores import detection_and_false_alarm_rates, score_blind_case
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import DataError
 from yid_ocp.virtual.injected import InjectedEffect
@@ -147,7 +147,7 @@ def marked(category, **changed):
 
 
 def test_rates_are_over_the_cases_that_they_speak_of():
-    found = ensemble_success_rates(
+    found = detection_and_false_alarm_rates(
         [
             marked("null", gap=True),
             marked("null", gap=False),
@@ -183,7 +183,7 @@ def test_rates_are_over_the_cases_that_they_speak_of():
     assert {name: found[name] for name in rates} == pytest.approx(rates), (
         "an effect that is named alone is a set of one"
     )
-    none = ensemble_success_rates([])
+    none = detection_and_false_alarm_rates([])
     assert (none["cases"], {none[name] for name in rates}) == (0, {None})
     assert all(entry["rate"] is None for entry in none["intervals"].values())
     assert none["confusion"]["counts"] == []

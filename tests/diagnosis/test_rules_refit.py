@@ -123,7 +123,7 @@ def test_held_out_recordings_are_seen_about_the_torques_where_the_best_of_all_ru
 
 @pytest.mark.parametrize(("apart", "runs"), [(0.9, 1), (1.0, 2)])
 def test_an_effect_that_takes_much_of_an_offset_is_fitted_once_more(solved, monkeypatch, apart, runs):
-    monkeypatch.setattr(module, "max_normalized_torque_bias_difference", lambda before, after: apart)
+    monkeypatch.setattr(module, "max_torque_bias_change_between_filters", lambda before, after: apart)
     monkeypatch.setattr(module, "_relinearizing", lambda problem: problem.evaluate)
     refit_with_effects(Problem(lambda values: 1.0), [FRICTION], {"k": 2.0, A: 3.0})
     assert len(solved.runs) == runs

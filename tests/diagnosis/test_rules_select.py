@@ -49,7 +49,7 @@ LIMITS = Thresholds()
 def test_a_loss_is_a_mean_over_samples_and_a_gap_what_exceeds_one(squares, counts, mean, gap):
     found = HeldOutLoss(np.array(squares), np.array(counts), {})
     assert found.chi2_per_sample == pytest.approx(mean)
-    assert found.excess_chi2 == pytest.approx(gap)
+    assert found.excess_chi2_per_sample == pytest.approx(gap)
 
 
 @cases(

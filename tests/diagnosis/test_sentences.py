@@ -38,7 +38,7 @@ from yid_ocp.diagnosis.diagnosis_result import (
     insufficient_data_message,
     recommended_experiment_text,
 )
-from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, _Overspeed
+from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.thresholds import Thresholds
 
@@ -166,8 +166,8 @@ def said() -> dict[str, str]:
     for seen in (True, False):
         text = insufficient_data_message("insufficient_data", before, 5, [visible(FRICTION, seen)], limits)
         found[f"insufficient data: detectable {seen}"] = text
-    force = DisturbanceEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
-    odd = DisturbanceEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
+    force = ForceOrFaultEvent("run", "elbow", "elbow", "force", 1.0, 1.5, 0.5, 0.12, 0.01, "N m")
+    odd = ForceOrFaultEvent("run", "camera", "points.w_T1.x", "sample", 2.0, 2.01, 0.05, 5e-4, 1e-5, "m")
     for events in ((force,), (force, odd), (force,) * 10):
         found[f"events: {len(events)}"] = _event_sentences(EventSet(events, (_Overspeed("run_0", "elbow", 3.0),)))
     return found

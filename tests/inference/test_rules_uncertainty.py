@@ -18,7 +18,7 @@ from yid_ocp.inference.null_test import (
     ExcessResidualCriteria,
     NullTestResult,
     assumed_channel_noise_levels,
-    residual_channel_samples,
+    residual_channel_indices,
     residuals_exceed_noise,
     run_null_test,
     whiten_with_extra_errors,
@@ -216,7 +216,7 @@ def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(ur
     options = ProblemOptions(path_cutoff=np.inf, weak_prior_factor=0.0)
     recordings = [taken(step, seed, camera=False, steps=200) for seed in range(3)]
     problem = EstimationProblem(step, recordings, ("elbow.mass",), options)
-    found, series = problem.evaluate(problem.initial_unknowns), residual_channel_samples(problem)
+    found, series = problem.evaluate(problem.initial_unknowns), residual_channel_indices(problem)
     offset = np.random.default_rng(2).choice([-3.0, 3.0], len(series))
     moved = np.zeros(len(found.residual))
     for own, size in zip(series, offset, strict=True):

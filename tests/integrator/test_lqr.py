@@ -9,8 +9,8 @@ from yid_ocp.effects import make_effect
 from yid_ocp.errors import ModelError
 from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.integrator.tracking_feedback import (
-    DifferentiatedJointMotion,
     EffectMomentumShift,
+    JointMotionWithSensitivities,
     lqr_feedback,
     proportional_feedback,
 )
@@ -149,8 +149,8 @@ def test_reference_and_shift_are_the_momentum_of_the_true_motion(plain, names, m
     shift = EffectMomentumShift(step)
     read = torque + misread
     loop = lqr_feedback(step, state[:, ANGLES], read, shift.theta_without_effects(theta))
-    recorded, true = (DifferentiatedJointMotion(state[:, ANGLES], x, internal) for x in (read, torque))
-    value, _ = shift.momentum_shift_and_derivatives(recorded, true, theta, ())
+    recorded, true = (JointMotionWithSensitivities(state[:, ANGLES], x, internal) for x in (read, torque))
+    value, _ = shift.node_momentum_shifts_and_derivatives(recorded, true, theta, ())
     np.testing.assert_allclose(loop.reference[1:, MOMENTA] + value[1:], state[1:-1, MOMENTA], atol=1e-9)
     if names or misread:
         assert np.max(np.abs(value)) > 1e-3
@@ -164,9 +164,9 @@ def test_the_shift_of_a_torque_that_was_misread(plain):
     shift = EffectMomentumShift(step)
     assert shift.parameter_names == ()
     by_torque = np.stack([torque, 0 * torque], axis=2)
-    recorded = DifferentiatedJointMotion(state[:, ANGLES], torque, none)
-    true = DifferentiatedJointMotion(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
-    value, slope = shift.momentum_shift_and_derivatives(recorded, true, theta, ("gain", "other"))
+    recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, none)
+    true = JointMotionWithSensitivities(state[:, ANGLES], 1.5 * torque, none, torque_sensitivity=by_torque)
+    value, slope = shift.node_momentum_shifts_and_derivatives(recorded, true, theta, ("gain", "other"))
     np.testing.assert_allclose(value[1:], 0.5 * TIME_STEP / 2 * torque[:-1], atol=1e-12)
     np.testing.assert_allclose(slope[:, :, 0] * 0.5, value, atol=1e-12)
     np.testing.assert_array_equal(slope[:, :, 1], 0.0)
@@ -185,15 +185,15 @@ def test_derivatives_are_those_of_differences(plain, names):
     d, rng = len(wanted) + 2, np.random.default_rng(1)
     by_angles, by_torque = (0.01 * rng.normal(size=(*x.shape, d)) for x in (state[:, ANGLES], torque))
     by_internal = 0.1 * rng.normal(size=(len(internal), d))
-    recorded = DifferentiatedJointMotion(state[:, ANGLES], torque, internal)
+    recorded = JointMotionWithSensitivities(state[:, ANGLES], torque, internal)
 
     def at(move):
         """The shift after a move along each of d directions; parameters move by the first ones."""
         own = theta.copy()
         own[[step.system.parameters.index(name) for name in wanted]] += move[: len(wanted)]
         parts = (state[:, ANGLES] + by_angles @ move, torque + by_torque @ move, internal + by_internal @ move)
-        true = DifferentiatedJointMotion(*parts, by_angles, by_torque, by_internal)
-        return shift.momentum_shift_and_derivatives(recorded, true, own, wanted)
+        true = JointMotionWithSensitivities(*parts, by_angles, by_torque, by_internal)
+        return shift.node_momentum_shifts_and_derivatives(recorded, true, own, wanted)
 
     value, slopes = at(np.zeros(d))
     assert slopes.shape == (*value.shape, d)

@@ -20,7 +20,7 @@ import plotly.offline
 import pytest
 
 from yid_ocp.diagnosis import Thresholds, diagnose
-from yid_ocp.diagnosis.events import DisturbanceEvent, EventSet, _Overspeed
+from yid_ocp.diagnosis.events import EventSet, ForceOrFaultEvent, _Overspeed
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse, ForceEstimate
 from yid_ocp.errors import OutputError
 from yid_ocp.report import terminal
@@ -235,7 +235,7 @@ def test_a_result_alone_gives_words_and_tables(found, tmp_path):
 def test_events_are_marked_on_the_time_axis_told_and_listed(found, tmp_path):
     t = np.linspace(0, 2, 21)
     pulse = DetectedForcePulse(0.5, 1.0, 0.7, False, 0.05, 1e-9)
-    event = DisturbanceEvent("run", "elbow", "elbow", "force", 0.5, 1.0, 0.7, pulse.impulse, 0.0125, "N m", pulse)
+    event = ForceOrFaultEvent("run", "elbow", "elbow", "force", 0.5, 1.0, 0.7, pulse.impulse, 0.0125, "N m", pulse)
     events = EventSet(
         (event,),
         (_Overspeed("run", "elbow", 1.5),),

@@ -21,7 +21,7 @@ from yid_ocp.analysis.joint_checks import known_effect_config_line
 from yid_ocp.arrays import Array
 from yid_ocp.data.issues import MIN_DIFFERENCES_FOR_NOISE_STD, QUALITY_LIMITS, Issue, Severity, median_sample_period
 from yid_ocp.data.recording import JointGroup, PointGroup
-from yid_ocp.inference.null_test import residual_channel_samples
+from yid_ocp.inference.null_test import residual_channel_indices
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import EpisodePrediction
 from yid_ocp.problem.evaluation import Evaluation
@@ -220,7 +220,7 @@ def check_fit_for_drift_and_noise(problem: EstimationProblem, x: Array, evaluati
 def _drifts(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> Iterator[Issue]:
     assert evaluation.jacobian is not None
     times = np.zeros(len(evaluation.residual))
-    for series in residual_channel_samples(problem):
+    for series in residual_channel_indices(problem):
         times[series.residual_indices] = series.t
     size = np.ones(len(problem.initial_unknowns))
     for i, (episode, result) in enumerate(zip(problem.episodes, evaluation.episode_predictions, strict=True)):
@@ -267,7 +267,7 @@ def _overstated(problem: EstimationProblem, evaluation: Evaluation) -> Iterator[
     """Groups whose residuals, also summed over blocks of time as what lasts for long sums up, are far below noise."""
     by_group: dict[str, list[tuple[float, float, int]]] = {}
     units = {}
-    for series in residual_channel_samples(problem):
+    for series in residual_channel_indices(problem):
         r = evaluation.residual[series.residual_indices]
         if len(r) >= MIN_DIFFERENCES_FOR_NOISE_STD:
             sums = np.array([part.sum() / math.sqrt(len(part)) for part in np.array_split(r, _N_TIME_BLOCKS)])

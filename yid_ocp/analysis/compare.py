@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from yid_ocp.analysis.profile import solution_with_profile_intervals
-from yid_ocp.inference.linearized_residual import step_within_unknown_sizes
+from yid_ocp.inference.linearized_residual import solve_step_within_unknown_sizes
 from yid_ocp.inference.null_test import DEFAULT_EXCESS_RESIDUAL_CRITERIA, ExcessResidualCriteria
 from yid_ocp.inference.uncertainty import (
     MAX_IDENTIFIABLE_RELATIVE_STD,
@@ -281,7 +281,7 @@ def _left_out(problem: EstimationProblem, solution: Solution, moving: list[int])
     for i in moving:
         own = np.concatenate([np.arange(rows.start, rows.stop) for rows in problem.residual_rows.measurements[i]])
         kept = np.setdiff1d(np.arange(len(evaluation.residual)), own)
-        step = step_within_unknown_sizes(
+        step = solve_step_within_unknown_sizes(
             problem, solution.x, evaluation.jacobian[kept], evaluation.residual[kept], 1e-10
         )
         x = np.clip(solution.x + step, *problem.bounds)

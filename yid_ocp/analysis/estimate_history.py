@@ -84,8 +84,8 @@ class _RunOutlierTest:
 
 
 @dataclass(frozen=True)
-class EstimateHistory:
-    """Drift of parameters and consistency of several runs of one model; chi2 is of all differences together."""
+class DriftAndOutlierTests:
+    """Tests for drift of each parameter and for outlier runs of one model; chi2 is of all differences together."""
 
     run_names: tuple[str, ...]
     parameter_drifts: tuple[_ParameterDrift, ...]
@@ -135,7 +135,7 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
     return RunEstimates(label, names, mean * unit, covariance, units, explains, effects), chi2, degrees
 
 
-def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> EstimateHistory:
+def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> DriftAndOutlierTests:
     """Test which parameters drifted between runs, in the order of time, and which run is an outlier.
 
     Each parameter is tested by its marginal variances, each run by its whole covariance; the significance level is
@@ -146,7 +146,7 @@ def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0
     drifts = tuple(_drift(name, runs, level / len(mean.parameter_names)) for name in mean.parameter_names)
     against = tuple(_against(i, runs, level / len(runs)) for i in range(len(runs)))
     names, p = tuple(run.run_name for run in runs), chi2_p_value(chi2, degrees)
-    return EstimateHistory(names, drifts, against, chi2, degrees, p, level)
+    return DriftAndOutlierTests(names, drifts, against, chi2, degrees, p, level)
 
 
 def _drift(name: str, runs: Sequence[RunEstimates], level: float) -> _ParameterDrift:

@@ -174,8 +174,8 @@ def add_observable_frames_to_step(step: Step) -> tuple[Step, list[_ObservableFra
 
 
 @dataclass
-class CandidateExperiment:
-    """One variant of an experiment, with the sensitivities of all frames that could be measured.
+class CandidateExperimentSensitivities:
+    """Sensitivities of all frames that could be measured in one variant of an experiment.
 
     Sensitivities of a frame's position at every node, by (episode, group, frame), are by the unknowns, then by the q
     that stand for the errors of the torques that drive this episode (`point_sensitivities_and_joint_information`).
@@ -218,7 +218,7 @@ class CandidateExperiment:
         return self._known[key]
 
 
-EXPERIMENT_CHANGE_NAMES: Mapping[str, str] = {
+MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
     "weld": "weld grasps in place of points",
     "second_arm": "a second arm",
     "motion": "another motion",
@@ -233,13 +233,13 @@ class CandidateExperimentBuilder:
     def __init__(self, setting: RecordedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
         self._progress = progress
-        self._layouts: dict[frozenset[str], CandidateExperiment | str] = {}
+        self._layouts: dict[frozenset[str], CandidateExperimentSensitivities | str] = {}
 
-    def build_experiment(self, mechanics: frozenset[str]) -> CandidateExperiment | str:
-        """The experiment with a set of mechanical changes, or a message why it cannot be built."""
+    def build_experiment(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities | str:
+        """Sensitivities with a set of mechanical changes, or a message why the experiment cannot be built."""
         if mechanics not in self._layouts:
             if mechanics:
-                words = " and ".join(EXPERIMENT_CHANGE_NAMES[name] for name in sorted(mechanics))
+                words = " and ".join(MECHANICAL_CHANGE_DESCRIPTIONS[name] for name in sorted(mechanics))
                 self._progress.begin_stage(f"working out {words}")
             try:
                 self._layouts[mechanics] = self._build(mechanics)
@@ -247,7 +247,7 @@ class CandidateExperimentBuilder:
                 self._layouts[mechanics] = error.what
         return self._layouts[mechanics]
 
-    def applicable_experiment_changes(self) -> list[str]:
+    def applicable_mechanical_changes(self) -> list[str]:
         """Names of the mechanical changes that apply to the system."""
         setting, system, episodes = self.setting, self.setting.problem.system, self.setting.problem.episodes
         moves = bool(system.driven) and not system.servos
@@ -257,7 +257,7 @@ class CandidateExperimentBuilder:
         applies = {"weld": loose, "second_arm": second, "motion": moves, "travel": moves}
         return [name for name, does in (applies | {"torque": bool(robot) and not measured}).items() if does]
 
-    def _build(self, mechanics: frozenset[str]) -> CandidateExperiment:
+    def _build(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities:
         setting, base = self.setting, self.setting.problem
         system, recordings, notes = self._experiment(mechanics)
         if "torque" in mechanics:
@@ -289,7 +289,7 @@ class CandidateExperimentBuilder:
         stated = evaluation.jacobian[problem.residual_rows.stated_priors].copy()
         # what is assumed of the parameters themselves stays out: what is asked is what sensors say
         stated[:, [problem.unknown_names.index(name) for name in names]] = 0.0
-        return CandidateExperiment(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
+        return CandidateExperimentSensitivities(problem, x, names, slopes, stated.T @ stated, by_joints, tuple(notes))
 
     def _joint_sensors(self, mechanics: frozenset[str]) -> dict[str, SensorOptions]:
         given = self.setting.problem.options.sensors

@@ -52,10 +52,10 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
     return {kind: tuple(own) for kind, own in found.items()}
 
 
-def fit_friction_law(
+def cross_validate_friction_law(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> FrictionLawFit:
-    """The fit of a law, `solution`, to all recordings, with its errors on every kind of motion left out in turn."""
+    """A law's fit to all recordings, `solution`, with errors of refits that leave out one kind of motion in turn."""
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)

@@ -31,7 +31,7 @@ from yid_ocp.inference.uncertainty import (
     ParameterEstimate,
     assess_goodness_of_fit,
     finite_or_none,
-    misfit_widened_covariance,
+    misfit_robust_covariance,
     parameter_estimates,
     parameter_unknown_names,
     parameter_verdict,
@@ -181,7 +181,7 @@ def identifiability(
         else:
             own = wide if as_solved else problem_whitened_at(problem, given, rounds=2)
             fit = assess_goodness_of_fit(own, evaluation if as_solved else own.evaluate(given), limits)
-            covariance = misfit_widened_covariance(wide, evaluation, fit)
+            covariance = misfit_robust_covariance(wide, evaluation, fit)
         view = _Sensitivities.of(wide, x, evaluation, names, inflation)
         judged = parameter_estimates(wide, x, evaluation, covariance, fit)
         std = np.array([judged[name].std for name in names])

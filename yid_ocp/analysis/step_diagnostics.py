@@ -44,8 +44,8 @@ def step_size_summary(step: Step) -> dict[str, Any]:
     for f in step.functions.all_functions:
         nonzeros = sum(f.nnz_out(i) for i in range(f.n_out()))
         found.append({"name": f.name(), "operations": f.n_instructions(), "nonzeros": nonzeros})
-    nonzeros = ca.jacobian_sparsity(e.residual, e.unknowns).nnz()
-    counts = {"unknowns": e.unknowns.numel(), "jacobian_nonzeros": nonzeros}
+    nonzeros = ca.jacobian_sparsity(e.residual, e.newton_unknowns).nnz()
+    counts = {"unknowns": e.newton_unknowns.numel(), "jacobian_nonzeros": nonzeros}
     return {"sizes": step.sizes, **counts, "functions": found}
 
 

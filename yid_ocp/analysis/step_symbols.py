@@ -188,8 +188,8 @@ class SymbolBlock:
 
 
 @dataclass(frozen=True)
-class EquationEntry:
-    """One equation of a step or, where a column is named, its derivative by it; and variables on which it depends."""
+class EquationOrDerivativeFormula:
+    """Formula of an equation of a step or, where a column is named, of its derivative by it, and variables in it."""
 
     row_name: str
     column_name: str
@@ -308,7 +308,7 @@ class StepSymbols(ReprMixin):
         at = names.index(block)
         return slice(ends[at], ends[at + 1])
 
-    def equation_entry(self, text: str) -> EquationEntry:
+    def equation_or_derivative(self, text: str) -> EquationOrDerivativeFormula:
         """The equation with a given name or, for `ROW, COLUMN`, its derivative by a variable.
 
         `text` is such as `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]` or `constraint[left.x], T2.length`. Raises
@@ -326,7 +326,7 @@ class StepSymbols(ReprMixin):
             expression, column = ca.jacobian(expression, self.column_symbols[at]), self.column_names[at]
         made = format_expressions([expression], self.column_symbols, self.column_display_names)
         used = self._summarize_columns(made.variable_indices)
-        return EquationEntry(self.row_names[row], column, made, used, expression)
+        return EquationOrDerivativeFormula(self.row_names[row], column, made, used, expression)
 
     def _summarize_columns(self, places: Iterable[int]) -> tuple[str, ...]:
         """Names of columns by index; a block with many of them is abbreviated, `24 of q0`."""
@@ -345,7 +345,7 @@ class StepSymbols(ReprMixin):
             row = self._row_expressions[at]
             count = count_operations([row], self.column_symbols)
             if count <= _MAX_PRINTED_OPERATIONS:
-                said += self.equation_entry(name).text_lines
+                said += self.equation_or_derivative(name).text_lines
             else:
                 used = self._summarize_columns(place[symbol.element_hash()] for symbol in ca.symvar(row))
                 said.append(_headline(name, count, used))

@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from yid_ocp.analysis.experiment_design import (
     ARM_GROUP,
     CAMERA_GROUP,
-    EXPERIMENT_CHANGE_NAMES,
-    CandidateExperiment,
+    MECHANICAL_CHANGE_DESCRIPTIONS,
     CandidateExperimentBuilder,
+    CandidateExperimentSensitivities,
     FrameObservationSchedule,
     RecordedExperiment,
     observable_frames,
@@ -46,7 +46,7 @@ class ExperimentChange:
 
     name: str
     description: str
-    mechanical_change: str = ""  # key of `EXPERIMENT_CHANGE_NAMES`, empty where only sensors change
+    mechanical_change: str = ""  # key of `MECHANICAL_CHANGE_DESCRIPTIONS`, empty where only sensors change
     camera_frame: str = ""  # that the camera sees besides; empty for none
     arm_frame: str = ""  # that an arm measures besides; empty for none
     camera_rate: float | None = None  # [Hz]
@@ -229,8 +229,8 @@ class _Outcomes:
         views = setting.existing_sensor_observations(episode)
         groups = ("" if group is None else group.name for group in (camera, arm))
         looked, felt = ({view.frame for view in views if view.point_group == name} for name in groups)
-        names = self.builder.applicable_experiment_changes()
-        changes = [ExperimentChange(name, EXPERIMENT_CHANGE_NAMES[name], name) for name in names]
+        names = self.builder.applicable_mechanical_changes()
+        changes = [ExperimentChange(name, MECHANICAL_CHANGE_DESCRIPTIONS[name], name) for name in names]
         for sight in observable_frames(setting.problem.system):
             name, words = sight.name, sight.description
             if name not in looked | felt:
@@ -273,7 +273,7 @@ class _Outcomes:
         return ChangedExperimentResult(names, words, std, verdicts, count, gain, "; ".join(layout.feasibility_notes))
 
     def _views(
-        self, episode: Episode, changes: Sequence[ExperimentChange], layout: CandidateExperiment
+        self, episode: Episode, changes: Sequence[ExperimentChange], layout: CandidateExperimentSensitivities
     ) -> list[FrameObservationSchedule]:
         setting = self.setting
         camera, times, std = setting.camera_sample_times_and_std(episode)
@@ -299,7 +299,9 @@ class _Outcomes:
         return views + [FrameObservationSchedule(feeling, frame, arm_times, felt) for frame in feels]
 
 
-def _relative_stds_and_gain(layout: CandidateExperiment, information: Array) -> tuple[dict[str, float], float]:
+def _relative_stds_and_gain(
+    layout: CandidateExperimentSensitivities, information: Array
+) -> tuple[dict[str, float], float]:
     """Relative standard deviation of every free parameter, and the gain, from a Fisher information of all unknowns."""
     problem, x = layout.problem, layout.x
     chosen = np.array([problem.unknown_names.index(name) for name in layout.free_parameters])

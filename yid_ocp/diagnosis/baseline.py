@@ -145,9 +145,9 @@ class BaselineData:
         found = self.compare_with_baseline(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
-    def predict_with_effects_removed_and_added(
+    def counterfactual_prediction_errors(
         self, nominal: RefittedModel, last: RefittedModel, progress: Progress
-    ) -> EffectRemovalAndAdditionTest | None:
+    ) -> CounterfactualPredictionErrors | None:
         """Predict reference recordings with the effects of `last` removed, and the diagnosed ones with them added.
 
         None without effects or reference recordings. Without earlier runs what is known of the world without the
@@ -167,8 +167,8 @@ class BaselineData:
         try:
             then = then or _estimated_without(last, without, shared)
         except YidError as error:
-            return EffectRemovalAndAdditionTest(removed, _nothing(present, error.what))
-        return EffectRemovalAndAdditionTest(removed, _predicted(last, present, then, {**then, **effects}))
+            return CounterfactualPredictionErrors(removed, _nothing(present, error.what))
+        return CounterfactualPredictionErrors(removed, _predicted(last, present, then, {**then, **effects}))
 
 
 def _plain_variance(fit: RefittedModel) -> Mapping[str, float]:
@@ -218,7 +218,7 @@ class _PredictionErrors:
 
 
 @dataclass(frozen=True)
-class EffectRemovalAndAdditionTest:
+class CounterfactualPredictionErrors:
     """Prediction errors on reference recordings with the effects removed, and on the diagnosed ones with them added."""
 
     # made without the effects: by the diagnosed model less its effects, against the nominal model as it was fitted

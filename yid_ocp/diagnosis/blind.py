@@ -224,7 +224,7 @@ class BlindCaseGenerator:
         self.problem, self.seed, self._finer = problem, seed, finer
         self._candidates, self._limits = candidates, limits
         recording = problem.episodes[0].recording
-        self.initial_configuration = initial_driven_joint_positions(self.simulated_system, recording)
+        self.initial_configuration = first_recorded_driven_joint_positions(self.simulated_system, recording)
         seen = any(group.pose is not None for group in recording.points)
         self.conditions = replace(conditions or SyntheticRecordingConditions(), has_camera=seen)
         self._effects = make_candidate_effects(problem.system, [recording], candidates)
@@ -420,7 +420,7 @@ def simulate_random_motion(
     return run_experiment_with_effects(simulated, values, injected, experiment)
 
 
-def initial_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:
+def first_recorded_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:
     """Return the initial positions of the driven joints of a recording; `ConfigError` where one is not recorded."""
     joints = recording.joints
     names = [] if joints is None else list(joints.names)

@@ -149,8 +149,8 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
     return {"count": count, "of": total, "rate": count / total, "low": low, "high": high}
 
 
-def ensemble_success_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Return the rates over an ensemble; None for a rate without cases."""
+def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
+    """Rates of false alarms, detection, right answers and more over an ensemble; None for a rate without cases."""
 
     def mean(values: Sequence[float]) -> float | None:
         return float(np.mean(values)) if len(values) else None

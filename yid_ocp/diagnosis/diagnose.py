@@ -24,7 +24,7 @@ from yid_ocp.diagnosis.diagnosis_result import (
     insufficient_data_message,
     recommended_experiment_text,
 )
-from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_disturbance_events, problem_corrected_for_events
+from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
     TRUNCATION_FRACTIONS,
     AllCandidatesProblem,
@@ -41,7 +41,7 @@ from yid_ocp.diagnosis.localise import (
     merge_time_intervals,
 )
 from yid_ocp.diagnosis.refit import (
-    PrecomputedFits,
+    NominalSolutionAndRefitStore,
     RefitContext,
     RefitStore,
     RefittedModel,
@@ -64,7 +64,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.null_test import (
     NullTestResult,
     assumed_channel_noise_levels,
-    residual_channel_samples,
+    residual_channel_indices,
     run_null_test,
     whiten_with_extra_errors,
 )
@@ -90,7 +90,7 @@ def diagnose(
     *,
     thresholds: Thresholds | None = None,
     progress: Progress | None = None,
-    known_fits: PrecomputedFits | None = None,
+    known_fits: NominalSolutionAndRefitStore | None = None,
     baseline: RunEstimates | Sequence[RunEstimates] | BaselineData = (),
     exclude: Sequence[str] = (),
 ) -> DiagnosisResult:
@@ -122,7 +122,7 @@ def diagnose(
         clock, told, known = (
             {"": time.perf_counter()},
             progress or LoggingProgress(log),
-            known_fits or PrecomputedFits(),
+            known_fits or NominalSolutionAndRefitStore(),
         )
         runs = (baseline,) if isinstance(baseline, RunEstimates) else baseline
         earlier = runs if isinstance(runs, BaselineData) else BaselineData.from_runs(runs, ())
@@ -246,7 +246,7 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
         stage_seconds={name: clock[name] - clock[last] for last, name in itertools.pairwise(clock)},
         events=events,
         baseline_comparison=earlier.compare_with_baseline(final, limits),
-        counterfactual=earlier.predict_with_effects_removed_and_added(nominal, final, search.progress),
+        counterfactual=earlier.counterfactual_prediction_errors(nominal, final, search.progress),
         untried=tuple(dict.fromkeys(search.skipped)),
         search_seconds=clock["refits"] - clock[""],
     )
@@ -278,8 +278,8 @@ def _happened(
         smoothed = _smooth_about_model(replace(fit, problem=own, evaluation=evaluation), limits)
     if not evaluation.ok:
         return NO_EVENTS, None
-    found = find_disturbance_events(own, x, evaluation, smoothed, limits)
-    (pushed, others), share = found.split_by_force(), 1 - limits.min_event_chi2_fraction
+    found = find_force_and_fault_events(own, x, evaluation, smoothed, limits)
+    (pushed, others), share = found.split_force_from_other_events(), 1 - limits.min_event_chi2_fraction
     if pushed and _excess(fit, problem_corrected_for_events(own, pushed)) > share * _excess(fit, own):
         found = others
     return found, smoothed
@@ -494,7 +494,7 @@ def _largest_joint_angles(fit: RefittedModel) -> dict[str, float]:
 
 def _null_test(problem: EstimationProblem, residual: Array, fitted: int, limits: Thresholds) -> NullTestResult:
     """The null test of a residual from which so many fitted parameters took their part."""
-    samples = residual_channel_samples(problem)
+    samples = residual_channel_indices(problem)
     return run_null_test(samples, residual, fitted, limits.significance_level, limits.residual_window)
 
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from yid_ocp.diagnosis.baseline import BaselineComparison, EffectRemovalAndAdditionTest
-from yid_ocp.diagnosis.events import NO_EVENTS, DisturbanceEvent, EventSet
+from yid_ocp.diagnosis.baseline import BaselineComparison, CounterfactualPredictionErrors
+from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, ForceOrFaultEvent
 from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.localise import GapLocation, main_gap_locations
 from yid_ocp.diagnosis.refit import RefittedModel
@@ -30,8 +30,8 @@ from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.diagnosis.verdict import (
     ParameterTransferCheck,
     UnknownVerdictReason,
+    effect_count_with_each_kind_once,
     failed_transfer_checks,
-    independent_assumption_count,
     required_fraction_of_smoother_chi2,
 )
 from yid_ocp.display import ReprMixin, ReprSummary
@@ -83,7 +83,7 @@ class DiagnosisResult(ReprMixin):
     thresholds: Thresholds
     stage_seconds: Mapping[str, float]
     baseline_comparison: BaselineComparison | None = None
-    counterfactual: EffectRemovalAndAdditionTest | None = None
+    counterfactual: CounterfactualPredictionErrors | None = None
     summary: str = ""
     truncated_recordings: tuple[TruncatedHeldOutRecording, ...] = ()
     unknown_reason: UnknownVerdictReason = ""
@@ -204,7 +204,7 @@ def decision_statistics_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
         "candidate": min(1.0, bonferroni_min_p_value(finding.candidate_scores)),
         "evidence": None if seen is None or before.problem.has_process_noise else max(seen.log_evidence.values()),
         **of_effects,
-        "assumptions": independent_assumption_count(added),
+        "assumptions": effect_count_with_each_kind_once(added),
         "carried": max(apart, default=None),
         "behind": {fit.effects[-1].label: _behind(fit, alone[0]) for fit in alone},
     }
@@ -445,7 +445,7 @@ def _nameless(finding: DiagnosisResult) -> str:
     """Why no effect is named, with the numbers that say so."""
     added, tried, reason = finding.selected_effects, finding.single_effect_models, finding.unknown_reason
     apart = [entry.both_estimates_text for entry in failed_transfer_checks(finding.transfer_checks)]
-    count = independent_assumption_count(added)
+    count = effect_count_with_each_kind_once(added)
     return _UNKNOWN_REASON_TEXTS[reason if reason != "none" or tried else "nothing"].format(
         best=tried[0].effects[0].label if tried else "",
         names=" and ".join(entry.effect.label for entry in added),
@@ -540,7 +540,7 @@ _COUNTERFACTUAL_TEXTS = (
 """Beginning, how the recordings were made, and what the prediction is compared with: effects removed, and added."""
 
 
-def _counterfactual(found: EffectRemovalAndAdditionTest) -> list[str]:
+def _counterfactual(found: CounterfactualPredictionErrors) -> list[str]:
     """Whether taking the effects away predicts the world without them, and adding them the world with them."""
     text = []
     both = (found.effects_removed, found.effects_added)
@@ -574,7 +574,7 @@ def joint_overspeed_messages(events: EventSet) -> list[str]:
     return [f"From {e.start_time:.3g} {said} {e.recording}, where {e.joint} {why}" for e in events.overspeeds]
 
 
-def _said(event: DisturbanceEvent) -> str:
+def _said(event: ForceOrFaultEvent) -> str:
     if event.kind == "sample":
         when = f"at {0.5 * (event.start_time + event.end_time):.3f} s in {event.recording}"
         return f"{event.channel} is off by {event.peak_value:+.3g} {event.unit} {when}"

@@ -57,7 +57,7 @@ _WRONG_SAMPLE_Z = 8.0  # standard deviations of noise, and robust ones of its ne
 
 
 @dataclass(frozen=True)
-class DisturbanceEvent:
+class ForceOrFaultEvent:
     """A brief local disturbance: an external force on one coordinate, or wrong samples of one channel."""
 
     recording: str
@@ -74,7 +74,7 @@ class DisturbanceEvent:
     unit: str
     detected_pulse: DetectedForcePulse | None = None  # shape of a force
 
-    def _overlap(self, other: DisturbanceEvent) -> float:
+    def _overlap(self, other: ForceOrFaultEvent) -> float:
         """Time for which both last, of whatever recording [s]; negative where one begins after the other."""
         return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
 
@@ -97,7 +97,7 @@ class _Overspeed:
 class EventSet:
     """All events of a diagnosis by recording and time, overspeeds, and the unknown force where an event is."""
 
-    disturbances: tuple[DisturbanceEvent, ...] = ()
+    disturbances: tuple[ForceOrFaultEvent, ...] = ()
     overspeeds: tuple[_Overspeed, ...] = ()
     force_estimates: tuple[ForceEstimate, ...] = ()
 
@@ -110,12 +110,12 @@ class EventSet:
         same = [(a.recording, a.channel) == (b.recording, b.channel) and a._overlap(b) > 0 for a, b in pairs]
         return len(self.disturbances) == len(other.disturbances) and all(same)
 
-    def split_by_force(self) -> tuple[EventSet, EventSet]:
+    def split_force_from_other_events(self) -> tuple[EventSet, EventSet]:
         """The force events alone, and the other events with the overspeeds."""
         forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
         return EventSet(forces), EventSet(others, self.overspeeds)
 
-    def for_recording(self, recording: str) -> tuple[DisturbanceEvent, ...]:
+    def for_recording(self, recording: str) -> tuple[ForceOrFaultEvent, ...]:
         """Return the events of one recording."""
         return tuple(event for event in self.disturbances if event.recording == recording)
 
@@ -127,7 +127,7 @@ class EventSet:
 NO_EVENTS = EventSet()
 
 
-def find_disturbance_events(
+def find_force_and_fault_events(
     problem: EstimationProblem,
     x: Array,
     evaluation: Evaluation,
@@ -283,21 +283,21 @@ def _short(smoothed: SmootherResult, recording: int, limits: Thresholds) -> list
 
 def _one_each(
     found: Sequence[tuple[ForceEstimate, DetectedForcePulse]], problem: EstimationProblem
-) -> list[DisturbanceEvent]:
+) -> list[ForceOrFaultEvent]:
     """Events of forces; where one push moves the model, it is named at the coordinate that explains most of it."""
     prescribed = set(problem.system.prescribed)
-    kept: list[DisturbanceEvent] = []
+    kept: list[ForceOrFaultEvent] = []
     for history, pulse in sorted(found, key=lambda entry: entry[1].p_value):
         what = (history.recording, history.location, history.coordinate, "force", pulse.start_time, pulse.end_time)
         size = (pulse.peak_value, pulse.impulse, pulse.peak_std * pulse.impulse_per_unit_peak, history.unit)
-        event = DisturbanceEvent(*what, *size, pulse)
+        event = ForceOrFaultEvent(*what, *size, pulse)
         same = [e for e in kept if e.recording == event.recording and not {e.channel, event.channel} <= prescribed]
         if all(event._overlap(other) <= 0 for other in same):
             kept.append(event)
     return kept
 
 
-def _recurs(one: DisturbanceEvent, other: DisturbanceEvent) -> bool:
+def _recurs(one: ForceOrFaultEvent, other: ForceOrFaultEvent) -> bool:
     """Whether the same force is there at the same time of another recording."""
     if one.recording == other.recording or one.channel != other.channel or one.peak_value * other.peak_value < 0:
         return False
@@ -308,7 +308,7 @@ def _recurs(one: DisturbanceEvent, other: DisturbanceEvent) -> bool:
 # -- wrong samples ----------------------------------------------------------------------------------------------------
 
 
-def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterator[DisturbanceEvent]:
+def _wrong_samples(problem: EstimationProblem, run: _RecordingRollout) -> Iterator[ForceOrFaultEvent]:
     """Samples that their neighbours contradict: of sensors beside their prediction, of joints as they were recorded."""
     episode, result, _ = run
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
@@ -358,7 +358,7 @@ def _floor(problem: EstimationProblem, episode: Episode, joint: str, quantity: s
 
 def _alone(
     t: Array, values: Array, noise: Array, recording: str, about: tuple[str, str, str]
-) -> Iterator[DisturbanceEvent]:
+) -> Iterator[ForceOrFaultEvent]:
     """Runs of at most `_MAX_WRONG_SAMPLES` samples far from where what is around them leads, as none of these is."""
     count, many = len(values), _NEIGHBOUR_COUNT
     if count < 2 * many:
@@ -384,7 +384,7 @@ def _alone(
         peak = float(off[begin + int(size[begin : end + 1].argmax())])
         impulse = float(off[begin : end + 1].sum() * period)
         std = float(spread[begin]) * period * math.sqrt(end - begin + 1)
-        yield DisturbanceEvent(recording, location, channel, "sample", *window, peak, impulse, std, unit)
+        yield ForceOrFaultEvent(recording, location, channel, "sample", *window, peak, impulse, std, unit)
 
 
 def _beside_neighbours(t: Array, values: Array) -> Array:
@@ -431,7 +431,7 @@ def problem_corrected_for_events(problem: EstimationProblem, events: EventSet) -
 
 
 def _counting(
-    episode: Episode, samples: Measurements, own: Sequence[DisturbanceEvent], end: float, cutoff: float
+    episode: Episode, samples: Measurements, own: Sequence[ForceOrFaultEvent], end: float, cutoff: float
 ) -> Measurements:
     """Samples without those that an event spoils."""
     hidden, is_effort = np.zeros(samples.value.shape, bool), bool(samples.sensor.effort_joints)

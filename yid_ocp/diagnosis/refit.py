@@ -19,9 +19,9 @@ from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem, join_effect_label
 from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase, ReportedParameter
 from yid_ocp.inference.null_test import chi2_p_value, times_since_recording_start
-from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_widened_covariance, std_from_covariance
+from yid_ocp.inference.uncertainty import assess_goodness_of_fit, misfit_robust_covariance, std_from_covariance
 from yid_ocp.inference.whitening import (
-    max_normalized_torque_bias_difference,
+    max_torque_bias_change_between_filters,
     problem_relinearized_at_torque_bias,
     problem_whitened_by_sensor_noise,
 )
@@ -61,7 +61,7 @@ class HeldOutLoss:
         return self.total_chi2 / max(float(self.block_sample_counts.sum()), 1.0)
 
     @property
-    def excess_chi2(self) -> float:
+    def excess_chi2_per_sample(self) -> float:
         """Held-out gap G = max(0, chi2/n - 1)."""
         return max(0.0, self.chi2_per_sample - 1.0)
 
@@ -108,7 +108,7 @@ class RefitStore(Protocol):
 
 
 @dataclass(frozen=True)
-class PrecomputedFits:
+class NominalSolutionAndRefitStore:
     """What is known before a diagnosis begins: the nominal problem's solution, and refits of an interrupted run."""
 
     solution: Solution | None = None
@@ -268,7 +268,7 @@ def _attempt(
     if found is None or not effects:
         return found
     filters = problem.problem.whitening_filters, found.problem.whitening_filters
-    if max_normalized_torque_bias_difference(*filters) < _RELINEARIZE_Z:
+    if max_torque_bias_change_between_filters(*filters) < _RELINEARIZE_Z:
         return found
     # about fixed torques a run stops where the effect and an offset that it makes superfluous hold each other
     outcome = REFIT_SOLVER.minimize_cost(found.problem, outcome.x, None, _relinearizing(found.problem))
@@ -297,7 +297,7 @@ def _seen(problem: AllCandidatesProblem, effects: Sequence[EffectBase], outcome:
 
 def _refit_covariance(problem: EstimationProblem, finish: Evaluation, limits: Thresholds) -> Array:
     """Covariance of the unknowns, shape (nx, nx), inflated by the misfit as in `solve`."""
-    return misfit_widened_covariance(problem, finish, assess_goodness_of_fit(problem, finish, limits.null_test_limits))
+    return misfit_robust_covariance(problem, finish, assess_goodness_of_fit(problem, finish, limits.null_test_limits))
 
 
 def _conditional_amplitude_std(

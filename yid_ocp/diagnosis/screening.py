@@ -27,7 +27,7 @@ from yid_ocp.diagnosis.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from yid_ocp.effects import EffectBase
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.linearized_residual import linearization_without_weak_priors
-from yid_ocp.inference.null_test import ResidualChannelSamples, chi2_p_value, residual_channel_samples
+from yid_ocp.inference.null_test import ResidualChannelIndices, chi2_p_value, residual_channel_indices
 
 _DECREASE_RTOL = 1e-6  # relative difference of promised decreases that rounding can make
 
@@ -92,7 +92,7 @@ def linearize_candidates(
     grids = {e.label: _shape_grid(e, grid) for e in problem.candidate_effects if e.label not in labels}
     own = [name for effect in base for name in effect.parameters.names]
     residual, basis, warm = np.zeros(0), np.zeros((0, 0)), None
-    placed, series = problem.relinearized_with_effects(base, values), residual_channel_samples(problem.problem)
+    placed, series = problem.relinearized_with_effects(base, values), residual_channel_indices(problem.problem)
     signatures: list[_EffectSignature] = []
     for k in range(max(map(len, grids.values()), default=0)):
         chosen = [effect for effect in problem.candidate_effects if k < len(grids.get(effect.label, ()))]
@@ -153,7 +153,7 @@ def _pinv(matrix: Array) -> Array:
     return np.asarray(np.linalg.pinv(matrix, rcond=1e-10, hermitian=True))
 
 
-def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannelSamples]) -> Array:
+def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannelIndices]) -> Array:
     """X' Omega X under the noise's known autocorrelation."""
     import scipy.signal  # slow to import
 
@@ -171,7 +171,7 @@ def _covariance_of_scores(columns: Array, series: Sequence[ResidualChannelSample
     return (total + total.T) / 2
 
 
-def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannelSamples]) -> Array:
+def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[ResidualChannelIndices]) -> Array:
     """Newey-West covariance of X' r for a residual of unknown autocorrelation, shape (p, p)."""
     total = np.zeros((columns.shape[1], columns.shape[1]))
     for s in series:
@@ -186,7 +186,7 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Res
 
 def score_candidates(
     point: AllCandidatesLinearization,
-    series: Sequence[ResidualChannelSamples],
+    series: Sequence[ResidualChannelIndices],
     visible: Sequence[CandidateDetectability],
 ) -> tuple[CandidateScore, ...]:
     """Return the score of every detectable candidate, largest predicted decrease of r'r first."""
@@ -224,7 +224,7 @@ def _promised(information: Array, slope: Array, lower: Array, upper: Array) -> t
     return step, np.sum((2 * slope - (information @ step[..., None])[..., 0]) * step, axis=-1)
 
 
-def _score(signature: _EffectSignature, residual: Array, series: Sequence[ResidualChannelSamples]) -> CandidateScore:
+def _score(signature: _EffectSignature, residual: Array, series: Sequence[ResidualChannelIndices]) -> CandidateScore:
     effect, x, floor = signature.effect, signature.projected_sensitivity, signature.score_noise_covariance
     slope = -(x.T @ residual)
     lower, upper = _room(effect)
@@ -353,6 +353,6 @@ def screen_candidates(
     """Screen all candidates except those of `base`: detectability, score and confusability."""
     point = linearize_candidates(problem, base, values, limits.shape_grid_size)
     visible = candidate_detectability(point, limits.detection_z)
-    ranked = score_candidates(point, residual_channel_samples(problem.problem), visible)
+    ranked = score_candidates(point, residual_channel_indices(problem.problem), visible)
     everything = make_joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, confusability_matrix(everything), everything)

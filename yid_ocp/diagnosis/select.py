@@ -61,7 +61,7 @@ def held_out_gap_closure(
 ) -> GapClosure:
     """Return the fraction of the held-out gap closed from `before` to `after`, with a block-bootstrap interval."""
     sure = _lr_decisive(before, after, limits)
-    if before.excess_chi2 <= 0 or not np.isfinite(after.chi2_per_sample):
+    if before.excess_chi2_per_sample <= 0 or not np.isfinite(after.chi2_per_sample):
         return replace(UNDEFINED_GAP_CLOSURE, is_decisive=sure)
     count = len(before.block_sample_counts)
     draws = np.random.default_rng(0).integers(0, count, (_N_BOOTSTRAP, count))
@@ -70,7 +70,7 @@ def held_out_gap_closure(
     g1 = np.maximum((after.block_chi2[draws].sum(axis=1) + after.baseline_chi2) / n - 1.0, 0.0)
     ratio = 1 - g1[g0 > 0] / g0[g0 > 0]
     low, high = np.quantile(ratio, [0.025, 0.975]) if len(ratio) else (math.nan, math.nan)
-    return GapClosure(1 - after.excess_chi2 / before.excess_chi2, float(low), float(high), sure)
+    return GapClosure(1 - after.excess_chi2_per_sample / before.excess_chi2_per_sample, float(low), float(high), sure)
 
 
 def _lr_decisive(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds) -> bool:
@@ -337,7 +337,7 @@ def _worth_adding(current: RefittedModel, chosen: RefittedModel, limits: Thresho
     """Whether the last effect of a fit closes a sure and relevant part of the gap, and is there at all."""
     before, after = current.held_out_loss, chosen.held_out_loss
     gained, error = held_out_improvement(before, after)
-    part = gained >= limits.min_gap_closed * before.excess_chi2 and before.excess_chi2 > 0
+    part = gained >= limits.min_gap_closed * before.excess_chi2_per_sample and before.excess_chi2_per_sample > 0
     closes = not _little_is_left(current, limits) and gained > error and part
     return (closes or _lr_decisive(before, after, limits)) and _is_there(current, chosen, chosen.effects[-1], limits)
 

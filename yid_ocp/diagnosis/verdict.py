@@ -168,8 +168,8 @@ def decide_verdict(
     return "confusable" if len(added[0].equivalent_effects) > 1 else "effect"
 
 
-def independent_assumption_count(added: Sequence[SelectedEffect]) -> int:
-    """Count independent assumptions: one law at several locations counts once, local effects count each."""
+def effect_count_with_each_kind_once(added: Sequence[SelectedEffect]) -> int:
+    """Number of independent assumptions: a kind at several locations counts once, local effects count each."""
     return len({entry.effect.label if entry.effect.is_local else entry.effect.kind for entry in added})
 
 
@@ -178,7 +178,7 @@ def required_fraction_of_smoother_chi2(added: Sequence[SelectedEffect], limits: 
 
     Each further assumption has to explain that part of what could be left.
     """
-    return 1.0 - (1.0 - limits.min_explained_fraction) ** independent_assumption_count(added)
+    return 1.0 - (1.0 - limits.min_explained_fraction) ** effect_count_with_each_kind_once(added)
 
 
 def find_unknown_verdict_reason(
@@ -194,7 +194,7 @@ def find_unknown_verdict_reason(
         return "none"
     if not (total.ci_low > limits.min_gap_closed or total.is_decisive):
         return "unsure"
-    elsewhere = independent_assumption_count(added) == 1 and total.ci_low >= limits.min_explained_fraction
+    elsewhere = effect_count_with_each_kind_once(added) == 1 and total.ci_low >= limits.min_explained_fraction
     if explained < required_fraction_of_smoother_chi2(added, limits) and not elsewhere:
         return "little"
     return "" if carried else "stand_in"

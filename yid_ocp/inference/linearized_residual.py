@@ -183,11 +183,11 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
         return math.inf
     if not len(x):
         return 0.0
-    step = step_within_unknown_sizes(problem, x, evaluation.jacobian, evaluation.residual, 1e-14)
+    step = solve_step_within_unknown_sizes(problem, x, evaluation.jacobian, evaluation.residual, 1e-14)
     return predicted_cost_reduction(evaluation.jacobian, evaluation.residual, step)
 
 
-def step_within_unknown_sizes(
+def solve_step_within_unknown_sizes(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
     """Least-squares step within the bounds, of at most the larger of value and typical size of each unknown, (nx,)."""

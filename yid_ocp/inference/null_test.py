@@ -39,8 +39,8 @@ DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 
 @dataclass(frozen=True)
-class ResidualChannelSamples:
-    """Samples of one scalar sensor output of a recording."""
+class ResidualChannelIndices:
+    """Times, and indices into the residual, of the samples of one scalar sensor output of a recording."""
 
     recording: str
     channel: str
@@ -109,7 +109,7 @@ def chi2_p_value(chi2: float, degrees: float) -> float:
 
 
 def run_null_test(
-    series: Sequence[ResidualChannelSamples],
+    series: Sequence[ResidualChannelIndices],
     residual: Array,
     parameters: int,
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
@@ -158,11 +158,11 @@ def min_bonferroni_p_value(tests: Sequence[NullTestResult]) -> float:
 
 
 def _windows(
-    series: Sequence[ResidualChannelSamples], residual: Array, level: float, length: float
+    series: Sequence[ResidualChannelIndices], residual: Array, level: float, length: float
 ) -> tuple[_ResidualWindow, ...]:
     raw: list[tuple[str, str, float, float]] = []
     p_values: list[float] = []
-    merged: dict[tuple[str, str], list[ResidualChannelSamples]] = {}
+    merged: dict[tuple[str, str], list[ResidualChannelIndices]] = {}
     for s in series:
         merged.setdefault((s.recording, s.channel), []).append(s)
     for (recording, channel), own in merged.items():
@@ -198,9 +198,9 @@ def times_since_recording_start(episode: Episode, samples: Measurements) -> Arra
     return np.asarray((samples.node + samples.fraction) * episode.grid.time_step)
 
 
-def residual_channel_samples(problem: EstimationProblem) -> tuple[ResidualChannelSamples, ...]:
+def residual_channel_indices(problem: EstimationProblem) -> tuple[ResidualChannelIndices, ...]:
     """Where each scalar sensor output of each recording stands in a problem's residual: times and indices."""
-    series: list[ResidualChannelSamples] = []
+    series: list[ResidualChannelIndices] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):
         for samples, rows in zip(episode.measurements, groups, strict=True):
             t = times_since_recording_start(episode, samples)
@@ -215,7 +215,7 @@ def residual_channel_samples(problem: EstimationProblem) -> tuple[ResidualChanne
                 seen = samples.used_output_mask[:, column]
                 if seen.any():
                     text = (episode.name, channel, samples.sensor.group_name, samples.sensor.unit)
-                    series.append(ResidualChannelSamples(*text, t[seen], place[seen, column], autocorrelation))
+                    series.append(ResidualChannelIndices(*text, t[seen], place[seen, column], autocorrelation))
     return tuple(series)
 
 

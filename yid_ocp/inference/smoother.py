@@ -148,7 +148,7 @@ def _forwards(model: LinearResidualModel, variance: Array, keep: bool) -> _Filte
         step, later, own = kalman_step_and_covariance(p, design, transition)
         if math.isinf(own):
             return _Filtered(model, begin, products, math.inf, ())
-        white, after = step.update(mean, interval.negative_residual_jacobian)
+        white, after = step.update_and_propagate(mean, interval.negative_residual_jacobian)
         products += white.T @ white
         log_determinant += own
         if keep:

@@ -14,7 +14,7 @@ from yid_ocp.inference.linearized_residual import linearization_without_weak_pri
 from yid_ocp.inference.null_test import (
     DEFAULT_EXCESS_RESIDUAL_CRITERIA,
     ExcessResidualCriteria,
-    residual_channel_samples,
+    residual_channel_indices,
     residuals_exceed_noise,
     run_null_test,
 )
@@ -93,7 +93,7 @@ def assess_goodness_of_fit(
             for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
                 parts.append(((predicted - samples.value) / samples.std)[samples.used_output_mask])
         residual = np.concatenate(parts)
-    series = residual_channel_samples(problem)
+    series = residual_channel_indices(problem)
     found = run_null_test(series, residual / limits.noise_fraction_of_std, len(problem.unknown_names))
     explains = not residuals_exceed_noise((found,), limits)
     return GoodnessOfFit(found.chi2_per_dof, found.p_value, explains, problem.options.has_no_serious_data_issues)
@@ -163,7 +163,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     blocks: dict[tuple[str, int], list[IntArray]] = {}
     recordings: dict[str, list[IntArray]] = {}
     channels: list[list[IntArray]] = []
-    for series in residual_channel_samples(problem):
+    for series in residual_channel_indices(problem):
         channels.append([series.residual_indices])
         recordings.setdefault(series.recording, []).append(series.residual_indices)
         at = (series.t / length).astype(int)
@@ -179,8 +179,8 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
     return found
 
 
-def misfit_widened_covariance(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
-    """Covariance of the unknowns at a fit, widened for misfit where the model does not explain the data."""
+def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
+    """Covariance of the unknowns at a fit: a sandwich that counts misfit where the model does not explain the data."""
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, evaluation)
     return covariance if fit.explains else _misfit_sandwich_covariance(problem, evaluation, covariance)
 

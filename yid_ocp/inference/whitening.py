@@ -98,7 +98,7 @@ class KalmanStep:
         """S^(-1/2) H, shape (r, nx)."""
         return self.whitening @ self.observation
 
-    def update(self, mean: Array, measured: Array) -> tuple[Array, Array]:
+    def update_and_propagate(self, mean: Array, measured: Array) -> tuple[Array, Array]:
         """Normalized innovations (r, c) of measured columns (r, c), and the mean (nx, c) after the step."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
@@ -225,7 +225,7 @@ class WhiteningFilter:
         """Innovations of step k, and the mean of another w after it."""
         step, nu = self.filter_steps[k], len(self.input_errors.torque_bias)
         known = None if push is None or k >= len(push) else push[k]
-        white, later = step.kalman.update(mean, own if known is None else own - step.by_torque @ known)
+        white, later = step.kalman.update_and_propagate(mean, own if known is None else own - step.by_torque @ known)
         if known is not None:
             move = step.kalman.transition.state_rows
             later[: len(move)] += move[:, len(move) : len(move) + nu] @ known
@@ -502,7 +502,7 @@ def _settled(
     return made
 
 
-def max_normalized_torque_bias_difference(
+def max_torque_bias_change_between_filters(
     some: Sequence[ResidualWhitener | None], others: Sequence[ResidualWhitener | None]
 ) -> float:
     """Largest difference of the torque offsets of two sets of filters, in stated standard deviations."""

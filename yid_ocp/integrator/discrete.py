@@ -119,7 +119,7 @@ class DiscreteEquations:
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
-    def impulses_of_force_with_derivatives(self) -> tuple[ca.SX, ca.SX] | None:
+    def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
         """Impulses of the closed-form force in `momentum_balance` and in `p1`, shape (n, 1) [N m s], or None."""
         if self.closed_form_force is None:
             return None
@@ -134,7 +134,7 @@ class DiscreteEquations:
         return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
-    def unknowns(self) -> ca.SX:
+    def newton_unknowns(self) -> ca.SX:
         """Symbolic unknowns of a step: free coordinates of q1, internal coordinates z1, multipliers lam."""
         return ca.vertcat(self.q1[list(self.system.unprescribed_coordinate_indices), 0], self.z1, self.lam)
 
@@ -488,7 +488,7 @@ def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:
         -1: {"q0": pulls.start_share * pulls.before_force_by_q + bent, "q1": bent},
         1: {"q0": bent, "q1": bent - pulls.midpoint_share * pulls.after_force_by_q},
     }
-    impulses = e.impulses_of_force_with_derivatives or (ca.SX(n, 1), ca.SX(n, 1))
+    impulses = e.closed_form_force_impulses or (ca.SX(n, 1), ca.SX(n, 1))
     found = []
     apart_and_rows = (e.balance_remainder, pulls.left_jacobian), (e.p1_remainder, pulls.right_jacobian)
     for side, impulse, (rest, rows) in zip((-1, 1), impulses, apart_and_rows, strict=True):

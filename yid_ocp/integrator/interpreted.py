@@ -71,7 +71,7 @@ class InterpretedKernel:
         e, point = self._model.equations, ca.vertcat(*self._model.equations.arguments)
         effort = -e.momentum_balance[list(self._model.system.prescribed_coordinate_indices), 0] / e.h
         outputs = ca.cse(ca.vertcat(e.momentum_balance, e.internal_residual, e.constraint_residual, e.p1, effort))
-        slope = ca.jacobian(outputs[self._residual.tolist()], e.unknowns)
+        slope = ca.jacobian(outputs[self._residual.tolist()], e.newton_unknowns)
         wanted = (outputs, slope, ca.jacobian(outputs, point))
         return [ca.Function("f", [point], [ca.densify(x)]) for x in wanted]
 

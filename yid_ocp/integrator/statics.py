@@ -104,11 +104,11 @@ class EquilibriumSolver:
         step, system = self.step, self.step.system
         given = checked_float_array("configuration", configuration, (len(self.known_coordinates),))
         theta = checked_float_array("theta", theta, (len(system.parameters),))
-        stiffness = holding_spring_stiffness(system, torque is not None)
+        stiffness = driven_joint_holding_stiffness(system, torque is not None)
         nu, nz = step.sizes["nu"], step.sizes["nz"]
         held = np.zeros(nu) if torque is None else checked_float_array("torque", torque, (nu,))
         hold = _Hold(given, held, stiffness, np.where(_is_motor_off(system, held), _HOLD_STIFFNESS, 0.0))
-        count, h = len(self.free_coordinates) + nz, step.equation_time_step(theta)
+        count, h = len(self.free_coordinates) + nz, step.clock_scaled_time_step(theta)
 
         def equations(w: Array) -> tuple[Array, Array]:
             (value, by_point, *_), _ = self._rest_equations(w, theta, hold, h)
@@ -274,7 +274,7 @@ class EquilibriumSolver:
         driven = list(self.step.system.driven_coordinate_indices)
         push, push_p = hold.stiffness * push, hold.stiffness * push_p
         push[driven, range(nu)] += hold.by_hand
-        push_p[driven, range(nu)] += self.step.equation_time_step(theta) / 2 * hold.by_hand
+        push_p[driven, range(nu)] += self.step.clock_scaled_time_step(theta) / 2 * hold.by_hand
         by_other = np.hstack([others, push, rows[:, fixed]])[self._sought]
         change = -_solved(rows[np.ix_(self._sought, self._sought)], by_other)
         state = np.concatenate([self._configuration(w, hold.given), p, w[free : free + nz]])
@@ -312,7 +312,7 @@ def _is_motor_off(system: System, command: Array) -> BoolArray:
     return np.asarray(bool(system.servos) & (command >= MOTOR_OFF_COMMAND / 2))
 
 
-def holding_spring_stiffness(system: System, known: bool) -> float:
+def driven_joint_holding_stiffness(system: System, known: bool) -> float:
     """Stiffness of the springs that hold driven joints at measured angles, inputs known or not [N m/rad, or 1]."""
     if not known:
         return _HOLD_STIFFNESS

@@ -57,8 +57,8 @@ class Step(ReprMixin):
         """Time step h [s]."""
         return self.model.time_step
 
-    def equation_time_step(self, theta: Array) -> float:
-        """Time step in the equations at a theta [s]: the recorded one times `System.recorded_time_scale`."""
+    def clock_scaled_time_step(self, theta: Array) -> float:
+        """Recorded time step times the clock scale at a theta (`System.recorded_time_scale`) [s]."""
         s = self.sizes
         none = [np.zeros(s[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
         return float(self.functions.row_scale_and_time_step(*none, theta, self.time_step)[1])
@@ -416,7 +416,7 @@ def _chunk(
     after[:, n : 2 * n] = bottom + found.p1_by_new[:, :, solved] @ moved
     after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
     effort = top[:, fixed] + found.residual_by_new[:, np.array(fixed, int)[:, None], solved] @ moved
-    effort /= -step.equation_time_step(theta)
+    effort /= -step.clock_scaled_time_step(theta)
     parts = (slice(0, nx), slice(nx, nx + nu), slice(nx + nu, None))
     return [
         LinearizedStep(*(a[:, part] for part in parts), *(e[:, part] for part in parts))

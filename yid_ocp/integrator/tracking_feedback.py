@@ -142,7 +142,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 
 
 @dataclass(frozen=True)
-class DifferentiatedJointMotion:
+class JointMotionWithSensitivities:
     """Angles and torques of the driven joints over the steps of a recording, with their derivatives.
 
     The latter (..., d) are by d parameters and what follows these; None where nothing depends on them.
@@ -222,10 +222,10 @@ class EffectMomentumShift:
         arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
         return np.array(self._impulse(*arguments, theta, self._time_step))
 
-    def momentum_shift_and_derivatives(
+    def node_momentum_shifts_and_derivatives(
         self,
-        recorded: DifferentiatedJointMotion,
-        true: DifferentiatedJointMotion,
+        recorded: JointMotionWithSensitivities,
+        true: JointMotionWithSensitivities,
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
@@ -261,7 +261,7 @@ class EffectMomentumShift:
         return (value - plain)[:, :, 0], total
 
     def _remembered(
-        self, motion: DifferentiatedJointMotion, theta: Array, wanted: _Wanted, width: int
+        self, motion: JointMotionWithSensitivities, theta: Array, wanted: _Wanted, width: int
     ) -> tuple[Array, Array | None]:
         """What joints remember at every node but the last, (N, nk), and its derivatives, (N, nk, d), or None."""
         steps = len(motion.torque)
@@ -316,7 +316,7 @@ class _Memory:
         compiled = step.is_compiled
         self._maps = CasadiLockedCache[None, MappedFunction](lambda _: MappedFunction(function, (3, 4), compiled))
 
-    def along(self, motion: DifferentiatedJointMotion, start: Array, theta: Array) -> Array:
+    def along(self, motion: JointMotionWithSensitivities, start: Array, theta: Array) -> Array:
         """Values at every node but the last, shape (N, k)."""
         before, now = motion._before_and_after
         found = [start]
@@ -327,7 +327,7 @@ class _Memory:
 
     def slopes(
         self,
-        motion: DifferentiatedJointMotion,
+        motion: JointMotionWithSensitivities,
         values: Array,
         start: list[int],
         theta: Array,

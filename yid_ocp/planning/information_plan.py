@@ -357,7 +357,7 @@ def _active(search: InformativeMotionSearch, limits: PlanResidualsAndLimits, w: 
         return tuple(dict.fromkeys(name for name, near in zip(names, is_near, strict=True) if near))
 
     values = limits.limited_quantity_values(mover.simulate_path(w), w)[0]
-    for rows, own in limits.limit_rows_and_values(values):
+    for rows, own in limits.split_values_by_limit_kind(values):
         near = (own > _ACTIVE_LIMIT_FRACTION * rows.upper) | (own < _ACTIVE_LIMIT_FRACTION * rows.lower)
         found[rows.description] = reached(rows.row_names, near)
     flat = w.ravel()

@@ -247,7 +247,7 @@ def _outcome(rows: PlanResidualsAndLimits, shot: PlanShootingResult, known: Para
     end = mover.standstill_node_indices
     error = float(np.max(np.linalg.norm(own[end, 0] - rows.target, axis=1)))
     swing = float(np.max(np.linalg.norm(np.diff(own[end], axis=0), axis=2)) / mover.step.time_step)
-    course = rows.reference_point_positions
+    course = rows.point_reference_trajectory
     off_path = None if course is None else float(np.max(np.linalg.norm(own[:, 0] - course, axis=1)))
     broken = rows.worst_violated_row_by_limit(rows.limited_quantity_values(rollout, shot.w)[0])
     message = shot.message

@@ -70,7 +70,7 @@ class PlanResidualsAndLimits:
         self.limit_rows = self._bounded()
 
     @property
-    def reference_point_positions(self) -> Array | None:
+    def point_reference_trajectory(self) -> Array | None:
         """Reference position of the point at every node, shape (N + 1, 3) [m]; None where only the end counts."""
         if self.options.goal != "path":
             return None
@@ -89,7 +89,7 @@ class PlanResidualsAndLimits:
         assert rollout.effort_sensitivity is not None
         at, by_q = self.point.positions_and_jacobian(rollout.state[:, :n], mover.theta)
         by_w = np.einsum("tiq,tqd->tid", by_q, rollout.state_sensitivity[:, :n, -size:])
-        end, course = mover.standstill_node_indices, self.reference_point_positions
+        end, course = mover.standstill_node_indices, self.point_reference_trajectory
         after, before, reached = end[1:], end[1:] - 1, options.position_tolerance
         by_speed = (by_w[after] - by_w[before]) / h
         parts = [_rows(at[end, :3] - self.target, by_w[end, :3], reached)]
@@ -149,7 +149,7 @@ class PlanResidualsAndLimits:
             found.append(_LimitRows("place [m]", low, high, np.full(len(low), 0.1), axes * nodes))
         return found
 
-    def limit_rows_and_values(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
+    def split_values_by_limit_kind(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
         """Pairs of the limit rows of a kind and their values, from values in the order of `limit_rows`."""
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
@@ -157,7 +157,7 @@ class PlanResidualsAndLimits:
     def worst_violated_row_by_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
         """The worst violated row of each kind of limit: its name, value and bound."""
         found = {}
-        for rows, own in self.limit_rows_and_values(value):
+        for rows, own in self.split_values_by_limit_kind(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
             worst = int(np.argmax(over)) if len(own) else 0
             if len(own) and over[worst] > 1e-4:

@@ -13,7 +13,7 @@ from yid_ocp.errors import DataError, SolverError
 from yid_ocp.integrator.statics import Equilibrium
 from yid_ocp.integrator.step import Step, checked_rollout_inputs, simulate_batch
 from yid_ocp.integrator.step_model import Rollout, RolloutInputs, SensitivityDirections
-from yid_ocp.integrator.tracking_feedback import DifferentiatedJointMotion
+from yid_ocp.integrator.tracking_feedback import JointMotionWithSensitivities
 from yid_ocp.model.system import System
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem.episodes import Episode, EpisodePrediction, InitialState
@@ -175,7 +175,7 @@ class EpisodePredictor:
         if not self._follows_momenta:
             return inputs
         rows = slice(2 * self.system.n_coordinates, None)
-        recorded = DifferentiatedJointMotion(episode.smoothed_driven_angles, episode.torque, state[rows])
+        recorded = JointMotionWithSensitivities(episode.smoothed_driven_angles, episode.torque, state[rows])
         by_internal = None if by_unknowns is None else by_unknowns[rows]
         shift, measured = self.model_functions.reference_momentum_shift, episode.measured_driven_angles
         return inputs.with_reference_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)

@@ -15,8 +15,8 @@ from yid_ocp.integrator.statics import EquilibriumSolver
 from yid_ocp.integrator.step import Step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
-    DifferentiatedJointMotion,
     EffectMomentumShift,
+    JointMotionWithSensitivities,
     driven_joints_only_step,
 )
 from yid_ocp.model.system import System
@@ -68,7 +68,7 @@ class CorrectedInputs:
     def with_reference_momentum_shift(
         self,
         shift: EffectMomentumShift,
-        recorded: DifferentiatedJointMotion,
+        recorded: JointMotionWithSensitivities,
         measured: Array,
         theta: Array,
         wanted: Sequence[str],
@@ -85,8 +85,8 @@ class CorrectedInputs:
             return self
         smooth, by_angles = recorded.angles + self.driven_angles - measured, self.driven_angles_sensitivity
         remembered, by_torque = recorded.initial_internal, self.torque_sensitivity
-        true = DifferentiatedJointMotion(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
-        momentum, slope = shift.momentum_shift_and_derivatives(recorded, true, theta, wanted)
+        true = JointMotionWithSensitivities(smooth, self.torque, remembered, by_angles, by_torque, by_internal)
+        momentum, slope = shift.node_momentum_shifts_and_derivatives(recorded, true, theta, wanted)
         return replace(self, momentum_shift=momentum, momentum_shift_sensitivity=slope if np.any(slope) else None)
 
     def nominal_torque_sensitivity(

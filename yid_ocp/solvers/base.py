@@ -26,7 +26,7 @@ from yid_ocp.inference.uncertainty import (
     ParameterEstimate,
     assess_goodness_of_fit,
     finite_or_none,
-    misfit_widened_covariance,
+    misfit_robust_covariance,
     parameter_estimates,
     unknowns_covariance_and_reduced_chi2,
     value_and_uncertainty_text,
@@ -80,7 +80,7 @@ class Solution(ReprMixin):
         The unknown vector of lowest cost, in the order of `unknown_names`.
     covariance : ndarray, shape (nx, nx)
         From the data and stated priors (the weak prior excluded), scaled by chi2 per degree of freedom above one, and
-        counting the misfit where the model does not explain the data (`uncertainty.misfit_widened_covariance`).
+        counting the misfit where the model does not explain the data (`uncertainty.misfit_robust_covariance`).
     parameters : dict of str to ParameterEstimate
         Free parameters shared by all recordings, and the fixed ones that the problem's model has.
     wall_time : float
@@ -200,7 +200,7 @@ class Solver(Protocol):
         ...
 
 
-class CheckedSolver:
+class SolverWithCheckedSettings:
     """Base of the package's own solvers, whose settings are checked against their annotated bounds."""
 
     name: ClassVar[str]
@@ -373,7 +373,7 @@ class _MultiStartSearch:
         """Solution of the best fit, with its uncertainty."""
         result, finish, problem = self._best.result, self._best.evaluation, self._best.weighted
         fit = assess_goodness_of_fit(problem, finish, limits)
-        covariance = misfit_widened_covariance(problem, finish, fit)
+        covariance = misfit_robust_covariance(problem, finish, fit)
         estimates = parameter_estimates(problem, result.x, finish, covariance, fit)
         found = *self._status_and_message(), problem.unknown_names, result.x, covariance, estimates, finish.cost, fit
         history = tuple(entry for one in self._fits for entry in one.history)

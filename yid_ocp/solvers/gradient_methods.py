@@ -24,10 +24,10 @@ from yid_ocp.problem.evaluation import EvaluateFunction, Evaluation
 from yid_ocp.solvers.base import (
     SOLVERS,
     AcceptedIterateRecorder,
-    CheckedSolver,
     Iterate,
     IterationCallback,
     SolverResult,
+    SolverWithCheckedSettings,
     Status,
     projected_gradient_norm,
 )
@@ -43,7 +43,7 @@ _LOWEST = "the cost cannot be lowered any further"
 
 @SOLVERS.register("gauss_newton")
 @dataclass(frozen=True)
-class GaussNewton(CheckedSolver):
+class GaussNewton(SolverWithCheckedSettings):
     """Minimise 1/2 |r(x)|^2 by bounded, damped linear least-squares steps.
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
@@ -148,7 +148,7 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
 
 @SOLVERS.register("single_shooting")
 @dataclass(frozen=True)
-class SingleShooting(CheckedSolver):
+class SingleShooting(SolverWithCheckedSettings):
     """Minimise the cost by SciPy's L-BFGS-B on unknowns scaled to order one.
 
     Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
@@ -202,7 +202,7 @@ class SingleShooting(CheckedSolver):
 
 @SOLVERS.register("steepest_descent")
 @dataclass(frozen=True)
-class SteepestDescent(CheckedSolver):
+class SteepestDescent(SolverWithCheckedSettings):
     """Projected steepest descent: x <- P(x - s g), P the projection on the bounds, s by Armijo backtracking.
 
     The gradient comes from the adjoint. Unscaled on purpose: this is what the paper did. The first length tried in an

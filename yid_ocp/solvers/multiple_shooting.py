@@ -22,9 +22,9 @@ from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.solvers.base import (
     SOLVERS,
     AcceptedIterateRecorder,
-    CheckedSolver,
     IterationCallback,
     SolverResult,
+    SolverWithCheckedSettings,
     Status,
     projected_gradient_norm,
 )
@@ -59,7 +59,7 @@ _CLOSED_DEFECT = 1e-7
 
 @SOLVERS.register("multiple_shooting")
 @dataclass(frozen=True)
-class MultipleShooting(CheckedSolver):
+class MultipleShooting(SolverWithCheckedSettings):
     """Multiple shooting: minimize 1/2 |r|^2 over parameters and node states, subject to the equations of motion.
 
     IPOPT solves the program of `transcribe`, with the DEL equations of every step as constraints. Defects are scaled to

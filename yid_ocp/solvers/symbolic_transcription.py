@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
 from yid_ocp.integrator.discrete import NlpStage, nlp_stage
-from yid_ocp.integrator.statics import holding_spring_stiffness
+from yid_ocp.integrator.statics import driven_joint_holding_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
@@ -385,7 +385,7 @@ class _Maker:
             statics = problem.model_functions.equilibrium_solver
             rest = statics.equations
             sought, held = rest.inputs[0], rest.inputs[2]
-            stiffness = holding_spring_stiffness(problem.system, bool(problem.system.driven))
+            stiffness = driven_joint_holding_stiffness(problem.system, bool(problem.system.driven))
             values = [ca.SX(stiffness), self._freed.theta, ca.SX(self._step.time_step)]
             balance, state = ca.substitute([rest.residual, rest.state], rest.inputs[3:], values)
             posture, nu = rest.inputs[1], held.numel()

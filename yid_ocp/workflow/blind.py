@@ -111,7 +111,7 @@ def run_blind(
         for label, found in zip(labels, answers, strict=True)
     ]
     flags = ["--cases", count, "--seed", seed, *(["--calibration"] if purpose == blind.ENSEMBLE_PURPOSES[1] else [])]
-    result = blind_scores.ensemble_success_rates(marks) | {
+    result = blind_scores.detection_and_false_alarm_rates(marks) | {
         "seed": seed,
         "purpose": purpose,
         "code": package_source_hash(),
@@ -381,7 +381,7 @@ class BlindExperiment:
         vision = not varied.is_without_object and any(group.pose is not None for group in first[0].points)
         values = dict(zip(system.parameters.names, map(float, system.parameters.vector()), strict=True))
         conditions = replace(self._recording_conditions(), has_camera=vision)
-        posture = blind.initial_driven_joint_positions(system, first[0])
+        posture = blind.first_recorded_driven_joint_positions(system, first[0])
         for attempt in range(blind.MAX_CASE_DRAWS):
             rng = np.random.default_rng([self.seed, blind.ENSEMBLE_PURPOSES.index(self.purpose), 3, attempt])
             try:

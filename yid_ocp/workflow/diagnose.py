@@ -19,7 +19,7 @@ from yid_ocp.config.settings import RunSettings, dump_config
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
-from yid_ocp.diagnosis.refit import PrecomputedFits
+from yid_ocp.diagnosis.refit import NominalSolutionAndRefitStore
 from yid_ocp.errors import DataError, OutputError
 from yid_ocp.files import (
     dataclass_from_plain_data,
@@ -84,7 +84,7 @@ def run_diagnose(
                 run.diagnosis.candidates,
                 thresholds=run.diagnosis,
                 progress=logged,
-                known_fits=PrecomputedFits(nominal, refits),
+                known_fits=NominalSolutionAndRefitStore(nominal, refits),
                 baseline=BaselineData.from_runs(runs, without),
                 exclude=run.diagnosis.exclude,
             )

@@ -45,7 +45,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
             if solution.status == Status.FAILED:
                 progress.begin_stage(f"the law '{law}' could not be fitted: {solution.message}")
                 continue
-            fits.append(friction_ladder.fit_friction_law(law, problem, solution, kinds))
+            fits.append(friction_ladder.cross_validate_friction_law(law, problem, solution, kinds))
             solved[law] = (settings, problem, solution)
         if not fits:
             raise DataError("no friction law could be fitted", hint="look at `yid-ocp check` of this configuration")

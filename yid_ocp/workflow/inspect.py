@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from yid_ocp.analysis import step_diagnostics
-from yid_ocp.analysis.step_symbols import EquationEntry, StepSymbols
+from yid_ocp.analysis.step_symbols import EquationOrDerivativeFormula, StepSymbols
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording_hdf5 import create_hdf5_atomically
@@ -63,7 +63,7 @@ def _run_inspect(
         named = [text for text in asked if text and not set(text) & set("[,")]
         for name in named:
             parameters.index(name)
-        chosen = [symbols.equation_entry(text) for text in entries if text.strip() not in named]
+        chosen = [symbols.equation_or_derivative(text) for text in entries if text.strip() not in named]
         free = free_parameter_names(run, parameters)
         progress.begin_stage("linearising")
         problem = build_problem(run, step) if run.recordings.estimate and free else None
@@ -228,7 +228,7 @@ def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]
     }
 
 
-def _entry_result(entry: EquationEntry, symbols: StepSymbols, at: Array) -> dict[str, Any]:
+def _entry_result(entry: EquationOrDerivativeFormula, symbols: StepSymbols, at: Array) -> dict[str, Any]:
     names = "title row=row_name column=column_name zero=is_identically_zero lines=text_lines"
     value = entry.numeric_value(symbols.column_symbols, at)
     return named_attributes(entry, names) | {"operations": entry.formula.n_operations, "value": value}

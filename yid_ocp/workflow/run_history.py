@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.analysis.estimate_history import (
-    EstimateHistory,
+    DriftAndOutlierTests,
     RunEstimates,
     assess_drift_and_outlier_runs,
     pool_estimates,
@@ -259,7 +259,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
     return CommandResult(folder.path, written, None)
 
 
-def estimate_history_to_dict(found: EstimateHistory) -> dict[str, Any]:
+def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:
     """Parameter estimates over several runs as a `yid-history/1` result, without inputs and versions."""
     parameters = {}
     for entry in found.parameter_drifts:

@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.diagnosis import DiagnosisResult
 from yid_ocp.diagnosis.diagnosis_result import joint_overspeed_messages
 from yid_ocp.diagnosis.localise import smoothed_unknown_units, smoothed_unknown_z_scores
-from yid_ocp.inference.null_test import residual_channel_samples
+from yid_ocp.inference.null_test import residual_channel_indices
 from yid_ocp.inference.smoother import SmootherResult
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
@@ -214,7 +214,7 @@ def _recording_figures(
 def _which(finding: DiagnosisResult, result: Mapping[str, Any]) -> _Chapter | None:
     # promised decrease of r'r: in per cent of its excess over noise, or as it is where there is hardly an excess
     fit = finding.nominal_model
-    rows = np.concatenate([series.residual_indices for series in residual_channel_samples(fit.problem)])
+    rows = np.concatenate([series.residual_indices for series in residual_channel_indices(fit.problem)])
     excess = float(np.sum(fit.evaluation.residual[rows] ** 2)) - (len(rows) - len(fit.values))
     percent = finding.verdict != "no_gap" and excess > 0
     factor = 100 / excess if percent else 1.0
