@@ -16,7 +16,7 @@ from yid_ocp.analysis.discretisation import (
     _MAX_GROWTH_DECADES,
     _N_CHECKED_NODES,
     AlternatingErrorGrowth,
-    DiscretisationEstimateShift,
+    EstimateShiftByLinksAndTimeStep,
     FinerDiscretisationProblem,
     _error_growth_along,
     fine_joints_by_coarse_joint,
@@ -124,7 +124,7 @@ ONE, BOTH = math.hypot(0.1, 0.6), math.hypot(0.1, 0.6, 0.8)
     ids=["not tried", "within it", "links", "time step", "both"],
 )
 def test_a_move_larger_than_the_standard_deviation_widens_it_to_where_the_limit_is(links, time_step, std):
-    shifts = {"a": DiscretisationEstimateShift(links, time_step)}
+    shifts = {"a": EstimateShiftByLinksAndTimeStep(links, time_step)}
     found = inflate_estimates_by_discretisation({"a": estimate(10.0, 0.1)}, shifts, {})
     assert found["a"].std == pytest.approx(std)
 
@@ -138,7 +138,7 @@ LOWERED = [(0.6, "identifiable", "weak"), (30.0, "identifiable", "not_identifiab
 def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
     """Of a value of 10 and a standard deviation of 0.02: ten percent are reached by a move of half of them."""
     said = {"a": estimate(10.0, 0.02, verdict=before), "b": estimate(10.0, 0.02), "c": estimate(3.0, 0.0, free=False)}
-    shifts = {"c": DiscretisationEstimateShift(9.0), "a": DiscretisationEstimateShift(move)}
+    shifts = {"c": EstimateShiftByLinksAndTimeStep(9.0), "a": EstimateShiftByLinksAndTimeStep(move)}
     found = inflate_estimates_by_discretisation(said, shifts, {})
     assert found["a"].verdict == after
     assert found["a"].std == (0.02 if move < 0.02 else pytest.approx(math.hypot(0.02, 2 * move)))
@@ -160,7 +160,8 @@ def test_a_verdict_is_lowered_by_moves_and_never_raised(move, before, after):
 )
 def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected):
     said = replace(estimate(10.0, 0.2), interval=interval, lower=0.0, upper=20.0)
-    found = inflate_estimates_by_discretisation({"a": said}, {"a": DiscretisationEstimateShift(0.3)}, {})["a"].interval
+    shifts = {"a": EstimateShiftByLinksAndTimeStep(0.3)}
+    found = inflate_estimates_by_discretisation({"a": said}, shifts, {})["a"].interval
     if expected is None:
         assert found is None
     else:
@@ -169,7 +170,7 @@ def test_an_interval_grows_at_its_ends_by_what_the_move_adds(interval, expected)
 
 def test_what_nothing_informs_stays_unknown():
     said = {"a": estimate(10.0, math.inf, verdict="not_identifiable")}
-    assert inflate_estimates_by_discretisation(said, {"a": DiscretisationEstimateShift(5.0, 5.0)}, {}) == said
+    assert inflate_estimates_by_discretisation(said, {"a": EstimateShiftByLinksAndTimeStep(5.0, 5.0)}, {}) == said
 
 
 def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):

@@ -19,9 +19,9 @@ from yid_ocp.diagnosis.localise import GapLocation
 from yid_ocp.diagnosis.refit import HeldOutLoss, RefittedModel
 from yid_ocp.diagnosis.screening import (
     AllCandidatesLinearization,
-    CandidateDetectability,
     CandidateScore,
     ConfusabilityMatrix,
+    DetectableAmplitudes,
     _EffectSignature,
 )
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
@@ -94,8 +94,8 @@ def score(of: EffectBase, p=0.5, decrease=1.0, statistic=1.0, step=None) -> Cand
     return CandidateScore(of, values, decrease, statistic, p)
 
 
-def visible(of: EffectBase, seen=True, detectable=0.1) -> CandidateDetectability:
-    return CandidateDetectability(of, dict.fromkeys(of.amplitude_names, detectable), seen)
+def visible(of: EffectBase, seen=True, detectable=0.1) -> DetectableAmplitudes:
+    return DetectableAmplitudes(of, dict.fromkeys(of.amplitude_names, detectable), seen)
 
 
 def alike(labels: Sequence[str], matrix) -> ConfusabilityMatrix:

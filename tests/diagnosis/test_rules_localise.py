@@ -9,7 +9,7 @@ from factories import BIAS, FORCE, OFFSET, OTHER_FORCE, cases, place, smoothed, 
 
 from yid_ocp.diagnosis.localise import (
     gap_locations_by_effect_closure,
-    localise_gap,
+    gap_locations_by_smoother_evidence,
     merge_time_intervals,
     smoothed_unknown_units,
     smoothed_unknown_z_scores,
@@ -38,7 +38,7 @@ def described(places):
 )
 def test_places_share_the_gap_by_their_evidence(weight, detectable, expected):
     found = smoothed(weight, detectable=dict.fromkeys(weight, 0.5) | detectable)
-    assert described(localise_gap(found)) == expected
+    assert described(gap_locations_by_smoother_evidence(found)) == expected
 
 
 def test_a_gap_is_there_when_an_unknown_is_surely_not_zero():
@@ -46,9 +46,10 @@ def test_a_gap_is_there_when_an_unknown_is_surely_not_zero():
         trace([FORCE, OTHER_FORCE], [[3.1, 0.0], [-3.1, 0.0], [2.9, 9.0], [3.1, 0.0]], np.ones((4, 2))),
         trace([OTHER_FORCE], [[0.0], [9.0]], np.ones((2, 1)), recording="second"),
     ]
-    found = {p.location: p.time_windows for p in localise_gap(smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces))}
+    seen = smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces)
+    found = {p.location: p.time_windows for p in gap_locations_by_smoother_evidence(seen)}
     assert found == {"T1": ((0.0, 1.0), (1.5, 2.0)), "T2": ((0.5, 1.5),)}
-    first, second = localise_gap(smoothed({FORCE: 3.0, OTHER_FORCE: 1.0}, traces=traces), 5.0)
+    first, second = gap_locations_by_smoother_evidence(seen, 5.0)
     assert (first.time_windows, second.time_windows) == ((), ((0.5, 1.5),))
 
 

@@ -9,7 +9,7 @@ import pytest
 from factories import amplitude, cases, effect, fit, loss
 
 from yid_ocp.diagnosis import blind, blind_scores
-from yid_ocp.diagnosis.blind import BlindCase, CaseGroundTruth, open_sealed_labels, sealed_labels_and_hash
+from yid_ocp.diagnosis.blind import BlindCase, CaseGroundTruth, labels_json_and_sha256, open_sealed_labels
 from yid_ocp.diagnosis.blind_scores import detection_and_false_alarm_rates, score_blind_case
 from yid_ocp.diagnosis.hypotheses import AllCandidatesProblem
 from yid_ocp.errors import DataError
@@ -228,7 +228,7 @@ def test_intervals_and_p_values_are_held_against_what_they_promise():
 
 
 def test_a_sealed_text_is_sorted_holds_all_and_opens_only_as_it_was():
-    text, digest = sealed_labels_and_hash([label("single", KV, multiple=3.0)])
+    text, digest = labels_json_and_sha256([label("single", KV, multiple=3.0)])
     effect = {"kind": "kelvin_voigt", "location": "T1", "values": {"tau": 0.05}}
     told = {"case": "case_000", "category": "single", "injected": [effect], "experiment": "", "multiple": 3.0}
     assert json.loads(text) == [told | {"truth": {"T1.bend": 12.0}}]

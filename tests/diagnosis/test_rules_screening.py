@@ -13,7 +13,7 @@ from yid_ocp.diagnosis.screening import (
     _covariance_of_scores,
     _newey_west_covariance,
     _shape_grid,
-    candidate_detectability,
+    candidate_detectable_amplitudes,
     confusability_matrix,
     make_joint_score_model,
     score_candidates,
@@ -99,21 +99,21 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
 )
 def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size, seen):
     of = effect("friction@elbow", amplitude(lower=-math.inf, expected=expected))
-    [found] = candidate_detectability(point([0.0, 0.0], signature(of, columns, noise)), detection_z=2.0)
+    [found] = candidate_detectable_amplitudes(point([0.0, 0.0], signature(of, columns, noise)), detection_z=2.0)
     assert found.detectable_amplitudes == {"friction@elbow.a": pytest.approx(size)}
     assert found.is_detectable is seen
 
 
 def test_the_range_counts_from_the_neutral_value():
     of = effect("factor@T1", amplitude(neutral=1.0, lower=0.0, expected=(0.7, 1.2)))
-    found = [candidate_detectability(point([0.0], signature(of, [c])), 2.0)[0] for c in (6.0, 8.0)]
+    found = [candidate_detectable_amplitudes(point([0.0], signature(of, [c])), 2.0)[0] for c in (6.0, 8.0)]
     assert [entry.is_detectable for entry in found] == [False, True]
 
 
 @pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
 def test_the_best_shape_tells_what_is_detectable(order):
     at = point([0.0], *(signature(SHAPED, [size], s=size) for size in order))
-    [found] = candidate_detectability(at, detection_z=2.0)
+    [found] = candidate_detectable_amplitudes(at, detection_z=2.0)
     assert found.detectable_amplitudes["branch@T1.a"] == pytest.approx(0.5)
     assert found.is_detectable
 
@@ -128,7 +128,7 @@ def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_s
         ((seen, weaker), "y", 0.5, True),
         ((hidden, larger), "x", 0.1, False),
     ):
-        [found] = candidate_detectability(point([0.0], *pair), detection_z=2.0)
+        [found] = candidate_detectable_amplitudes(point([0.0], *pair), detection_z=2.0)
         assert (found.detectable_amplitudes[f"pair@x.{name}"], found.is_detectable) == (pytest.approx(size), is_seen)
 
 

@@ -33,7 +33,7 @@ from yid_ocp.diagnosis.verdict import (
     find_unknown_verdict_reason,
     fit_with_disagreement_in_std,
     has_significant_gap,
-    is_chance_excess,
+    is_barely_significant_and_unexplained,
 )
 from yid_ocp.progress import NULL_PROGRESS
 
@@ -127,7 +127,8 @@ SPEAKING = smoothed({FORCE: 9.0, BIAS: 0.0}, evidence={"plant": 9.0, "both": 9.0
     },
 )
 def test_a_barely_significant_excess_without_shape_is_chance(found, p_values, before, held_out, chance):
-    assert is_chance_excess(found, scored(*p_values), outcome(p=before), outcome(p=held_out), LIMITS) is chance
+    seen = found, scored(*p_values), outcome(p=before), outcome(p=held_out), LIMITS
+    assert is_barely_significant_and_unexplained(*seen) is chance
 
 
 # -- the verdict ------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import threadpoolctl
 from small_problems import places
 
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
-from yid_ocp.diagnosis.localise import localise_gap, smoothed_unknown_z_scores
+from yid_ocp.diagnosis.localise import gap_locations_by_smoother_evidence, smoothed_unknown_z_scores
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference import smoother, smoother_model
 from yid_ocp.inference.smoother import select_and_smooth_unknowns
@@ -325,7 +325,7 @@ def test_it_is_named_beside_the_place_but_its_own_other_unknowns_are_not():
     sizes, detectable = {HERE: 1.0, LIKE: 0.0, same: 0.0}, dict.fromkeys((HERE, LIKE, same), 0.5)
     seen = SimpleNamespace(group_variance=sizes, detectable_std=detectable, smoothed_unknowns=())
     seen.log_evidence_drop, seen.alternative_groups = {HERE: 9.0, LIKE: 0.0, same: 0.0}, {HERE: (LIKE, same)}
-    first, *_ = localise_gap(seen)
+    first, *_ = gap_locations_by_smoother_evidence(seen)
     assert (first.location, first.indistinguishable_from) == ("here", ("there",))
 
 
@@ -411,14 +411,14 @@ def test_clean_data_have_no_place(driven):
     found = said_of(problem_of(driven, recorded(driven, {}, 2)))
     assert found.log_evidence["both"] == 0
     assert found.gap_origin == "none"
-    assert all(place.gap_share == 0 for place in localise_gap(found))
-    assert any(place.is_observable for place in localise_gap(found))
+    assert all(place.gap_share == 0 for place in gap_locations_by_smoother_evidence(found))
+    assert any(place.is_observable for place in gap_locations_by_smoother_evidence(found))
 
 
 @pytest.mark.parametrize(("joint", "name", "push"), [(0, "shoulder", 0.3), (1, "elbow", 0.03)])
 def test_a_push_is_found_where_and_when_it_was(driven, joint, name, push):
     found = said_of(problem_of(driven, recorded(driven, {joint: (push, 0.8, 1.3)}, 3)))
-    places = localise_gap(found)
+    places = gap_locations_by_smoother_evidence(found)
     assert places[0].location == name
     assert places[0].gap_share > 0.5
     assert found.log_evidence["plant"] > found.log_evidence["sensor"] + 10
@@ -441,13 +441,13 @@ def test_a_sensor_that_reads_wrong_is_told_from_a_push(driven):
     wrong = replace(recording, points=(replace(group, position=moved),))
     found = said_of(problem_of(driven, wrong))
     assert found.gap_origin == "sensor"
-    assert localise_gap(found)[0].location == "points"
+    assert gap_locations_by_smoother_evidence(found)[0].location == "points"
 
 
 def test_efforts_of_prescribed_joints_say_which(bench):
     recording = bench.recording({"joint_coulomb@elbow": {"tau_c": 0.3}}, 1, duration=2.0)
     found = said_of(bench.problem([recording]))
-    places = localise_gap(found)
+    places = gap_locations_by_smoother_evidence(found)
     assert places[0].location == "elbow"
     assert places[0].gap_share > 0.8
     assert found.explainable_gap_fraction > 0.5

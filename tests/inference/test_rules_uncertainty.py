@@ -400,7 +400,7 @@ def test_the_whole_residual_against_chi_squared(count, value, parameters, colour
 def test_smoothed_efforts_repeat_each_other_as_filtered_white_noise_does(urdf_folder):
     step = pendulum_step(urdf_folder, prescribed=PENDULUM)
     problem = EstimationProblem(step, [taken(step, 1, steps=90)], ("elbow.mass",), ProblemOptions(path_cutoff=15.0))
-    low_pass, own = effort_filter_from_path_cutoff(15.0), residual_channel_samples(problem)
+    low_pass, own = effort_filter_from_path_cutoff(15.0), residual_channel_indices(problem)
     found = next(entry.noise_autocorrelation for entry in own if "effort" in entry.group)
     noise = low_pass(H * np.arange(200_000), np.random.default_rng(0).standard_normal((200_000, 1)))[:, 0]
     lags = low_pass.decorrelation_stride(H) * np.arange(1, 4)

@@ -215,7 +215,7 @@ def _resident() -> float:
 
 
 @dataclass(frozen=True)
-class CableMemoryDecision:
+class ChosenCableMemoryFit:
     """Problem and solution with or without cable memory, and the reason; the message is empty without a decision."""
 
     problem: EstimationProblem
@@ -228,7 +228,7 @@ def decide_cable_memory(
     solver: Solver,
     solution: Solution,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
-) -> CableMemoryDecision:
+) -> ChosenCableMemoryFit:
     """The solution, refitted without cable memory where recordings that start in motion do not support it.
 
     Where a cable moves when its recording begins, the load that it bears there is not known, and what it seems to
@@ -237,21 +237,21 @@ def decide_cable_memory(
     """
     memory, moving = _memory_parameters(problem), _moving(problem)
     if not memory or not moving or solution.evaluation is None:
-        return CableMemoryDecision(problem, solution)
+        return ChosenCableMemoryFit(problem, solution)
     without = problem_without_cable_memory(problem)
     known = dict(zip(solution.unknown_names, solution.x, strict=True))
     other = solve(without, solver, without.vector(known).tolist(), limits=limits)
     if other.evaluation is None:
-        return CableMemoryDecision(problem, solution)
+        return ChosenCableMemoryFit(problem, solution)
     if len(moving) < _MIN_MOVING_RECORDINGS:
         words = "memory is not kept: too few recordings start in motion to bear it out"
-        return CableMemoryDecision(without, other, words)
+        return ChosenCableMemoryFit(without, other, words)
     kept, dropped = (_left_out(p, s, moving) for p, s in ((problem, solution), (without, other)))
     told = "recordings that start in motion, each predicted from the others, have the root mean square error"
     errors = f"{told} {kept:.3g} with it and {dropped:.3g} without, in standard deviations"
     if kept < dropped:
-        return CableMemoryDecision(problem, solution, f"memory is kept: {errors}")
-    return CableMemoryDecision(without, other, f"memory is not kept: {errors}")
+        return ChosenCableMemoryFit(problem, solution, f"memory is kept: {errors}")
+    return ChosenCableMemoryFit(without, other, f"memory is not kept: {errors}")
 
 
 def problem_without_cable_memory(problem: EstimationProblem) -> EstimationProblem:

@@ -33,7 +33,7 @@ _EXTRAPOLATION_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
-class DiscretisationEstimateShift:
+class EstimateShiftByLinksAndTimeStep:
     """Shift of one estimate with links divided in two, and half the time step, in its unit; None where not tried."""
 
     links: float | None = None
@@ -125,7 +125,7 @@ def parameter_shifts_in_finer_model(
 
 def inflate_estimates_by_discretisation(
     estimates: Mapping[str, ParameterEstimate],
-    found: Mapping[str, DiscretisationEstimateShift],
+    found: Mapping[str, EstimateShiftByLinksAndTimeStep],
     sizes: Mapping[str, float],
 ) -> dict[str, ParameterEstimate]:
     """Estimates whose standard deviation, interval and verdict include their discretisation shift.

@@ -162,7 +162,7 @@ class BlindCase:
     excluded_kinds: tuple[str, ...]  # left out of the library; mostly one that has nothing to do with the case
 
 
-def sealed_labels_and_hash(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
+def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
     """Return the labels as JSON text and its SHA-256 hash, published before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()

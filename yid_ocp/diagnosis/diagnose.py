@@ -26,7 +26,7 @@ from yid_ocp.diagnosis.diagnosis_result import (
 )
 from yid_ocp.diagnosis.events import NO_EVENTS, EventSet, find_force_and_fault_events, problem_corrected_for_events
 from yid_ocp.diagnosis.hypotheses import (
-    TRUNCATION_FRACTIONS,
+    KEPT_ROLLOUT_FRACTIONS,
     AllCandidatesProblem,
     CandidateChoice,
     TruncatedHeldOutRecording,
@@ -36,7 +36,7 @@ from yid_ocp.diagnosis.hypotheses import (
 from yid_ocp.diagnosis.localise import (
     GapLocation,
     gap_locations_by_effect_closure,
-    localise_gap,
+    gap_locations_by_smoother_evidence,
     main_gap_locations,
     merge_time_intervals,
 )
@@ -58,7 +58,7 @@ from yid_ocp.diagnosis.verdict import (
     find_unknown_verdict_reason,
     fit_with_disagreement_in_std,
     has_significant_gap,
-    is_chance_excess,
+    is_barely_significant_and_unexplained,
 )
 from yid_ocp.errors import DataError, SolverError
 from yid_ocp.inference.null_test import (
@@ -190,9 +190,9 @@ def _diagnosed(seen: _Examined, earlier: BaselineData, clock: dict[str, float]) 
         smoothed = _smooth_about_model(nominal, limits) if smoothed is None else smoothed
         # it knows noise of torques by its spectrum only: too little for a verdict to rest on what it explains
         trusted = None if nominal.problem.has_process_noise else smoothed
-        gap = not is_chance_excess(trusted, scores, before, held, limits)
+        gap = not is_barely_significant_and_unexplained(trusted, scores, before, held, limits)
     clock["localisation"] = time.perf_counter()
-    where = () if smoothed is None else localise_gap(smoothed, limits.location_z)
+    where = () if smoothed is None else gap_locations_by_smoother_evidence(smoothed, limits.location_z)
     fits: tuple[RefittedModel, ...] = ()
     added: tuple[SelectedEffect, ...] = ()
     if gap and enough and scores:
@@ -348,7 +348,7 @@ def _followed(
 ) -> tuple[RefitContext, RefittedModel, tuple[TruncatedHeldOutRecording, ...]]:
     """The nominal model beside held-out recordings as far as it can follow them, fitted again where they were cut."""
     found = before
-    for margin in TRUNCATION_FRACTIONS:
+    for margin in KEPT_ROLLOUT_FRACTIONS:
         if np.isfinite(nominal.held_out_loss.chi2_per_sample):
             break
         composed = replace(search.problem, problem=nominal.problem)
@@ -433,7 +433,7 @@ def _after(
     last = accepted[-1].refitted_model
     remaining = _held_out_null_test(last, limits)
     left = has_significant_gap(_estimation_null_test(last, limits), remaining, limits)
-    rest = localise_gap(_smooth_about_model(last, limits), limits.location_z) if left else ()
+    rest = gap_locations_by_smoother_evidence(_smooth_about_model(last, limits), limits.location_z) if left else ()
     windows = merge_time_intervals([(w.start_time, w.end_time) for w in before.windows if w.is_flagged])
     # every effect closes what it adds to those before it
     closed: dict[str, float] = {}

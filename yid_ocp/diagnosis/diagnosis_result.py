@@ -13,9 +13,9 @@ from yid_ocp.diagnosis.hypotheses import TruncatedHeldOutRecording
 from yid_ocp.diagnosis.localise import GapLocation, main_gap_locations
 from yid_ocp.diagnosis.refit import RefittedModel
 from yid_ocp.diagnosis.screening import (
-    CandidateDetectability,
     CandidateScore,
     ConfusabilityMatrix,
+    DetectableAmplitudes,
     bonferroni_min_p_value,
 )
 from yid_ocp.diagnosis.select import (
@@ -64,7 +64,7 @@ class DiagnosisResult(ReprMixin):
     noise_floor: tuple[AssumedChannelNoiseLevel, ...]
     nominal_test: NullTestResult  # on the recordings to estimate on
     nominal_held_out_test: NullTestResult
-    detectability: tuple[CandidateDetectability, ...]
+    detectability: tuple[DetectableAmplitudes, ...]
     confusability: ConfusabilityMatrix
     candidate_scores: tuple[CandidateScore, ...]  # first pass, best first
     smoother_result: SmootherResult | None  # about the nominal model; None where there is no gap to locate
@@ -349,7 +349,7 @@ def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
 
 
 def recommended_experiment_text(
-    verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], seen: Sequence[CandidateDetectability]
+    verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], seen: Sequence[DetectableAmplitudes]
 ) -> str:
     """Return the sentence that recommends the next recording, by verdict, place of the gap and confusable effects."""
     rivals = next((entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1), ())
@@ -367,7 +367,7 @@ def recommended_experiment_text(
 
 
 def insufficient_data_message(
-    verdict: str, before: NullTestResult, unknowns: int, seen: Sequence[CandidateDetectability], limits: Thresholds
+    verdict: str, before: NullTestResult, unknowns: int, seen: Sequence[DetectableAmplitudes], limits: Thresholds
 ) -> str:
     """Return why the data are insufficient; empty if they suffice."""
     if verdict != "insufficient_data":
@@ -565,10 +565,10 @@ def _event_sentences(events: EventSet) -> str:
         more = f"; and {count - _MAX_EVENTS_LISTED} more" if count > _MAX_EVENTS_LISTED else ""
         first = "One event stands" if count == 1 else f"{count} events stand"
         text.append(f"{first} beside all this, short and in one place: {told}{more}.")
-    return " ".join([*text, *joint_overspeed_messages(events)])
+    return " ".join([*text, *ignored_after_overspeed_messages(events)])
 
 
-def joint_overspeed_messages(events: EventSet) -> list[str]:
+def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
     """Return one sentence for each recording whose end is ignored because a joint moves too fast."""
     said, why = "s on nothing is judged in", "moves too fast for the model to follow."
     return [f"From {e.start_time:.3g} {said} {e.recording}, where {e.joint} {why}" for e in events.overspeeds]

@@ -37,7 +37,7 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
     return tuple(sorted(places, key=lambda place: (-place.gap_share, not place.is_observable)))
 
 
-def localise_gap(
+def gap_locations_by_smoother_evidence(
     smoothed: SmootherResult, location_z: float = DEFAULT_THRESHOLDS.location_z
 ) -> tuple[GapLocation, ...]:
     """Return all locations by their share of the log evidence, largest first, then observable ones without a share.

@@ -51,7 +51,7 @@ class AllCandidatesLinearization:
 
 
 @dataclass(frozen=True)
-class CandidateDetectability:
+class DetectableAmplitudes:
     """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone."""
 
     effect: EffectBase
@@ -127,11 +127,11 @@ def _basis(matrix: Array) -> Array:
     return np.asarray(u[:, singular > 1e-7 * max(singular.max(initial=0.0), 1e-300)])
 
 
-def candidate_detectability(
+def candidate_detectable_amplitudes(
     point: AllCandidatesLinearization, detection_z: float = DEFAULT_THRESHOLDS.detection_z
-) -> tuple[CandidateDetectability, ...]:
-    """Return the detectability of every candidate: amplitudes of `detection_z` standard deviations."""
-    found: dict[str, CandidateDetectability] = {}
+) -> tuple[DetectableAmplitudes, ...]:
+    """Return the smallest detectable amplitudes of every candidate: of `detection_z` standard deviations."""
+    found: dict[str, DetectableAmplitudes] = {}
     for signature in point.signatures:
         effect, neutral = signature.effect, signature.effect.neutral_values
         information = signature.projected_sensitivity.T @ signature.projected_sensitivity
@@ -141,7 +141,7 @@ def candidate_detectability(
         detectable = dict(zip(effect.amplitude_names, map(float, sizes), strict=True))
         widths = {n: max(abs(bound - neutral[n]) for bound in effect.prior_ranges[n]) for n in effect.amplitude_names}
         visible = any(size < widths[name] for name, size in detectable.items())
-        new, best = CandidateDetectability(effect, detectable, visible), found.get(effect.label)
+        new, best = DetectableAmplitudes(effect, detectable, visible), found.get(effect.label)
         if best is None or (visible and not best.is_detectable):
             found[effect.label] = new
         elif min(detectable.values()) < min(best.detectable_amplitudes.values()):
@@ -187,7 +187,7 @@ def _newey_west_covariance(columns: Array, residual: Array, series: Sequence[Res
 def score_candidates(
     point: AllCandidatesLinearization,
     series: Sequence[ResidualChannelIndices],
-    visible: Sequence[CandidateDetectability],
+    visible: Sequence[DetectableAmplitudes],
 ) -> tuple[CandidateScore, ...]:
     """Return the score of every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
@@ -338,7 +338,7 @@ def confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMa
 class ScreeningResult:
     """Detectability, scores and confusability of all candidates at one point."""
 
-    detectability: tuple[CandidateDetectability, ...]
+    detectability: tuple[DetectableAmplitudes, ...]
     candidate_scores: tuple[CandidateScore, ...]  # best first
     confusability: ConfusabilityMatrix
     joint_score_model: AllCandidatesScoreModel
@@ -352,7 +352,7 @@ def screen_candidates(
 ) -> ScreeningResult:
     """Screen all candidates except those of `base`: detectability, score and confusability."""
     point = linearize_candidates(problem, base, values, limits.shape_grid_size)
-    visible = candidate_detectability(point, limits.detection_z)
+    visible = candidate_detectable_amplitudes(point, limits.detection_z)
     ranked = score_candidates(point, residual_channel_indices(problem.problem), visible)
     everything = make_joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, confusability_matrix(everything), everything)

@@ -13,7 +13,7 @@ from typing import Literal
 
 from yid_ocp.diagnosis.hypotheses import join_effect_labels
 from yid_ocp.diagnosis.refit import RefitContext, RefittedModel, refit_with_effects
-from yid_ocp.diagnosis.screening import CandidateDetectability, CandidateScore, bonferroni_min_p_value
+from yid_ocp.diagnosis.screening import CandidateScore, DetectableAmplitudes, bonferroni_min_p_value
 from yid_ocp.diagnosis.select import GapClosure, SelectedEffect
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects import EffectBase
@@ -135,7 +135,7 @@ def has_significant_gap(
     return best < limits.candidate_significance_level and largest > 1 + limits.min_channel_excess_chi2
 
 
-def is_chance_excess(
+def is_barely_significant_and_unexplained(
     smoothed: SmootherResult | None,
     ranked: Sequence[CandidateScore],
     before: NullTestResult,
@@ -154,7 +154,7 @@ def is_chance_excess(
 def decide_verdict(
     gap: bool,
     enough: bool,
-    visible: Sequence[CandidateDetectability],
+    visible: Sequence[DetectableAmplitudes],
     reason: UnknownVerdictReason,
     added: Sequence[SelectedEffect],
 ) -> str:

@@ -410,7 +410,7 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
 
 
 @dataclass(frozen=True, eq=False)
-class NlpStage:
+class NlpStepConstraints:
     """Symbolic equality constraints of one step in a nonlinear program, and their Jacobians.
 
     The latter are sparse derivatives of `residual` (nr, 1) and `prescribed_effort` (nc, 1) by `x0`, `x1`, `lam`, `u`.
@@ -436,7 +436,7 @@ class NlpStage:
         return ca.jacobian(self.residual, chosen), ca.jacobian(self.prescribed_effort, chosen)
 
 
-def nlp_stage(equations: DiscreteEquations, time_step: float) -> NlpStage:
+def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpStepConstraints:
     """One step as constraint rows of a nonlinear program, and their derivatives, for a time step [s].
 
     With x = (q, p, z) the rows are, all of order one,
@@ -471,7 +471,7 @@ def nlp_stage(equations: DiscreteEquations, time_step: float) -> NlpStage:
     rows, effort, *values = ca.cse([ca.sparsify(expression) for expression in made])
     by = [dict(zip(groups, part, strict=True)) for part in (values[: len(groups)], values[len(groups) :])]
     dense = ca.densify(rows), ca.densify(effort)
-    return NlpStage(e, h, x0, x1, e.lam, e.u, e.theta, dense[0], tuple(names), by[0], dense[1], by[1])
+    return NlpStepConstraints(e, h, x0, x1, e.lam, e.u, e.theta, dense[0], tuple(names), by[0], dense[1], by[1])
 
 
 def _slopes(e: DiscreteEquations) -> tuple[dict[str, ca.SX], dict[str, ca.SX]]:

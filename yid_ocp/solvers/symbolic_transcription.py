@@ -6,9 +6,9 @@ The unknowns are, in this order,
 
 with x = (q, p, z). `rest` is the equilibrium at the first posture (coordinates sought, internal ones, forces of the
 grasps), of which x_0 is a function; it is absent where a start is given. The constraints are the equations of that
-equilibrium and the rows of every `NlpStage`; the objective has the whitened samples, interpolated between nodes, and
-the priors. What was recorded are parameters. Where noise drives the motion its errors are unknowns too, after
-the states of their recording, with their standard deviations as priors: at the optimum this is the likelihood of
+equilibrium and the rows of every `NlpStepConstraints`; the objective has the whitened samples, interpolated between
+nodes, and the priors. What was recorded are parameters. Where noise drives the motion its errors are unknowns too,
+after the states of their recording, with their standard deviations as priors: at the optimum this is the likelihood of
 `inference.whitening`, but for what that linearises.
 """
 
@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import SolverError
-from yid_ocp.integrator.discrete import NlpStage, nlp_stage
+from yid_ocp.integrator.discrete import NlpStepConstraints, nlp_step_constraints
 from yid_ocp.integrator.statics import driven_joint_holding_stiffness
 from yid_ocp.parallel import CASADI_LOCK
 from yid_ocp.problem.episodes import Episode
@@ -183,7 +183,7 @@ class _DrivenStage(NamedTuple):
 
 
 def _driven_stage(
-    stage: NlpStage,
+    stage: NlpStepConstraints,
     freed: _FreeParameterSymbols,
     followed: Sequence[int],
     momentum: Array,
@@ -243,7 +243,7 @@ class _Maker:
         for k, name in enumerate(self._names):
             theta[system.parameters.index(name)] = free[k]
         self._freed = _FreeParameterSymbols(self._names, free, fixed, theta)
-        self._stage = nlp_stage(self._step.equations, self._step.time_step)
+        self._stage = nlp_step_constraints(self._step.equations, self._step.time_step)
         self._stages: dict[tuple[bool, bool], _DrivenStage] = {}
         self._sensors: dict[tuple[Sensor, bool, bool], tuple[LocalVariableFunction, bool]] = {}
 

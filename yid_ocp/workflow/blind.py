@@ -203,7 +203,7 @@ class _Proof:
             known = {"first": prepared / f"{name}.h5", "detectable": prepared / f"{name}.json", "folder": str(cases)}
             tasks.append(Task(f"case {entry.number}", {**told[name], **known, "planned": asdict(entry)}))
         made = self.done(_draw_case, tasks, "sealed/drawn")
-        text, digest = blind.sealed_labels_and_hash([blind.CaseGroundTruth.from_dict(entry["label"]) for entry in made])
+        text, digest = blind.labels_json_and_sha256([blind.CaseGroundTruth.from_dict(entry["label"]) for entry in made])
         write_text(self.folder / "sealed/labels.json", text)
         write_strict_json(cases / "cases.json", [entry["case"] for entry in made])
         said = {"sha256": digest, "cases": self.count, "seed": self.seed, "purpose": self.purpose}

@@ -11,8 +11,8 @@ import numpy as np
 
 from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.clock_checks import check_fit_for_drift_and_noise
-from yid_ocp.analysis.compare import CableMemoryDecision, decide_cable_memory
-from yid_ocp.analysis.discretisation import AlternatingErrorGrowth, DiscretisationEstimateShift
+from yid_ocp.analysis.compare import ChosenCableMemoryFit, decide_cable_memory
+from yid_ocp.analysis.discretisation import AlternatingErrorGrowth, EstimateShiftByLinksAndTimeStep
 from yid_ocp.analysis.profile import solution_with_profile_intervals
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
@@ -54,7 +54,7 @@ def run_solve(
         solution, stability = solution_marked_if_step_unstable(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
         solution = solution_with_profile_intervals(problem, solution, progress)
-        shifts: dict[str, DiscretisationEstimateShift] = {}
+        shifts: dict[str, EstimateShiftByLinksAndTimeStep] = {}
         notes: list[str] = []
         if solution.evaluation is not None:
             at = (solution.x, solution.evaluation, _requested_refinements(run))
@@ -92,7 +92,7 @@ run = command_with_settings(run_solve)
 
 def solve_and_decide_cable_memory(
     run: RunSettings, problem: EstimationProblem, folder: RunFolder, progress: Progress
-) -> CableMemoryDecision:
+) -> ChosenCableMemoryFit:
     """Solution by the run's solver, every iterate logged, and the decision whether a cable keeps its memory."""
     steps = sum(episode.grid.steps for episode in problem.episodes)
     small = min(max(steps / 500 * (problem.system.n_coordinates / 50) ** 1.7, 0.1), 1.0)
@@ -178,7 +178,7 @@ def _prediction_errors(
 
 
 def discretisation_shift_results(
-    shifts: Mapping[str, DiscretisationEstimateShift], std: Mapping[str, float]
+    shifts: Mapping[str, EstimateShiftByLinksAndTimeStep], std: Mapping[str, float]
 ) -> dict[str, Any]:
     """Discretisation shifts of estimates for result.json, with each parameter's standard deviation from the data."""
     return {name: {**asdict(own), "std": std.get(name)} for name, own in shifts.items()}
@@ -201,7 +201,7 @@ def measure_discretisation_shifts(
     progress: Progress = NULL_PROGRESS,
     *,
     models_alone: bool = False,
-) -> tuple[dict[str, DiscretisationEstimateShift], list[str]]:
+) -> tuple[dict[str, EstimateShiftByLinksAndTimeStep], list[str]]:
     """Shifts of the estimates when every link is divided in two and when the time step is halved.
 
     Of every shared free parameter, none where nothing was tried; and why something that was asked for is not known.
@@ -226,7 +226,7 @@ def measure_discretisation_shifts(
             found[key] = own
     links, steps = found.get("links", {}), found.get("time_step", {})
     names = problem.shared_parameters if found else ()
-    return {name: DiscretisationEstimateShift(links.get(name), steps.get(name)) for name in names}, notes
+    return {name: EstimateShiftByLinksAndTimeStep(links.get(name), steps.get(name)) for name in names}, notes
 
 
 def _refined_problem(

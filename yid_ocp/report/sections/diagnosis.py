@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.diagnosis import DiagnosisResult
-from yid_ocp.diagnosis.diagnosis_result import joint_overspeed_messages
+from yid_ocp.diagnosis.diagnosis_result import ignored_after_overspeed_messages
 from yid_ocp.diagnosis.localise import smoothed_unknown_units, smoothed_unknown_z_scores
 from yid_ocp.inference.null_test import residual_channel_indices
 from yid_ocp.inference.smoother import SmootherResult
@@ -189,7 +189,7 @@ def _events(finding: DiagnosisResult) -> _Chapter | None:
         "is judged below, as far as that can be done."
         if events.force_estimates
         else "",
-        *joint_overspeed_messages(events),
+        *ignored_after_overspeed_messages(events),
     ]
     by_recording: dict[str, list[TimePlotData]] = {}
     for force in events.force_estimates:
