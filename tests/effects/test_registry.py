@@ -33,7 +33,15 @@ def beam() -> System:
 
 
 # of arms that are moved by commanded positions
-OF_SERVOS = {"servo_gain", "servo_delay", "servo_saturation", "supply_voltage", "back_emf", "joint_load_friction"}
+OF_SERVOS = {
+    "servo_gain",
+    "servo_delay",
+    "servo_saturation",
+    "supply_voltage",
+    "back_emf",
+    "current_limit",
+    "joint_load_friction",
+}
 
 
 def test_the_vocabulary_is_the_shared_one(shared) -> None:
@@ -42,7 +50,7 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     table = {row[0]: row for row in rows[2:]}
     described = {kind.strip() for name in table for kind in name.split(",")}
     assert set(EFFECTS) <= described  # the vocabulary is ahead: kinds of later work stand there as well
-    system, options = baxter_foam_y_system(1), PositionServoOptions(motor=MotorOptions("dc"))
+    system, options = baxter_foam_y_system(1), PositionServoOptions(motor=MotorOptions("dc", "sts3215"))
     servos = System.build(system.mechanism, driven=system.driven, servos=options, grasps=system.grasps)
     places = {kind: (servos, place) for kind, place in candidate_kinds_and_locations(servos, _SENSOR_KINDS)}
     places |= {kind: (system, place) for kind, place in candidate_kinds_and_locations(system, _SENSOR_KINDS)}

@@ -16,6 +16,7 @@ from small_problems import (
 )
 
 from yid_ocp.data.recording import validate_recording
+from yid_ocp.effects import candidate_kinds_and_locations
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.integrator.step import simulate
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorOptions, PositionServoOptions
@@ -28,6 +29,10 @@ VALUES = {
     "elbow.servo_torque_limit": 3.0, "elbow.servo_gain_factor": 100.0,
 }  # fmt: skip
 DC = PositionServoOptions(motor=MotorOptions("dc"))
+FIRMWARE = PositionServoOptions(motor=MotorOptions("dc", "mx64"), firmware=("derivative", "dead_band"))
+FIRMWARE_VALUES = VALUES | {
+    f"{joint}.servo_{term}": value for joint in PENDULUM for term, value in (("derivative", 0.7), ("dead_band", 0.02))
+}
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +46,32 @@ def test_a_dc_motor_limits_its_duty_and_its_speed_takes_torque_beyond_the_limit(
     assert torque([1.0, 0.0], [0.0, 0.0], [2.0, 0.0])[0] == pytest.approx(9.0 - 8.0)
     assert torque([1.0, 0.0], [0.0, 0.0], [-2.0, 0.0])[0] == pytest.approx(9.0 + 8.0)
     assert torque([0.05, 0.0], [0.0, 0.0], [0.1, 0.0])[0] == pytest.approx(60 * 0.05 - 0.4, abs=1e-6)
+
+
+def test_a_firmware_damps_within_its_duty_and_ignores_small_errors(urdf_folder) -> None:
+    torque = torque_function(pendulum_step(urdf_folder, driven=PENDULUM, servos=FIRMWARE), FIRMWARE_VALUES)
+    # within the limit of 9 N m damping and counter-voltage add, beyond it the duty's part is gone
+    assert torque([0.1, 0.0], [0.0, 0.0], [1.0, 0.0])[0] == pytest.approx(60 * (0.1 - 0.02) - (0.7 + 4.0), abs=1e-3)
+    assert torque([1.0, 0.0], [0.0, 0.0], [1.0, 0.0])[0] == pytest.approx(9.0 - 4.0, abs=1e-3)
+    assert abs(torque([0.015, 0.0], [0.0, 0.0], [0.0, 0.0])[0]) < 1e-3 * 60
+    assert torque([-0.1, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == pytest.approx(-60 * 0.08, abs=1e-3)
+    assert torque([0.0, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == 0.0
+    with pytest.raises(ConfigError, match="has a derivative term already"):
+        PositionServoOptions(firmware=("derivative",))
+
+
+def test_a_current_limit_takes_from_braking_as_well(urdf_folder) -> None:
+    effects = [("current_limit", "shoulder", {"limit": 5.0})]
+    step = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=FIRMWARE)
+    torque = torque_function(step, VALUES)
+    most = 5.0 * MOTOR_PRESETS["mx64"].plain.torque_constant
+    assert torque([1.0, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == pytest.approx(most, rel=0.05)
+    assert torque([0.0, 0.0], [0.0, 0.0], [-4.0, 0.0])[0] == pytest.approx(most, rel=1e-3)
+    assert torque([0.02, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == pytest.approx(60 * 0.02, rel=1e-3)
+    # a motor without a published constant has no current
+    bare = pendulum_step(urdf_folder, driven=PENDULUM, servos=DC).system
+    assert ("current_limit", "shoulder") not in candidate_kinds_and_locations(bare, ["joints.position"])
+    assert ("current_limit", "elbow") in candidate_kinds_and_locations(step.system, ["joints.position"])
 
 
 def test_a_motor_that_is_off_gives_no_torque_however_fast_it_turns(step) -> None:
@@ -119,6 +150,7 @@ LADDER = {
     "stribeck": [("joint_coulomb", {"tau_c": 0.8}), ("joint_stribeck", {"tau_s": 0.2, "v_stribeck": 0.1})],
     "presliding": [("joint_presliding", {"tau_c": 0.8})],
     "load": [("joint_coulomb", {"tau_c": 0.3}), ("joint_load_friction", {"share": 0.2})],
+    "firmware": [("current_limit", {"limit": 1.5}), ("supply_voltage", {"scale": 0.9})],
     "drive": [("supply_voltage", {"scale": 0.9}), ("back_emf", {"scale": 1.3}), ("servo_gain", {"scale": 0.8})],
 }
 
@@ -127,7 +159,7 @@ LADDER = {
 @pytest.mark.parametrize("power", ["on", "switched", "off"])
 def test_slopes_through_sticking_reversal_and_rest_are_those_of_differences(urdf_folder, law, power) -> None:
     effects = [(kind, joint, values) for kind, values in LADDER[law] for joint in PENDULUM]
-    step = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=DC)
+    step = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=FIRMWARE if law == "firmware" else DC)
     enabled = np.ones((61, 2))
     enabled[20:35] = 0.0
     group = {
@@ -138,7 +170,7 @@ def test_slopes_through_sticking_reversal_and_rest_are_those_of_differences(urdf
     names = step.system.parameters.names
     # a delay moves the sample at which a motor is switched off: there is a jump, not a slope
     free = [name for name in names if ("servo" in name or "@" in name) and "servo_delay" not in name]
-    made = problem_of(step, group, free)
+    made = problem_of(step, group, free, FIRMWARE_VALUES if law == "firmware" else None)
     assert_slopes_are_those_of_differences(made, lambda _, value: 1e-6 * max(1e-2, abs(value)), 2e-4, 1e-4)
 
 

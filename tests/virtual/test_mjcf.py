@@ -141,7 +141,7 @@ def with_effect(system: System, kind: str, location: str, values: dict[str, floa
 
 def test_every_kind_of_the_library_is_looked_at() -> None:
     ours = {kind for kind in EFFECTS if EFFECTS[kind].__module__.startswith("yid_ocp.effects")}
-    assert set(MECHANICAL) | set(OTHERS) | OF_SERVOS | {"joint_load_friction"} == ours
+    assert set(MECHANICAL) | set(OTHERS) | OF_SERVOS | {"joint_load_friction", "current_limit"} == ours
 
 
 @pytest.mark.parametrize("kind", MECHANICAL)

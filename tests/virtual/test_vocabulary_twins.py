@@ -259,6 +259,18 @@ def test_export_says_that_a_servo_is_native_in_mjcf_alone(servo_arm: System) -> 
     assert lift.forcerange == pytest.approx([-limit, limit])
 
 
+def test_a_firmwares_damping_is_native_in_mjcf_and_its_dead_band_and_current_limit_are_not() -> None:
+    system = moved_by(PositionServoOptions(motor=MotorOptions("dc", "sts3215"), firmware=("derivative", "dead_band")))
+    values = VALUES | {"pan.servo_derivative": 0.3}
+    pan = mujoco.MjModel.from_xml_string(mujoco_xml(system, values)).actuator("pan")
+    assert pan.biasprm[1:3] == pytest.approx((-40.0, -0.3))
+    with pytest.raises(ModelError, match="the servo of 'lift' has a dead band"):
+        mujoco_xml(system, values | {"lift.servo_dead_band": 0.01})
+    limited = system.with_effects([make_effect("current_limit", "pan", system, {"limit": 1.5})])
+    with pytest.raises(ModelError, match="cannot express: dead band and current limit"):
+        mujoco_xml(limited, values)
+
+
 def test_an_exported_model_replays_its_commands(servo_arm: System, recording: Recording) -> None:
     nominal = dict(zip(servo_arm.parameters.names, servo_arm.parameters.vector(VALUES), strict=True))
 

@@ -21,6 +21,7 @@ from yid_ocp.model.system import MidpointState, NodeState, StepTerms, System
 _PLAY_TORQUE = 0.2  # at which three quarters of the backlash are taken up [N m]
 _DEFAULT_EFFORT_LIMIT = 10.0  # of a joint that has none [N m or N]
 _MIN_LIMIT_FRACTION = 0.1  # smallest torque limit that is searched, over the joint's effort limit
+_MIN_LIMIT_CURRENT = 0.1  # smallest current limit that is searched [A]
 
 
 def _recorded_joints(system: System) -> tuple[str, ...]:
@@ -37,9 +38,22 @@ def _dc_motor_joints(system: System) -> tuple[str, ...]:
     return tuple(name for name in base.servo_joint_names(system) if system.servos[name].motor_kind == "dc")
 
 
+def _published_motor_joints(system: System) -> tuple[str, ...]:
+    """Names of joints whose motor has a published torque constant."""
+    return tuple(name for name in _dc_motor_joints(system) if system.servos[name].torque_constant is not None)
+
+
 def _geared_joints(system: System) -> tuple[str, ...]:
     """Names of arm joints whose effort is known; of joints with a servo where there are none."""
     return _effort_joints(system) or base.servo_joint_names(system)
+
+
+def _limit_definition(lowest: float, unit: str, text: str) -> ParameterDefinition:
+    """Definition of tightness = limit^-16, reported as limit in `unit` from `lowest` on."""
+    highest, inverse = lowest**-TORQUE_SATURATION_EXPONENT, f"({unit})^-16"
+    words = f"{text}, to the power -16"
+    tightness = ParameterDefinition("tightness", inverse, 0.0, 0.0, highest, (0.0, highest), words)
+    return replace(tightness, reported_reciprocal=f"limit {unit}", reciprocal_power=TORQUE_SATURATION_EXPONENT)
 
 
 def _effort_arms(system: System) -> tuple[str, ...]:
@@ -297,7 +311,8 @@ class SupplyVoltage(_ServoChange):
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         tightness = servo.torque_limit_tightness * self["scale"] ** -TORQUE_SATURATION_EXPONENT
-        return {"gain": servo.gain * self["scale"], "torque_limit_tightness": tightness}
+        scaled = {name: getattr(servo, name) * self["scale"] for name in ("gain", "derivative")}
+        return scaled | {"torque_limit_tightness": tightness}
 
 
 @EFFECTS.register("back_emf")
@@ -313,6 +328,25 @@ class BackEmf(_ServoChange):
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         return {"damping": servo.damping * self["scale"]}
+
+
+@EFFECTS.register("current_limit")
+class CurrentLimit(_ServoChange):
+    """A limit of a direct-current motor's current, which is its torque over the published torque constant kt.
+
+    Kept inside as limit^-16, as `ServoSaturation` has it; beyond the duty's limit it also takes from braking.
+    """
+
+    equation = "torque = kt clip(torque/kt, limit)"
+    possible_locations = _published_motor_joints
+
+    @classmethod
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
+        """Definition of tightness = limit^-16, reported as limit [A], from `_MIN_LIMIT_CURRENT`."""
+        return (_limit_definition(_MIN_LIMIT_CURRENT, "A", "largest current"),)
+
+    def _changes(self, servo: PositionServo) -> dict[str, Any]:
+        return {"current_limit_tightness": servo.current_limit_tightness + self["tightness"]}
 
 
 @EFFECTS.register("servo_delay")
@@ -344,10 +378,7 @@ class ServoSaturation(_ServoChange):
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
         known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD else _DEFAULT_EFFORT_LIMIT
         torque = "N m" if joint.coordinate_unit == "rad" else "N"
-        highest, text = (_MIN_LIMIT_FRACTION * known) ** -TORQUE_SATURATION_EXPONENT, "largest torque of the servo"
-        unit, text = f"({torque})^-16", f"{text}, to the power -16"
-        tightness = ParameterDefinition("tightness", unit, 0.0, 0.0, highest, (0.0, highest), text)
-        return (replace(tightness, reported_reciprocal=f"limit {torque}", reciprocal_power=TORQUE_SATURATION_EXPONENT),)
+        return (_limit_definition(_MIN_LIMIT_FRACTION * known, torque, "largest torque of the servo"),)
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
         return {"torque_limit_tightness": servo.torque_limit_tightness + self["tightness"]}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal
 
 import casadi as ca
 
@@ -21,11 +21,14 @@ _DEFAULT_FULL_TORQUE_ERROR = 0.05  # at which a servo of unknown gain reaches it
 _DEFAULT_GAIN = 50.0  # of a servo without an effort limit [N m/rad or N/m]
 _DEFAULT_DAMPING_TIME = 0.1  # a servo's damping over its gain [s]
 _MAX_COMMAND_DELAY = 0.5  # [s]
+_MAX_DEAD_BAND = 0.2  # [rad or m]
 MOTOR_OFF_COMMAND = 1e6  # input of a servo whose motor is off; from half of it on there is no torque [rad or m]
+_DEAD_BAND_ROUNDING = 1e-4  # over which the ends of a servo's dead band are rounded off [rad or m]
 SERVO_GAIN_FACTOR = "servo_gain_factor"  # parameter by which a recording states the proportional gain of a firmware
 
 _MotorKind = Literal["ideal", "dc"]
 _MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]
+_FirmwareTerm = Literal["derivative", "dead_band"]
 
 
 @dataclass(frozen=True)
@@ -138,18 +141,33 @@ class PositionServoOptions:
         bool, OptionInfo("whether the controller carries the robot's own weight, so that the servos need not")
     ] = False
     motor: Annotated[MotorOptions, OptionInfo("of every servo")] = MotorOptions()
+    firmware: Annotated[
+        tuple[_FirmwareTerm, ...],
+        OptionInfo(
+            "further terms of the firmware, parameters that begin at zero: derivative (JOINT.servo_derivative: torque "
+            "against the rate within the limit of a dc motor's duty), dead_band (JOINT.servo_dead_band: errors up to "
+            "it are ignored)"
+        ),
+    ] = ()
+
+    def __post_init__(self) -> None:
+        if "derivative" in self.firmware and self.motor.kind == "ideal":
+            what = "an ideal motor has a derivative term already, JOINT.servo_damping"
+            hint = "leave it out, or set model.arms.servo.motor.kind: dc"
+            raise ConfigError(what, where="model.arms.servo.firmware", allowed="derivative with kind: dc", hint=hint)
 
 
 @dataclass(frozen=True)
 class PositionServo:
     """A position servo on one joint, whose input is the commanded coordinate u.
 
-        ideal:  torque = clip(gain (u(t - delay) - q) - damping dq/dt)
-        dc:     torque = clip(gain (u(t - delay) - q)) - damping dq/dt
+        ideal:  torque = clip(gain e - damping dq/dt)
+        dc:     torque = clip(gain e - derivative dq/dt) - damping dq/dt
 
-    with clip(x) = x / (1 + tightness x^p)^(1/p), p = `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, to which
-    further limits add. Of a direct-current motor the limit is that of its duty, and the damping is its counter-voltage
-    (torque = kt/R (duty V - kt dq/dt)). At `MOTOR_OFF_COMMAND` there is no torque at all.
+    with e = u(t - delay) - q beyond the dead band, clip(x) = x / (1 + tightness x^p)^(1/p),
+    p = `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, to which further limits add. Of a direct-current motor
+    the limit is that of its duty, and the damping is its counter-voltage (torque = kt/R (duty V - kt dq/dt));
+    `current_limit_tightness` clips the whole. At `MOTOR_OFF_COMMAND` there is no torque at all.
     """
 
     gain: ca.SX  # includes the firmware's where that is known [N m/rad or N/m]
@@ -158,26 +176,36 @@ class PositionServo:
     torque_limit_tightness: ca.SX  # [(N m)^-p]
     command_interpolation: _CommandInterpolation = "held"
     motor_kind: _MotorKind = "ideal"
+    derivative: ca.SX = field(default_factory=lambda: ca.SX(0))  # of a dc motor's firmware [N m s/rad]
+    dead_band: ca.SX = field(default_factory=lambda: ca.SX(0))  # either way [rad or m]
+    current_limit_tightness: ca.SX = field(default_factory=lambda: ca.SX(0))  # [A^-p]
+    torque_constant: float | None = None  # published one of a dc motor [N m/A]
 
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
         """The servo's torque for a command, a coordinate and its rate [N m or N]."""
         on = command < MOTOR_OFF_COMMAND / 2
-        pull, drag = self.gain * (ca.if_else(on, command, q) - q), self.damping * v
-        demand = pull - drag if self.motor_kind == "ideal" else pull
-        clipped = demand / (1 + self.torque_limit_tightness * demand**TORQUE_SATURATION_EXPONENT) ** (
-            1 / TORQUE_SATURATION_EXPONENT
-        )
-        return ca.if_else(on, clipped if self.motor_kind == "ideal" else clipped - drag, 0)
+        error, drag = ca.if_else(on, command, q) - q, self.damping * v
+        if not self.dead_band.is_zero():
+            near, far = (ca.sqrt((error + w) ** 2 + _DEAD_BAND_ROUNDING**2) for w in (-self.dead_band, self.dead_band))
+            error = error + (near - far) / 2
+        if self.motor_kind == "ideal":
+            return ca.if_else(on, _clipped(self.gain * error - drag, self.torque_limit_tightness), 0)
+        torque = _clipped(self.gain * error - self.derivative * v, self.torque_limit_tightness) - drag
+        if self.torque_constant is not None and not self.current_limit_tightness.is_zero():
+            current = torque / self.torque_constant
+            torque = self.torque_constant * _clipped(current, self.current_limit_tightness)
+        return ca.if_else(on, torque, 0)
 
     def potential_energy(self, command: ca.SX, q: ca.SX) -> ca.SX:
         """Energy 1/2 gain (u - q)^2 of the servo as a spring, without its limit [J]; none while its motor is off."""
         error = ca.if_else(command < MOTOR_OFF_COMMAND / 2, command, q) - q
         return 0.5 * self.gain * error**2
 
-    @property
-    def gain_damping_delay_limit_tightness(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """Gain, damping, command delay and torque limit tightness (limit^-p)."""
-        return self.gain, self.damping, self.command_delay, self.torque_limit_tightness
+
+def _clipped(x: ca.SX, tightness: ca.SX) -> ca.SX:
+    """x / (1 + tightness x^p)^(1/p)."""
+    p = TORQUE_SATURATION_EXPONENT
+    return x / (1 + tightness * x**p) ** (1 / p)
 
 
 def joint_damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
@@ -216,9 +244,13 @@ def build_joint_servos(
             own.append(Parameter(f"{joint}.{SERVO_GAIN_FACTOR}", 1.0, "1", 0.0, math.inf, words))
             gain = gain * own[-1].symbol
         tightness = limit**-TORQUE_SATURATION_EXPONENT
+        further = _firmware_parameters(at, options.firmware)
+        preset = None if options.motor.preset is None else MOTOR_PRESETS[options.motor.preset]
+        more: dict[str, Any] = {term: parameter.symbol for term, parameter in further.items()}
+        more["torque_constant"] = None if preset is None else preset.plain.torque_constant
         how = options.command_interpolation, options.motor.kind
-        servos[joint] = PositionServo(gain, damping, delay, tightness, *how)
-        entries += own
+        servos[joint] = PositionServo(gain, damping, delay, tightness, *how, **more)
+        entries += [*own, *further.values()]
     return servos, entries
 
 
@@ -238,6 +270,20 @@ def _servo_parameters(joint: Joint) -> list[Parameter]:
         Parameter(f"{joint.name}.servo_{name}", value, unit, lower, upper, f"{text}, servo of {joint.name}")
         for name, value, unit, lower, upper, text in rows
     ]
+
+
+def _firmware_parameters(joint: Joint, terms: Sequence[_FirmwareTerm]) -> dict[_FirmwareTerm, Parameter]:
+    angle = joint.coordinate_unit
+    rate, words = "N m s/rad" if angle == "rad" else "N s/m", f"servo of {joint.name}"
+    known = {
+        "derivative": (rate, math.inf, f"torque against the rate within the duty's limit, {words}"),
+        "dead_band": (angle, _MAX_DEAD_BAND, f"error that is ignored, {words}"),
+    }
+    made = {}
+    for term in dict.fromkeys(terms):
+        unit, upper, text = known[term]
+        made[term] = Parameter(f"{joint.name}.servo_{term}", 0.0, unit, 0.0, upper, text)
+    return made
 
 
 def mechanism_without_gravity(tree: Mechanism) -> Mechanism:

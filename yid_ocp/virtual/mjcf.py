@@ -44,6 +44,7 @@ MODEL_ASPECT_DESCRIPTIONS: Mapping[str, str] = {
     "torque_delay": "torque that acts later than recorded",
     "torque_lag": "torque that follows its record",
     "servo": "gain, damping, delay and limit of position servos",
+    "servo_firmware": "dead band and current limit of position servos",
     "clock": "a clock that runs fast or slow",
     "reading": "what a sensor reads; the motion does not depend on it",
     "memory": "forces with a memory",
@@ -60,7 +61,10 @@ MUJOCO_APPROXIMATED_ASPECTS = frozenset({"dry_friction", "grasp_compliance"})
 _IGNORED_ASPECTS = frozenset({"reading", "torque_gain", "torque_offset", "torque_delay", "torque_lag"})
 # aspects for which MuJoCo has an equivalent term
 _NATIVE_ASPECTS = (
-    frozenset(MODEL_ASPECT_DESCRIPTIONS) - MUJOCO_APPROXIMATED_ASPECTS - _IGNORED_ASPECTS - {"clock", "memory", "force"}
+    frozenset(MODEL_ASPECT_DESCRIPTIONS)
+    - MUJOCO_APPROXIMATED_ASPECTS
+    - _IGNORED_ASPECTS
+    - {"servo_firmware", "clock", "memory", "force"}
 )
 
 _JOINTS_PER_BODY = 6  # as many as MuJoCo allows
@@ -120,7 +124,12 @@ def model_aspects_of_parameters(system: System, symbols: ca.SX) -> set[str]:
             part for grasp in held for part in (grasp.compliance, grasp.relaxation_time) if part is not None
         ),
         "sprung_joint": system.joint_compliances.values(),
-        "servo": (part for servo in system.servos.values() for part in servo.gain_damping_delay_limit_tightness),
+        "servo": (
+            part
+            for s in system.servos.values()
+            for part in (s.gain, s.damping, s.command_delay, s.torque_limit_tightness, s.derivative)
+        ),
+        "servo_firmware": (p for s in system.servos.values() for p in (s.dead_band, s.current_limit_tightness)),
         "clock": (system.recorded_time_scale,),
     }
     return {name for name, parts in entered.items() if any(_depends(part, symbols) for part in parts)}
@@ -421,8 +430,9 @@ def _add_actuators(system: System, value: ParameterEvaluator, actuator: Element,
         attributes, servo = {"name": joint, "joint": joint}, system.servos.get(joint)
         bias, between = [-offset, 0.0, 0.0], "linear"
         if servo is not None:
-            own, damping, late, tightness = (float(value(x)[0]) for x in servo.gain_damping_delay_limit_tightness)
-            damping = 0.0 if servo.motor_kind == "dc" else damping
+            rate = servo.derivative if servo.motor_kind == "dc" else servo.damping
+            parts = servo.gain, rate, servo.command_delay, servo.torque_limit_tightness
+            own, damping, late, tightness = (float(value(x)[0]) for x in parts)
             gain, bias, delay = own * gain, [own * bias[0], -own, -damping], delay + late
             between = "zoh" if servo.command_interpolation == "held" else "linear"
             limit = tightness ** (-1 / TORQUE_SATURATION_EXPONENT) if tightness > 0 else math.inf
@@ -477,6 +487,10 @@ def _refuse_inexpressible(system: System, value: ParameterEvaluator, emulate: bo
         if value.is_identically_zero(compliance):
             allowed, hint = "a compliance above zero", "leave the effect out"
             raise ModelError(f"joint '{joint}' is rigid", where="mujoco_xml", allowed=allowed, hint=hint)
+    for joint, servo in system.servos.items():
+        if not value.is_identically_zero(servo.dead_band):
+            allowed = f"{joint}.servo_dead_band: 0"
+            raise ModelError(f"the servo of '{joint}' has a dead band", where="mujoco_xml", allowed=allowed)
     if not value.is_identically_zero(system.recorded_time_scale - 1):
         raise ModelError("the clock is scaled", where="mujoco_xml", allowed="a clock that tells the true time")
 
