@@ -9,7 +9,7 @@ import pytest
 from made_models import Formula, estimate, solution
 from made_models import estimate as estimated
 from made_recordings import chain_of_motors
-from small_problems import places
+from small_problems import pendulum_step, places, taken
 
 from yid_ocp.analysis import discretisation
 from yid_ocp.analysis.discretisation import (
@@ -26,7 +26,7 @@ from yid_ocp.analysis.discretisation import (
 )
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import compile_step, simulate
+from yid_ocp.integrator.step import compile_step, simulate, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
@@ -102,7 +102,7 @@ def test_a_start_and_its_equilibrium_are_carried_to_the_finer_chain():
     fine, asked = problem(lambda x: [x["a"]], start, bounds=free), []
     fine.system = chain(2)
     inner = fine.evaluate
-    fine.evaluate = lambda x, equilibrium_guesses: asked.append((x, equilibrium_guesses)) or inner(x)
+    fine.evaluate = lambda x, derivatives, equilibrium_guesses: asked.append((x, equilibrium_guesses)) or inner(x)
     guesses = (SimpleNamespace(equilibrium_guess=guess) for guess in (np.array([0.2, -0.4]), None))
     at = replace(coarse.evaluate(coarse.initial_unknowns), episode_predictions=tuple(guesses))
     divided = fine_joints_by_coarse_joint(coarse.system, fine.system)
@@ -189,6 +189,33 @@ def test_half_the_step_of_a_pendulum_is_where_its_own_fit_goes(pendulum, twin):
     np.testing.assert_allclose(
         [own[name] for name in coarse.unknown_names], change, rtol=0.1, atol=0.05 * np.abs(change).max()
     )
+
+
+@pytest.mark.parametrize(
+    ("feedback", "encoders"), [("proportional", False), ("proportional", True), ("lqr", True)], ids=str
+)
+def test_beside_torque_noise_the_coarse_weights_say_where_half_the_step_moves_a_fit(urdf_folder, feedback, encoders):
+    """Of steps of 40 ms, of a motion with steps of 2.5 ms: moves of up to three standard deviations."""
+    step = pendulum_step(urdf_folder, driven=("shoulder",))
+    drawn = taken(step, 3, steps=200, camera=False)
+    levels = {"effort_std": 0.05, "effort_bias_std": 0.1, "effort_kind": "command", "position_std": 1e-3}
+    points = replace(drawn.points[0], std=np.full(drawn.points[0].position.shape, 1e-3))
+    if encoders:  # no points that are made of them
+        points = replace(points, name="points_camera", sensor="camera", pose=np.eye(4))
+    drawn = replace(drawn, joints=replace(drawn.joints, **levels), points=(points,))
+    free, options = ("elbow.damping", "elbow.stiffness"), ProblemOptions(feedback=feedback, proportional_gains=(9.0,))
+    truth = EstimationProblem(step_with_time_step(step, 0.0025), [drawn], free, options)
+    recording = truth.simulate_recording(seed=1)
+    coarse, anew = (EstimationProblem(step_with_time_step(step, h), [recording], free, options) for h in (0.04, 0.02))
+    fine, x = coarse.with_time_step(0.02), coarse.initial_unknowns
+    np.testing.assert_array_equal(fine.evaluate(x).residual, anew.evaluate(x).residual)
+    found, finer = (solve(problem, GaussNewton()) for problem in (coarse, anew))
+    refined = FinerDiscretisationProblem(fine)
+    own = parameter_shifts_in_finer_model(refined, found.problem, found.x, found.evaluation)
+    std = np.array([found.std[name] for name in free])
+    change = (finer.x - found.x) / std
+    assert np.abs(change).max() > 2
+    np.testing.assert_allclose([own[name] for name in free] / std, change, rtol=0.1, atol=0.05)
 
 
 H = 0.01

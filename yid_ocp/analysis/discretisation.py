@@ -14,7 +14,6 @@ from yid_ocp.analysis.step_diagnostics import system_with_numeric_parameters
 from yid_ocp.arrays import Array
 from yid_ocp.inference.linearized_residual import bounded_levenberg_marquardt_step
 from yid_ocp.inference.uncertainty import ParameterEstimate, verdict_by_relative_std
-from yid_ocp.inference.whitening import problem_whitened_at
 from yid_ocp.integrator.discrete import ConstraintForcePlacement, ForceSplit
 from yid_ocp.integrator.statics import Equilibrium, EquilibriumSolver
 from yid_ocp.integrator.step import Step, compile_step, simulate
@@ -22,7 +21,8 @@ from yid_ocp.integrator.step_model import Rollout, TrackingFeedback
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
-from yid_ocp.problem.evaluation import Evaluation
+from yid_ocp.problem.episodes import InputErrorModel, truncate_episode
+from yid_ocp.problem.evaluation import Evaluation, ResidualWhitener
 from yid_ocp.problem.unknown_vector import INITIAL_STATE_PREFIX
 
 _START_ANGLE_PREFIX = f"{INITIAL_STATE_PREFIX}q."
@@ -103,24 +103,58 @@ def parameter_shifts_in_finer_model(
 
     Data, bounds and priors are those of the coarse problem, whose evaluation is `at_x`; its prediction replaces the
     data with `model_difference_only`, for points away from an estimate. A message where the step cannot be made.
+
+    Where noise drives the motion, its estimate, the weights and the Jacobian are the coarse ones: the finer model adds
+    its residual alone (Richardson's extrapolation), which saves a filter of its own.
     """
     point, guesses = refined._unknowns(coarse.unknown_names, x), at_x.equilibrium_guesses
     warm = tuple(None if q is None else refined._guess(coarse.system, q) for q in guesses)
     weighted = any(own is not None for own in coarse.whitening_filters)
-    problem = problem_whitened_at(refined.problem, point, warm, rounds=2) if weighted else refined.problem
-    evaluation = problem.evaluate(point, equilibrium_guesses=warm)
-    if not evaluation.ok or evaluation.jacobian is None:
+    problem = _with_coarse_weights(refined.problem, coarse) if weighted else refined.problem
+    own, other = problem.residual_rows, coarse.residual_rows
+    if (model_difference_only and own != other) or (weighted and own.measurements != other.measurements):
+        return "the finer model is compared at other samples"
+    evaluation = problem.evaluate(point, derivatives=not weighted, equilibrium_guesses=warm)
+    residual, jacobian = evaluation.residual, evaluation.jacobian
+    if not evaluation.ok:
         return evaluation.message
-    residual = evaluation.residual
+    if weighted:
+        problem, point, jacobian = coarse, x, at_x.jacobian
+        residual = np.concatenate([residual[other.data], at_x.residual[other.data.stop :]])
     if model_difference_only:
-        if problem.residual_rows != coarse.residual_rows:
-            return "the finer model is compared at other samples"
         residual = residual - at_x.residual
+    assert jacobian is not None
     scale = problem.unknown_scales
     low, high = ((bound - point) / scale for bound in problem.bounds)
-    step = scale * bounded_levenberg_marquardt_step(evaluation.jacobian * scale, residual, 0.0, low, high)
+    step = scale * bounded_levenberg_marquardt_step(jacobian * scale, residual, 0.0, low, high)
     moved = dict(zip(problem.unknown_names, map(float, step), strict=True))
-    return {name: moved[name] / refined._factor(name) for name in problem.shared_parameters}
+    return {name: moved[name] / (1.0 if weighted else refined._factor(name)) for name in problem.shared_parameters}
+
+
+@dataclass(frozen=True)
+class _CoarseWeights:
+    """Filter of a coarser rollout, in each of whose steps `ratio` finer ones make a mean torque."""
+
+    coarse: ResidualWhitener
+    input_errors: InputErrorModel
+    ratio: int
+
+    def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
+        """Whiten as the coarser filter; see `ResidualWhitener`."""
+        if push is not None:
+            push = np.mean(push.reshape(-1, self.ratio, *push.shape[1:]), axis=1)
+        return self.coarse.whiten(rows, push)
+
+
+def _with_coarse_weights(fine: EstimationProblem, coarse: EstimationProblem) -> EstimationProblem:
+    """The finer problem about the coarse one's input errors, whitened by its filters, over the same whole steps."""
+    ratio, episodes = round(coarse.step.time_step / fine.step.time_step), []
+    filters: list[ResidualWhitener | None] = []
+    for own, other, whitening in zip(fine.episodes, coarse.episodes, coarse.whitening_filters, strict=True):
+        errors = other.input_errors and other.input_errors.on_finer_steps(ratio)
+        episodes.append(replace(truncate_episode(own, ratio * other.grid.steps), input_errors=errors))
+        filters.append(_CoarseWeights(whitening, errors, ratio) if whitening and errors else None)
+    return fine.with_episodes(episodes, (), filters)
 
 
 def inflate_estimates_by_discretisation(

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -123,6 +124,15 @@ class InputErrorModel:
         return replace(
             self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
         )
+
+    def on_finer_steps(self, ratio: int) -> InputErrorModel:
+        """The same errors with `ratio` steps in place of each, its torques held and the reference interpolated."""
+        held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
+        made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
+        if (known := self.smoothed_reference) is not None:
+            at, nodes = np.arange(ratio * len(known)) / ratio, np.arange(len(known))
+            made["smoothed_reference"] = np.stack([np.interp(at, nodes, x) for x in known.T], axis=1)
+        return replace(self, **made)
 
     def _truncated_to_steps(self, steps: int) -> InputErrorModel:
         """The same error model restricted to the first `steps` steps of the rollout."""

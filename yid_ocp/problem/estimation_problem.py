@@ -421,6 +421,23 @@ class EstimationProblem(ReprMixin):
         """The same problem on the first `duration` seconds of each recording, rebuilt without held-out recordings."""
         return self._prepared(options=replace(self.options, duration=duration), held_out=())
 
+    def with_time_step(self, time_step: float) -> EstimationProblem:
+        """The same problem with another time step [s], not whitened and without held-out recordings.
+
+        Initial states, guesses of equilibria and loads on gears are those of this problem.
+        """
+        functions = self.model_functions.with_time_step(time_step)
+
+        def placed(episode: Episode) -> Episode:
+            made = prepare_episode(functions, episode.recording, self.options, self.theta)
+            loads, times = made.joint_loads.copy(), (made.grid.node_times, episode.grid.node_times)
+            for column, known in zip(loads.T, episode.joint_loads.T, strict=True):
+                column[:] = np.interp(*times, known)
+            start = {name: getattr(episode, name) for name in ("fixed_initial_state", "equilibrium_guess")}
+            return replace(made, joint_loads=loads, **start)
+
+        return self._changed(model_functions=functions).with_episodes(list(map(placed, self.episodes)), ())
+
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
         """The same problem rebuilt with other options."""
         return self._prepared(options=options)

@@ -12,7 +12,7 @@ import numpy as np
 from yid_ocp.arrays import Array, IntArray
 from yid_ocp.integrator.compiler import MappedFunction
 from yid_ocp.integrator.statics import EquilibriumSolver
-from yid_ocp.integrator.step import Step
+from yid_ocp.integrator.step import Step, step_with_time_step
 from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.integrator.tracking_feedback import (
     EffectMomentumShift,
@@ -311,7 +311,7 @@ class ModelFunctions:
 
     def __init__(self, step: Step, names: tuple[str, ...], start_parameters: tuple[str, ...] = ()) -> None:
         self.step = step
-        self.parameter_names = names
+        self.parameter_names, self._start_parameters = names, start_parameters
         self.input_corrections = InputCorrections(step.system, names, step.is_compiled)
         self._statics = CasadiLockedCache[None, EquilibriumSolver](lambda _: EquilibriumSolver(step))
         self._start_fit = CasadiLockedCache[None, InitialStateFitter](
@@ -320,6 +320,13 @@ class ModelFunctions:
         self._arms = CasadiLockedCache[None, Step](lambda _: driven_joints_only_step(step))
         self._momentum = CasadiLockedCache[None, EffectMomentumShift](lambda _: EffectMomentumShift(step))
         self._sensors: CasadiLockedCache[tuple[Sensor, bool], MappedFunction] = CasadiLockedCache(self._compiled)
+
+    def with_time_step(self, time_step: float) -> ModelFunctions:
+        """The same functions for another time step [s]; those that do not depend on it are shared."""
+        made = ModelFunctions(step_with_time_step(self.step, time_step), self.parameter_names, self._start_parameters)
+        made.input_corrections, made._sensors = self.input_corrections, self._sensors
+        made._arms = CasadiLockedCache(lambda _: step_with_time_step(self.arms_only_integrator_step, time_step))
+        return made
 
     @property
     def equilibrium_solver(self) -> EquilibriumSolver:

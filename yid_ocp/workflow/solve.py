@@ -20,7 +20,6 @@ from yid_ocp.data.issues import Issue
 from yid_ocp.errors import YidError
 from yid_ocp.files import named_attributes
 from yid_ocp.inference.uncertainty import covariance_to_dict, estimates_marked_not_trusted, typical_parameter_magnitudes
-from yid_ocp.integrator.step import step_with_time_step
 from yid_ocp.model.objects.base import CableTopology
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -232,10 +231,9 @@ def measure_discretisation_shifts(
 def _refined_problem(
     run: RunSettings, problem: EstimationProblem, what: _Refinement
 ) -> discretisation.FinerDiscretisationProblem:
-    recordings, options = [episode.recording for episode in problem.episodes], problem.options
     if what == "time_step":
-        step = step_with_time_step(problem.step, problem.step.time_step / 2)
-        return discretisation.FinerDiscretisationProblem(EstimationProblem(step, recordings, problem.free, options))
+        return discretisation.FinerDiscretisationProblem(problem.with_time_step(problem.step.time_step / 2))
+    recordings, options = [episode.recording for episode in problem.episodes], problem.options
     system = build_system(run, link_division=2)
     steps = sum(episode.grid.steps for episode in problem.episodes)
     compiled = problem.step.is_compiled and steps > _MIN_STEPS_TO_COMPILE
