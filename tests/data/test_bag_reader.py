@@ -222,6 +222,55 @@ def test_a_bag_of_twelve_topics(tmp_path: Path) -> None:
     assert any(note.startswith("/tf was left out") for note in by_itself.notes)
 
 
+def wrench(stamp: int, force: float, frame: str = "/ft_link") -> Message:
+    def fields(bag: Bag) -> dict[str, Any]:
+        parts = [bag.of("geometry_msgs/msg/Vector3", size, 0.0, -size) for size in (force, 0.1 * force)]
+        return {"header": bag.header(stamp, frame), "wrench": bag.of("geometry_msgs/msg/Wrench", *parts)}
+
+    return "geometry_msgs/msg/WrenchStamped", fields
+
+
+def inertial(stamp: int, turn: float, variance: float) -> Message:
+    def fields(bag: Bag) -> dict[str, Any]:
+        rate, push = (bag.of("geometry_msgs/msg/Vector3", *parts) for parts in ((turn, 0.0, 0.0), (0.0, 0.0, 9.81)))
+        spread, unknown = variance * np.eye(3).ravel(), -np.eye(3).ravel()
+        covariances = {"orientation_covariance": unknown, "linear_acceleration_covariance": unknown}
+        covariances["angular_velocity_covariance"] = spread
+        turned = bag.of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        values = {"orientation": turned, "angular_velocity": rate, "linear_acceleration": push}
+        return {"header": bag.header(stamp, "camera_imu"), **values, **covariances}
+
+    return "sensor_msgs/msg/Imu", fields
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_wrenches_and_inertial_readings_become_groups_on_the_frames_of_their_headers(kind: str, tmp_path: Path) -> None:
+    messages = [*arm_and_camera()]
+    for k in range(4):
+        stamp = START + k * SECOND // 200
+        messages.append(("/left/wrench", stamp, wrench(stamp, 1.0 + k)))
+        messages.append(("/right/wrench", stamp, wrench(stamp, -1.0, "")))
+        messages.append(("/imu/data", stamp, inertial(stamp, 0.1 * k, 4e-4)))
+    path = write_bag(tmp_path, kind, messages)
+    recording = read_any(path)
+    groups = {group.name: group for group in recording.channel_groups}
+    assert {name: group.names for name, group in groups.items()} == {
+        "wrist_left": ("ft_link",),
+        "wrist_right": ("right",),
+        "imu": ("camera_imu",),
+    }
+    assert groups["imu"].t == pytest.approx(0.005 * np.arange(4))
+    own = groups["wrist_left"].values_by_quantity
+    np.testing.assert_allclose(own["force"][:, 0], np.outer(1.0 + np.arange(4), [1, 0, -1]))
+    np.testing.assert_allclose(own["torque"], 0.1 * own["force"])
+    np.testing.assert_allclose(groups["imu"].values_by_quantity["angular_velocity"][:, 0, 0], 0.1 * np.arange(4))
+    np.testing.assert_allclose(groups["imu"].values_by_quantity["specific_force"][:, 0], [[0, 0, 9.81]] * 4)
+    assert groups["imu"].stds_by_attribute == {"angular_velocity_std": pytest.approx(0.02)}
+    assert not any("wrench" in note or "imu" in note for note in recording.notes)
+    said = {source.name: source.imported_as for source in preview_file(path).sources}
+    assert (said["/left/wrench"], said["/imu/data"]) == ("wrist on /ft_link", "imu on camera_imu")
+
+
 def test_the_preview_of_a_bag_proposes_what_imports_it(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", twelve_topics())
     contents = preview_file(path)

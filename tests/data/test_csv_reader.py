@@ -11,7 +11,7 @@ from recording_examples import joints_of, table
 
 from yid_ocp.data import readers
 from yid_ocp.data.readers import READERS, preview_file, read_any
-from yid_ocp.data.readers.csv import read_csv
+from yid_ocp.data.readers.csv import CsvOptions, read_csv
 from yid_ocp.data.recording import JointGroup, Recording, validate_recording
 from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.errors import DataError
@@ -38,6 +38,24 @@ def test_csv_conventional_columns(tmp_path: Path) -> None:
     assert np.array_equal(points.t, [0.0])
     assert (recording.name, recording.source, recording.description) == ("run", "run.csv", "two joints")
     assert recording.sha256 is not None
+
+
+def test_csv_columns_of_sensors_on_links(tmp_path: Path) -> None:
+    """They have rows of their own; a column of another name is said to be a component."""
+    header = "t,q_a,ft_force_x,ft_force_y,ft_force_z,w1,w2,w3"
+    rows = ["0.0,0.1,1,2,3,,,", "0.5,0.2,,,,0.1,0.2,0.3", "1.0,0.3,4,5,6,0.4,0.5,0.6"]
+    (tmp_path / "run.csv").write_text("\n".join([header, *rows]))
+    columns = {f"w{i + 1}": f"angular_velocity_{axis}:imu_link" for i, axis in enumerate("xyz")}
+    imu, wrist = sorted(
+        read_csv(tmp_path / "run.csv", CsvOptions(columns=columns)).channel_groups, key=lambda g: g.name
+    )
+    assert (imu.name, imu.names, wrist.name, wrist.names) == ("imu", ("imu_link",), "wrist", ("ft",))
+    np.testing.assert_allclose(wrist.t, [0.0, 1.0])
+    np.testing.assert_allclose(wrist.values_by_quantity["force"][:, 0], [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_allclose(imu.t, [0.5, 1.0])
+    np.testing.assert_allclose(imu.values_by_quantity["angular_velocity"][1, 0], [0.4, 0.5, 0.6])
+    with pytest.raises(DataError, match="no column for force_z of 'ft'"):
+        read_csv(tmp_path / "run.csv", CsvOptions(columns={**columns, "ft_force_z": "skip"}))
 
 
 def test_csv_units_are_converted(tmp_path: Path) -> None:

@@ -44,6 +44,9 @@ OF_SERVOS = {
 }
 
 
+SIGNALS = (*_SENSOR_KINDS, "wrist:left_gripper")
+
+
 def test_the_vocabulary_is_the_shared_one(shared) -> None:
     text = (shared / "reference" / "effects.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
@@ -52,14 +55,15 @@ def test_the_vocabulary_is_the_shared_one(shared) -> None:
     assert set(EFFECTS) <= described  # the vocabulary is ahead: kinds of later work stand there as well
     system, options = baxter_foam_y_system(1), PositionServoOptions(motor=MotorOptions("dc", "sts3215"))
     servos = System.build(system.mechanism, driven=system.driven, servos=options, grasps=system.grasps)
-    places = {kind: (servos, place) for kind, place in candidate_kinds_and_locations(servos, _SENSOR_KINDS)}
-    places |= {kind: (system, place) for kind, place in candidate_kinds_and_locations(system, _SENSOR_KINDS)}
+    places = {kind: (servos, place) for kind, place in candidate_kinds_and_locations(servos, SIGNALS)}
+    places |= {kind: (system, place) for kind, place in candidate_kinds_and_locations(system, SIGNALS)}
     for kind in EFFECTS:
         row = next(cells for name, cells in table.items() if kind in map(str.strip, name.split(",")))
         system, place = places[kind]
         effect = make_effect(kind, place, system)
         for quantity in effect.definitions:
             name, _ = quantity.reported_name_and_unit
+            name = "bias per component" if kind == "sensor_bias" else name
             assert re.search(rf"\b{name}\b", row[2]), f"{kind}: {name} not in {row[2]}"
 
 
@@ -68,7 +72,7 @@ def test_every_kind_describes_itself(one_arm) -> None:
         assert EFFECTS[kind].equation
         assert EFFECTS[kind].__doc__
         assert EFFECTS[kind].required_excitation in ORDERED_EXCITATION_DESCRIPTIONS
-    for kind, place in candidate_kinds_and_locations(one_arm, _SENSOR_KINDS):
+    for kind, place in candidate_kinds_and_locations(one_arm, SIGNALS):
         effect = make_effect(kind, place, one_arm)
         assert effect.amplitude_names
         for quantity, entry in zip(effect.definitions, effect.parameters, strict=True):
@@ -81,11 +85,11 @@ def test_every_kind_describes_itself(one_arm) -> None:
 
 
 def test_candidates_of_the_papers_system(one_arm) -> None:
-    found = candidate_kinds_and_locations(one_arm, _SENSOR_KINDS)
+    found = candidate_kinds_and_locations(one_arm, SIGNALS)
     assert {kind for kind, _ in found} == set(EFFECTS) - OF_SERVOS
     assert len(found) == len(set(found))
     blind = candidate_kinds_and_locations(one_arm, ["joints.position"])
-    assert not {kind for kind, _ in blind} & {"camera_scale", "effort_gain", "clock_scale"}
+    assert not {kind for kind, _ in blind} & {"camera_scale", "effort_gain", "clock_scale", "sensor_bias"}
     assert ("kelvin_voigt", "T3") in blind
     assert ("junction_compliance", "w_T1") in blind
     assert ("grasp_slip", "left") in blind

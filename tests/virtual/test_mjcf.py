@@ -69,6 +69,8 @@ OTHERS = {
     "camera_scale": ("camera", {"scale": 1.01}, "not representable"),
     "camera_latency": ("camera", {"delay": 0.05}, "not representable"),
     "surface_offset": ("camera", {"fraction": 0.5}, "not representable"),
+    "sensor_bias": ("wrist:tip", {"force_x": 1.0}, "not representable"),
+    "sensor_scale": ("imu:tip", {"scale": 1.1}, "not representable"),
     "clock_scale": ("clock", {"scale": 1.05}, "not representable"),
     # two branches on joints without mass, which only writing the model shows
     "junction_compliance": ("w_T", {"stiffness": 50.0}, "native"),

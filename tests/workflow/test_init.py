@@ -18,7 +18,14 @@ from yid_ocp.cli import main
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
 from yid_ocp.config.settings import RunSettings
-from yid_ocp.data import JointGroup, PointGroup, Recording, read_recording, write_recording
+from yid_ocp.data import (
+    JointGroup,
+    PointGroup,
+    Recording,
+    SensorChannelGroup,
+    read_recording,
+    write_recording,
+)
 from yid_ocp.model.servos_and_springs import MotorOptions
 from yid_ocp.workflow.build import build_system, settings_by_parameter_name
 
@@ -144,6 +151,19 @@ def test_efforts_beside_points_are_left_alone(bench: Path) -> None:
     run = proposed(moved(SHORT, effort=True))
     assert run.sensors["joints.effort"].use is False
     assert not run.model.effects
+
+
+def test_a_wrist_sensor_is_proposed_with_its_frame_and_noise(bench: Path) -> None:
+    """It takes the place of points; a sensor on an unknown frame, or beside torques that drive, is left out."""
+    noise = np.random.default_rng(0).standard_normal((len(SHORT), 1, 3))
+    wrist = SensorChannelGroup("wrist", ("ft",), SHORT, {"force": 0.1 * noise, "torque": noise}, {"torque_std": 1.0})
+    imu = SensorChannelGroup("imu", ("head",), SHORT, {"angular_velocity": noise})
+    run = proposed(replace(moved(SHORT, parts=(), effort=True), channel_groups=(wrist, imu)))
+    assert run.sensors["joints.effort"].use is False
+    assert run.sensors["wrist.force"].std == pytest.approx(0.1, rel=0.2)
+    assert run.sensors["wrist.torque"].std is None
+    assert run.sensors["wrist.force"].frames == run.sensors["wrist.torque"].frames == {"ft": "hub"}
+    assert run.sensors["imu.angular_velocity"].use is False
 
 
 def test_commands_without_efforts_are_followed_by_servos(bench: Path, capsys: pytest.CaptureFixture[str]) -> None:

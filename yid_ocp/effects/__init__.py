@@ -48,12 +48,12 @@ def signal_kinds_required_by_any_effect() -> frozenset[str]:
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
     """Every pair (effect kind, location) possible in a system and visible in its recorded signals, ordered by kind.
 
-    The system is without the effects in question, the signals are among `signal_kinds_required_by_any_effect`. What
-    works only on prescribed joints is left out where no effort was recorded, for there nothing would show it.
-    `ModelError` of another signal.
+    The system is without the effects in question, the signals are among `signal_kinds_required_by_any_effect`, or a
+    sensor on a frame such as `wrist:FRAME`. What works only on prescribed joints is left out where no effort was
+    recorded, for there nothing would show it. `ModelError` of another signal.
     """
     present, known = set(recorded_sensors), signal_kinds_required_by_any_effect()
-    for name in sorted(present - known):
+    for name in sorted(name for name in present - known if ":" not in name):
         raise ModelError(f"there is no kind of sensor '{name}'", **unknown_name_details(name, sorted(known)))
     unseen = set() if "joints.effort" in present else set(system.prescribed)
     found = []
@@ -61,5 +61,6 @@ def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[s
         cls = EFFECTS[kind]
         if cls.required_sensors <= present:
             places = (cls.candidate_locations or cls.possible_locations)(system)
+            places = [place for place in places if place in present] if cls.is_at_recorded_sensor else places
             found += [(kind, place) for place in places if place not in unseen]
     return found

@@ -91,6 +91,8 @@ class EffectBase(Effect):
     required_sensors: ClassVar[frozenset[str]] = frozenset()  # without which the effect is not observable
     # whether its presence at one location says nothing about others, as for a mass; not so for friction
     is_local: ClassVar[bool] = False
+    # whether a location is a sensor, `GROUP:FRAME`, which a diagnosis tries where recordings hold it
+    is_at_recorded_sensor: ClassVar[bool] = False
     # names of all places where the effect can act, as a function of this module gives them, and of those that a
     # diagnosis tries: all where absent
     possible_locations: ClassVar[Callable[[System], Collection[str]]]

@@ -1,4 +1,4 @@
-"""Errors of cameras and clocks.
+"""Errors of cameras, clocks, wrist sensors and inertial units.
 
 A group of points is a camera's when its sensor has a pose. Points stand in the world frame in a recording, and so do
 offsets and turns here; only the camera's place and where it looks matter of its pose.
@@ -43,7 +43,7 @@ class _CameraEffect(EffectBase):
 
 
 @EFFECTS.register("camera_translation")
-class CameraTranslation(_CameraEffect):
+class _CameraTranslation(_CameraEffect):
     """Constant offset of seen points: seen = true + (x, y, z), along the world's axes."""
 
     equation = "seen point = true + (x, y, z)"
@@ -56,7 +56,7 @@ class CameraTranslation(_CameraEffect):
 
 
 @EFFECTS.register("camera_rotation")
-class CameraRotation(_CameraEffect):
+class _CameraRotation(_CameraEffect):
     """Seen points rotated about the camera's origin by Rz(rz) Ry(ry) Rx(rx), in the world's axes."""
 
     equation = "seen point = c + R (true - c)"
@@ -70,7 +70,7 @@ class CameraRotation(_CameraEffect):
 
 
 @EFFECTS.register("camera_scale")
-class CameraScale(_CameraEffect):
+class _CameraScale(_CameraEffect):
     """Depth error: the vector from the camera to the seen point is scaled, so that its pixel stays."""
 
     equation = "seen point = c + scale (true - c)"
@@ -81,7 +81,7 @@ class CameraScale(_CameraEffect):
 
 
 @EFFECTS.register("surface_offset")
-class SurfaceOffset(_CameraEffect):
+class _SurfaceOffset(_CameraEffect):
     """The camera sees the near surface: a fraction of the tube's radius from its axis towards the camera."""
 
     equation = "seen point = true + fraction r (c - true)/|c - true|"
@@ -99,7 +99,7 @@ class SurfaceOffset(_CameraEffect):
 
 
 @EFFECTS.register("camera_latency")
-class CameraLatency(_CameraEffect):
+class _CameraLatency(_CameraEffect):
     """Seen points are late: seen(t) = true(t - delay)."""
 
     equation = "seen point(t) = true point(t - delay)"
@@ -113,7 +113,7 @@ class CameraLatency(_CameraEffect):
 
 
 @EFFECTS.register("clock_scale")
-class ClockScale(EffectBase):
+class _ClockScale(EffectBase):
     """Recorded time = true time x scale, for a recording with a nominal clock."""
 
     equation = "recorded time = true x scale"
@@ -124,3 +124,67 @@ class ClockScale(EffectBase):
 
     def apply_to_system(self, system: System) -> System:
         return replace(system, recorded_time_scale=system.recorded_time_scale / self["scale"])
+
+
+# -- wrist force/torque sensors and inertial units --------------------------------------------------------------------
+
+_MOUNTED_COMPONENTS = {
+    "wrist": (("force", "N", 200.0, 5.0), ("torque", "N m", 20.0, 0.5)),
+    "imu": (("angular_velocity", "rad/s", 1.0, 0.05), ("specific_force", "m/s^2", 10.0, 0.5)),
+}
+"""By group of a recording: quantity, unit, bound and expected size of a bias."""
+
+
+def _mounted(system: System) -> tuple[str, ...]:
+    frames = [name for name, frame in system.mechanism.frames.items() if frame.joint_index >= 0]
+    return tuple(f"{group}:{frame}" for group in _MOUNTED_COMPONENTS for frame in frames)
+
+
+class _MountedSensorEffect(EffectBase):
+    """An error of a wrist sensor or an inertial unit, whose location is `wrist:FRAME` or `imu:FRAME`."""
+
+    required_excitation = "how it stands against gravity"
+    is_at_recorded_sensor = True
+    is_local = True
+    possible_locations = _mounted
+
+    def _read(self, quantity: str, output: ca.SX) -> ca.SX:
+        return output
+
+    def distorted_reading(self, channel: str, output: ca.SX, state: NodeState) -> ca.SX:
+        group, _, frame = self.location.partition(":")
+        if state.marked_frame != frame or not channel.startswith((f"{group}.", f"{group}_")):
+            return output
+        quantity = next((q for q, *_ in _MOUNTED_COMPONENTS[group] if f".{q}." in channel), None)
+        return output if quantity is None else self._read(quantity, output)
+
+
+@EFFECTS.register("sensor_bias")
+class _SensorBias(_MountedSensorEffect):
+    """Constant error of each component of a wrist sensor or an inertial unit, along the axes of its frame."""
+
+    equation = "measured component = true + bias"
+
+    @classmethod
+    def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
+        """Bias of each component, such as `force_x` [N] or `specific_force_x` [m/s^2]."""
+        return tuple(
+            ParameterDefinition(f"{quantity}_{axis}", unit, 0.0, -most, most, (-usual, usual), "measured less true")
+            for quantity, unit, most, usual in _MOUNTED_COMPONENTS[location.partition(":")[0]]
+            for axis in "xyz"
+        )
+
+    def _read(self, quantity: str, output: ca.SX) -> ca.SX:
+        return output + ca.vertcat(*(self[f"{quantity}_{axis}"] for axis in "xyz"))
+
+
+@EFFECTS.register("sensor_scale")
+class _SensorScale(_MountedSensorEffect):
+    """All readings of a wrist sensor or an inertial unit multiplied by a factor."""
+
+    equation = "measured = scale x true"
+    required_excitation = "how hard it pulls at its ends"
+    declared_parameters = (ParameterDefinition("scale", "1", 1.0, 0.5, 2.0, (0.9, 1.1), "measured over true"),)
+
+    def _read(self, quantity: str, output: ca.SX) -> ca.SX:
+        return self["scale"] * output

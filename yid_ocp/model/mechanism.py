@@ -95,10 +95,16 @@ class Joint:
 
 @dataclass(frozen=True)
 class Frame:
-    """A named frame fixed to a joint's moving side (`joint_index` = -1: to the world)."""
+    """A named frame fixed to a joint's moving side (`joint_index` = -1: to the world).
+
+    Of what else is fixed there, a cut at the frame leaves `proximal_bodies` (in the joint's frame) and the frames and
+    further joints named in `proximal_names` on the side of the joint; all the rest is beyond it.
+    """
 
     joint_index: int
     placement: Placement
+    proximal_bodies: tuple[Inertia, ...] = ()
+    proximal_names: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -173,7 +179,7 @@ class Mechanism(ReprMixin):
             raise ModelError(f"there is no frame '{name}'", where=self.name, hint=nearest_name_hint(name, known))
         tip, part = self.link_chains[line]._locate(_fraction(name, said))
         end = self.frames[tip]
-        return Frame(end.joint_index, Placement(end.placement.rotation, part * end.placement.translation))
+        return replace(end, placement=Placement(end.placement.rotation, part * end.placement.translation))
 
     def ancestor_joint_indices(self, index: int) -> tuple[int, ...]:
         """Indices of the joints from the root to joint `index`, itself included; empty for the world."""
@@ -204,7 +210,10 @@ class Mechanism(ReprMixin):
         for joint in other.joints:
             parent, local = moved(joint.parent_index, joint.placement)
             joints.append(replace(joint, parent_index=parent, placement=local))
-        added = {name: Frame(*moved(entry.joint_index, entry.placement)) for name, entry in other.frames.items()}
+        added = {}
+        for name, entry in other.frames.items():
+            carrier_index, local = moved(entry.joint_index, entry.placement)
+            added[name] = replace(entry, joint_index=carrier_index, placement=local)
         both, chains = self.parameters.with_added(other.parameters), {**self.link_chains, **other.link_chains}
         name = f"{self.name}+{other.name}" if self.joints else other.name
         return Mechanism(name, tuple(joints), {**self.frames, **added}, both, chains)
@@ -214,7 +223,7 @@ class Mechanism(ReprMixin):
         if name in self.frames:
             raise ModelError(f"there is a frame '{name}' already", where=self.name)
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
-        added = Frame(carrier.joint_index, carrier.placement @ Placement.from_matrix(placement))
+        added = replace(carrier, placement=carrier.placement @ Placement.from_matrix(placement))
         return replace(self, frames={**self.frames, name: added})
 
     def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
@@ -240,7 +249,7 @@ class Mechanism(ReprMixin):
         joints = [replace(joint, parent_index=moved(joint.parent_index)) for joint in self.joints]
         later = [replace(joint, parent_index=i) for i, joint in enumerate(chain[1:], index)]
         joints[index:index] = [*chain[:1], *later]
-        frames = {name: Frame(moved(frame.joint_index), frame.placement) for name, frame in self.frames.items()}
+        frames = {name: replace(frame, joint_index=moved(frame.joint_index)) for name, frame in self.frames.items()}
         return replace(self, joints=tuple(joints), frames=frames)
 
 

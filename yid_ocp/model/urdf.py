@@ -140,19 +140,33 @@ def read_urdf(
     made: list[Joint] = []
     for entry in order:
         carrier, at, source = placed[entry]
-        carried = merge_bodies(bodies.get(entry, ()))
+        own = {link: bodies[link] for link, (at_joint, *_) in frames.items() if at_joint == entry and link in bodies}
+        carried = merge_bodies(own.values())
         if carried is not None:
             mass = float(carried.mass)
             parameter = Parameter(f"{entry}.mass", mass, "kg", 0.0, math.inf, f"mass of what {entry} carries")
             parameters.append(parameter)
             carried = replace(carried.scaled_by(parameter.symbol / mass), mass=parameter.symbol)
+            bodies |= {link: body.scaled_by(parameter.symbol / mass) for link, body in own.items()}
         parent = order.index(carrier) if carrier is not None else -1
         made.append(_joint(source, parent, Placement.from_matrix(at), () if carried is None else (carried,)))
-    links = {
-        link: Frame(-1 if carrier is None else order.index(carrier), Placement.from_matrix(at))
-        for link, (carrier, at) in frames.items()
-    }
+    parents = {name: source.parent for name, (_, _, source) in placed.items()}
+    links = {}
+    for link, (carrier, at, _) in frames.items():
+        near = {} if carrier is None else _proximal_links(link, frames)
+        names = frozenset((*near, *(joint for joint, parent in parents.items() if parent in near)))
+        index, rest = -1 if carrier is None else order.index(carrier), tuple(bodies[n] for n in near if n in bodies)
+        links[link] = Frame(index, Placement.from_matrix(at), rest, names)
     return Mechanism(robot.name, tuple(made), links, Parameters(parameters))
+
+
+def _proximal_links(link: str, frames: Mapping[str, tuple[_Carrier, Array, str]]) -> dict[str, None]:
+    """Links that are fixed to one, but do not hang on it."""
+    beyond, carrier = {link}, frames[link][0]
+    for name, (own, _, parent) in frames.items():  # parents before children
+        if own == carrier and parent in beyond:
+            beyond.add(name)
+    return {name: None for name, (own, *_) in frames.items() if own == carrier and name not in beyond}
 
 
 def _parsed(file: Path) -> Any:
@@ -281,19 +295,19 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
 
 def _walk(
     robot: Any, root: str, dropped: Set[str], kept: Collection[str], locked: Mapping[str, float], where: str
-) -> tuple[dict[str, tuple[_Carrier, Array, Any]], dict[_Carrier, list[Inertia]], dict[str, tuple[_Carrier, Array]]]:
-    """Kept joints, bodies by carrier, and links from the root on, each with carrier and placement (4, 4) in its frame.
+) -> tuple[dict[str, tuple[_Carrier, Array, Any]], dict[str, Inertia], dict[str, tuple[_Carrier, Array, str]]]:
+    """Kept joints, bodies by link, and links from the root on, each with carrier and placement (4, 4) in its frame.
 
-    A carrier is a kept joint, None for the world; what is fixed together is merged.
+    A carrier is a kept joint, None for the world; each link comes with the link that it is fixed to, empty for none.
     """
     links = {link.name: link.inertial for link in robot.links}
     joints: dict[str, tuple[_Carrier, Array, Any]] = {}
-    bodies: dict[_Carrier, list[Inertia]] = {}
-    frames: dict[str, tuple[_Carrier, Array]] = {}
-    stack: list[tuple[str, _Carrier, Array]] = [(root, None, np.eye(4))]
+    bodies: dict[str, Inertia] = {}
+    frames: dict[str, tuple[_Carrier, Array, str]] = {}
+    stack: list[tuple[str, _Carrier, Array, str]] = [(root, None, np.eye(4), "")]
     while stack:
-        link, carrier, at = stack.pop()
-        frames[link] = (carrier, at)
+        link, carrier, at, parent = stack.pop()
+        frames[link] = (carrier, at, parent)
         inertial = links[link]
         if inertial is not None and inertial.mass:
             tensor = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, float)
@@ -301,15 +315,15 @@ def _walk(
                 _check_bodies(link, tensor, where)
             body = Inertia.from_values(float(inertial.mass), np.zeros(3), tensor)
             place = Placement.from_matrix(at @ _origin(inertial))
-            bodies.setdefault(carrier, []).append(body.transformed_by(place))
+            bodies[link] = body.transformed_by(place)
         for joint in robot.joints:
             if joint.parent != link or joint.child in dropped:
                 continue
             if joint.name in kept:
                 joints[joint.name] = (carrier, at @ _origin(joint), joint)
-                stack.append((joint.child, joint.name, np.eye(4)))
+                stack.append((joint.child, joint.name, np.eye(4), ""))
             else:
-                stack.append((joint.child, carrier, at @ _origin(joint) @ _locked_motion(joint, locked)))
+                stack.append((joint.child, carrier, at @ _origin(joint) @ _locked_motion(joint, locked), link))
     loose = sorted(set(links) - set(frames) - dropped)
     if loose:
         raise ModelError(f"link '{loose[0]}' does not hang on '{root}'", where=where, allowed="one tree")

@@ -325,6 +325,7 @@ def _samples(
         grid.node_times,
         grid.time_step,
         effort_filter_from_path_cutoff(options.path_cutoff),
+        LowPassFilter(options.path_cutoff),
         partial(_joint_mass_matrices, step, theta),
     )
     found = [data for kind in SENSOR_READERS for data in SENSOR_READERS[kind](around)]

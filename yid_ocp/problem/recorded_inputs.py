@@ -17,6 +17,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import CHANNEL_KINDS, recorded_camera_pose, recorded_joint_columns
+from yid_ocp.sensors.base import channel_kinds_of_group
 
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
 """Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
@@ -191,8 +192,11 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
 
 
 def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
-    """Kinds of recorded signals, among those of `effects.signal_kinds_required_by_any_effect`."""
-    found = set()
+    """Signals that effects require (`effects.signal_kinds_required_by_any_effect`) and recordings contain.
+
+    Each sensor mounted on a frame is one of its own, such as `wrist:FRAME`.
+    """
+    found, mounted = set[str](), set[str]()
     for recording in recordings:
         own = {} if recording.joints is None else {"joints": recording.joints.channels}
         own |= {group.name: dict(group.values_by_quantity) for group in recording.channel_groups}
@@ -200,11 +204,14 @@ def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
             channel = CHANNEL_KINDS[kind]
             if any(channel.matches_group_name(group) and channel.quantity in values for group, values in own.items()):
                 found.add(kind)
+        for group in recording.channel_groups:
+            of_vectors = [channel.group for channel in channel_kinds_of_group(group.name) if channel.components]
+            mounted |= {f"{kind}:{name}" for kind in of_vectors for name in group.names}
         if any(recorded_camera_pose(group) is not None for group in recording.points):
             found.add("camera")
         if any(group.clock == "nominal" for group in recording.all_groups):
             found.add("nominal_clock")
-    return frozenset(found) & signal_kinds_required_by_any_effect()
+    return frozenset(found & signal_kinds_required_by_any_effect() | mounted)
 
 
 def prescribed_path(

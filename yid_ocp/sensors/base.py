@@ -39,19 +39,25 @@ class SensorOptions:
     ] = None
     std: Annotated[
         _Positive | Mapping[str, _Positive] | None,
-        OptionInfo("noise standard deviation instead of the recorded one, by name where they differ", "m, rad or N m"),
+        OptionInfo(
+            "noise standard deviation instead of the recorded one, by name where they differ, in the channel's unit",
+            "m, rad, N m, ...",
+        ),
     ] = None
     frames: Annotated[
         Mapping[str, str],
-        OptionInfo("frame of the model that a point marks, or T1:40%, where the two have different names"),
+        OptionInfo(
+            "frame of the model that a point marks, or T1:40%, or that a wrist sensor or IMU sits on, where the two "
+            "have different names"
+        ),
     ] = field(default_factory=dict)
     points: Annotated[tuple[str, ...] | None, OptionInfo("points to use; all that the model has when absent")] = None
     bias_std: Annotated[
         _NonNegative | Mapping[str, _NonNegative] | None,
         OptionInfo(
-            "standard deviation of a constant error in each joint's torque, another in every recording, instead of the "
-            "recorded one (efforts and currents only)",
-            "N m",
+            "standard deviation of a constant error in each joint's torque or each component of a wrist sensor or IMU, "
+            "another in every recording, instead of the recorded one",
+            "N m, ...",
         ),
     ] = None
     effort_kind: Annotated[
@@ -62,7 +68,10 @@ class SensorOptions:
     ] = None
     constants: Annotated[
         Mapping[str, float | Mapping[str, float]],
-        OptionInfo("constants of the sensor, by name, such as torque_constant [N m/A] of motors.current"),
+        OptionInfo(
+            "constants of the sensor, by name: torque_constant [N m/A] of motors.current, sign (1 or -1) of wrist.force "
+            "and wrist.torque"
+        ),
     ] = field(default_factory=dict)
 
 
@@ -315,6 +324,7 @@ class SensorDataInputs:
     node_times: Array  # of the rollout, shape (N + 1,) [s]
     time_step: float  # between them [s]
     effort_filter: _SmoothingFilter  # of efforts of prescribed joints
+    path_filter: _SmoothingFilter  # of the motion of prescribed joints
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
 
 

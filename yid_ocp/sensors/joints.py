@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 import scipy.special
 
-from yid_ocp.arrays import Array
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.errors import ConfigError, DataError
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
@@ -145,28 +145,43 @@ def smoothed_effort_data(
     error that is constant in the recording; `is_sample` says whether a value is that at its time, not of the interval
     until the next. `DataError` of a recording too short for the filter.
     """
-    times, low_pass = around.node_times, around.effort_filter
-    smooth = low_pass(t, values)
+    period, last = float(np.median(np.diff(t))), len(around.node_times) - 1
     # what stands for an interval belongs to its middle
-    period = float(np.median(np.diff(t)))
     late = 0.0 if is_sample else 0.5 * period
+    kept, measured = smoothed_node_values(around, t, values, "efforts", late)
+    times = around.node_times[kept]
+    unit = sensor.effort_per_unit_reading
+    total, correlation = _smoothed_effort_noise(around, sensor.joint_names, std * np.abs(unit), period, times)
+    if correlation is not None:
+        correlation = correlation * np.outer(np.sign(unit), np.sign(unit))
+    return SensorData(sensor, times, measured, total / np.abs(unit), (1, last - 1), bias, correlation)
+
+
+def smoothed_node_values(
+    around: SensorDataInputs, t: Array, values: Array, noun: str, late: float = 0.0, *, like_path: bool = False
+) -> tuple[IntArray, Array]:
+    """Nodes (K,) and low-pass filtered values (K, k) there, thinned out to independent samples.
+
+    `values` (M, k) belong to the times `t` + `late` [s] and are called `noun` in a `DataError` of a recording too short
+    for the filter: that of efforts, whose prediction is smoothed again, or the one of the path.
+    """
+    low_pass = around.path_filter if like_path else around.effort_filter
+    times, smooth = around.node_times, low_pass(t, values)
     measured = np.stack([np.interp(times, t + late, column) for column in smooth.T], axis=1)
     # Smoothed values repeat their neighbours: only as many are kept as count as independent, none between the samples.
     # Both ends are left out: the filter sees one side alone there, the impulse at node 0 depends on the motion before
     # the recording and that at the last node on the motion after it.
     step, steps = around.time_step, len(times) - 1
-    apart = max(1, round(period / step))
+    apart = max(1, round(float(np.median(np.diff(t))) / step))
     ends = apart * math.ceil(max(1, math.ceil(low_pass.settling_time / step)) / apart)
     kept = np.arange(ends, steps + 1 - ends, apart * math.ceil(low_pass.decorrelation_stride(step) / apart))
+    span = t[[0, -1]] + low_pass.settling_time * np.array([1, -1])
+    kept = kept[(times[kept] > span[0] - step) & (times[kept] < span[1] + step)]
     if not len(kept):
-        what = f"{steps * step:.3g} s of efforts are too short for a filter of {low_pass.cutoff:g} Hz"
+        what = f"{steps * step:.3g} s of {noun} are too short for a filter of {low_pass.cutoff:g} Hz"
         allowed, hint = f"more than {2 * ends * step:.3g} s", "use a longer recording, or raise problem.path_cutoff"
         raise DataError(what, where=around.recording.name, allowed=allowed, hint=hint)
-    unit = sensor.effort_per_unit_reading
-    total, correlation = _smoothed_effort_noise(around, sensor.joint_names, std * np.abs(unit), period, times[kept])
-    if correlation is not None:
-        correlation = correlation * np.outer(np.sign(unit), np.sign(unit))
-    return SensorData(sensor, times[kept], measured[kept], total / np.abs(unit), (1, steps - 1), bias, correlation)
+    return kept, measured[kept]
 
 
 # -- noise levels -----------------------------------------------------------------------------------------------------

@@ -13,13 +13,14 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.data.channel_checks import white_noise_std
 from yid_ocp.data.readers import mean_sample_rate
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import ConfigError, nearest_name_hint
 from yid_ocp.files import named_attributes
 from yid_ocp.model import Mechanism, Segment
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.urdf import read_urdf, resolve_urdf_path
 from yid_ocp.sensors import SensorOptions
+from yid_ocp.sensors.base import ChannelKind, channel_kinds_of_group
 from yid_ocp.sensors.joints import is_noise_std_stated, quantization_step
 
 _TOOL_FRAME_NAMES = ("tool0", "tcp", "gripper", "tool", "end_effector", "ee_link", "flange", "hand", "link8")
@@ -108,7 +109,8 @@ class ConfigProposal:
     @property
     def is_object_measured_only_by_effort(self) -> bool:
         """Whether joint efforts of arms with prescribed motion are the only measurements that depend on the object."""
-        return self.arm_mode == "prescribed" and not self.point_placements
+        seen = (group for group in self.point_placements if not group.startswith("imu"))
+        return self.arm_mode == "prescribed" and not any(seen)
 
 
 def propose_config(
@@ -177,7 +179,7 @@ def propose_config(
         why,
         "estimated" if moving else "equilibrium",
         moving or "all recordings begin at rest",
-        _places(tree, first, branches, holder, standing),
+        _places(tree, first, branches, holder, standing) | _sensor_places(tree, first, holder),
         _noise(first, recorded, joints),
         _time_step(period),
         min(10.0, 0.2 / period),
@@ -233,7 +235,9 @@ def _holder(tree: Mechanism, arms: Sequence[_ArmChain], frame: str | None, stand
 
 
 def _mode(recording: Recording, joints: JointGroup, closed: bool, has_object: bool) -> tuple[str, str]:
-    seen, is_servo = ", ".join(group.name for group in recording.points), joints.effort is None and _commanded(joints)
+    wrists = [group.name for group in recording.channel_groups if group.name.startswith("wrist")]
+    seen = ", ".join([*(group.name for group in recording.points), *wrists])
+    is_servo = joints.effort is None and _commanded(joints)
     if not has_object and not is_servo:
         what = "without an object only an arm of position servos is described"
         allowed = "commanded positions that differ from the measured ones, and no efforts"
@@ -361,6 +365,28 @@ def _along(name: str, percent: int) -> str:
     return f"w_{name}" if percent == 100 else f"{name}:{percent}%"
 
 
+def _sensor_places(tree: Mechanism, recording: Recording, holder: str) -> dict[str, tuple[_PointPlacement, ...]]:
+    """Frames of wrist sensors and inertial units: those of their names, else, of a wrist, that of the holder."""
+    found: dict[str, tuple[_PointPlacement, ...]] = {}
+    for key, group, channel in _mounted_channels(recording):
+        other = ("", "no moving link has that name: write frames: {NAME: FRAME} in place of use: false")
+        if channel.group == "wrist":
+            other = (holder, "a guess: this link and what hangs on it are what the sensor carries")
+        own = {name: name in tree.frames and tree.frames[name].joint_index >= 0 for name in group.names}
+        found[key] = tuple(
+            _PointPlacement(name, name, "a link has that name") if moves else _PointPlacement(name, *other)
+            for name, moves in own.items()
+        )
+    return found
+
+
+def _mounted_channels(recording: Recording) -> Iterator[tuple[str, SensorChannelGroup, ChannelKind]]:
+    for group in recording.channel_groups:
+        for kind in channel_kinds_of_group(group.name):
+            if kind.components and kind.quantity in group.values_by_quantity:
+                yield f"{group.name}.{kind.quantity}", group, kind
+
+
 def _straight(branches: Sequence[Segment]) -> dict[str, Array]:
     """Places along the straight object, by the name of the frame there."""
     spots: dict[str, Array] = {}
@@ -399,6 +425,13 @@ def _noise(recording: Recording, recorded: JointGroup, joints: Sequence[str]) ->
             if not is_noise_std_stated(recorded, f"joints.{channel}", SensorOptions()):
                 noise = _GroupNoise(max(least, *(_size(recorded.t, values[:, j]) for j in at)), unit, _SEEN_NOISE)
             found[f"joints.{channel}"] = noise
+    for key, group, kind in _mounted_channels(recording):
+        noise = _GroupNoise(None, kind.unit, _STATED_NOISE)
+        if kind.std_attribute_names[0] not in group.stds_by_attribute:
+            values = group.values_by_quantity[kind.quantity]
+            sizes = (_size(group.t, column) for column in values.reshape(len(values), -1).T)
+            noise = _GroupNoise(max(1e-3, *sizes), kind.unit, _SEEN_NOISE)
+        found[key] = noise
     return found | {group.name: _point_noise(group) for group in recording.points}
 
 

@@ -307,7 +307,8 @@ def _object(item: InitObjectConfiguration, proposal: ConfigProposal) -> Iterator
     else:
         yield _line("  ", "damping", "0.05", "viscous, of every coordinate [N m s/rad]")
     tips = [f"w_{segment.name}" for segment in item.settings.build_segments()]
-    marked = [place.frame for places in proposal.point_placements.values() for place in places if place.frame]
+    of_points = [places for group, places in proposal.point_placements.items() if "." not in group]
+    marked = [place.frame for places in of_points for place in places if place.frame]
     wanted = dict.fromkeys([*tips, *marked, *grasps.values()])
     if set(wanted) > set(tips):
         yield from _listed("  ", "points", wanted, "frames that sensors may see; NAME:40% along a segment")
@@ -383,6 +384,11 @@ def _sensors(proposal: ConfigProposal) -> Iterator[str]:
         told_by_points = proposal.arm_mode == "prescribed" and not proposal.is_object_measured_only_by_effort
         if group == "joints.effort" and told_by_points:
             entries, said = ["use: false", *entries], "true once friction and payload of the arm are in the model"
+        is_mounted = places and "." in group
+        if is_mounted and (proposal.arm_mode == "driven" or not all(place.frame for place in places)):
+            why = "torques with noise move the arms: set mode: prescribed to use it"
+            entries = ["use: false", *entries]
+            said = why if proposal.arm_mode == "driven" else "its frame is not known"
         # without a setting of its own, a comment
         yield _line("  ", group, f"{{{', '.join(entries)}}}", said) if entries else f"  # {group}: {said}"
         for place in places:

@@ -1,7 +1,8 @@
-"""Bags of ROS 1 and ROS 2, and MCAP files: joint states, stamped points and poses."""
+"""Bags of ROS 1 and ROS 2, and MCAP files: joint states, stamped points and poses, wrist sensors and IMUs."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import JointGroup, PointGroup, Recording
+from yid_ocp.data.recording import JointGroup, PointGroup, Recording, SensorChannelGroup
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import check_input_file, file_sha256, limited_memory
 from yid_ocp.progress import NULL_PROGRESS, Progress
@@ -27,9 +28,11 @@ _POINT_STAMPED = "geometry_msgs/msg/PointStamped"
 _POSES = tuple(f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance", "Transform"))
 _TREES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _PLACES = (_POINT_STAMPED, *_POSES)
-_KNOWN = (JOINT_STATE_MESSAGE_TYPE, *_PLACES)
+_WRENCH, _IMU = "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/Imu"
+_MOUNTED = {_WRENCH: "wrist", _IMU: "imu"}  # group of a recording that messages of a type become
+_KNOWN = (JOINT_STATE_MESSAGE_TYPE, *_PLACES, *_MOUNTED)
 # last parts of topics that say what a message is, not what was seen
-_PLAIN_WORDS = ("pose", "point", "position", "transform", "odom")
+_PLAIN_WORDS = ("pose", "point", "position", "transform", "odom", "wrench", "imu", "data", "data_raw")
 
 
 # -- an open bag ------------------------------------------------------------------------------------------------------
@@ -131,6 +134,7 @@ class _Contents:
     file: OpenBag
     states: Sequence[BagMessage]
     places: Sequence[BagMessage]
+    mounted: Sequence[BagMessage]  # readings of wrist sensors and IMUs
 
 
 @dataclass(frozen=True)
@@ -160,9 +164,10 @@ def read_bag(
     """Read a ROS 1 bag, a ROS 2 bag folder or an MCAP file.
 
     `sensor_msgs/JointState` becomes the joints, of several topics on one clock; stamped points,
-    poses and transforms of `geometry_msgs`, and frames of `/tf`, become points, one group per frame of reference. Times
-    are the headers' stamps (the times of recording if a message has none), from the first message on. A joint channel
-    that is empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.
+    poses and transforms of `geometry_msgs`, and frames of `/tf`, become points, one group per frame of reference;
+    `WrenchStamped` and `Imu` become a group `wrist` or `imu` per topic, on the frame of their header. Times are the
+    headers' stamps (the times of recording if a message has none), from the first message on. A joint channel that is
+    empty, or NaN throughout, was not measured and is left out. Topics that are not used are in `notes`.
 
     `DataError` where `rosbags` is not installed, the bag cannot be read, holds no such topic or leaves a choice open,
     and as `validate_recording`.
@@ -174,11 +179,12 @@ def read_bag(
     bag = _contents(path, tuple(source for source in options.points or () if ":" in source), progress)
     groups, notes = _joints(bag, options, str(path))
     seen = _named_places(bag, options.points, str(path))
-    if not groups and not seen:
+    if not groups and not seen and not bag.mounted:
         allowed = f"topics of the types {', '.join((*_KNOWN, _TREES[0]))}"
         raise bag.file.no_usable_topics_error("the bag has no joint states and no points", allowed)
     places = [message for entries in seen.values() for _, message in entries]
-    seconds = relative_message_time_function([*(m for entry in groups for m in entry.messages), *places])
+    used_messages = [*(m for entry in groups for m in entry.messages), *places, *bag.mounted]
+    seconds = relative_message_time_function(used_messages)
     joint_group, more = _on_one_clock(groups, seconds, str(path))
     points = []
     for frame, entries in seen.items():
@@ -186,12 +192,14 @@ def read_bag(
         name = "points" if len(seen) == 1 else "points_" + frame.replace("/", "_")
         points.append(PointGroup(name, *position, None, options.sensor, frame))
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
+    channels = _mounted_sensors(bag, seconds)
+    used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
     if turned and pose_axes is None:
         more = (*more, f"orientations of {', '.join(sorted(turned))} were left out (pose_axes keeps them)")
     left = [f"{t.name} was left out ({t.kind}, {t.n_messages})" for t in bag.file.topics if t.name not in used]
     own = options.description, path.name, path.stem, digest
-    raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left))
+    raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
     return base.convert_to_si_and_validate(raw, str(path), replace(options, joints=None, points=None))
 
 
@@ -227,7 +235,8 @@ for _kind in (".bag", ".mcap", ".db3", "folder"):
 
 def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _Contents:
     """Decode what can be used of a bag; of trees of transforms the named frames, all of them for None."""
-    bag, states, places = OpenBag(path), list[BagMessage](), list[BagMessage]()
+    bag, states, places, mounted = OpenBag(path), list[BagMessage](), list[BagMessage](), list[BagMessage]()
+    lists = {JOINT_STATE_MESSAGE_TYPE: states, **dict.fromkeys(_MOUNTED, mounted)}
     wanted_kinds = _KNOWN if trees is not None and not trees else (*_KNOWN, *_TREES)
     with bag.read_errors_as_data_errors(), closing(bag.reader) as reader:
         wanted = [connection for connection in reader.connections if connection.msgtype in wanted_kinds]
@@ -244,8 +253,8 @@ def _contents(path: Path, trees: Sequence[str] | None, progress: Progress) -> _C
                         places.append(_message(source, logged, part, _POSES[2]))
                 continue
             message = _message(connection.topic, logged, content, connection.msgtype)
-            (states if connection.msgtype == JOINT_STATE_MESSAGE_TYPE else places).append(message)
-    return _Contents(bag, states, places)
+            lists.get(connection.msgtype, places).append(message)
+    return _Contents(bag, states, places, mounted)
 
 
 def _message(source: str, logged: int, content: Any, kind: str) -> BagMessage:
@@ -260,6 +269,8 @@ def _plain(content: Any, kind: str) -> SimpleNamespace:
         names = [str(name) for name in content.name]
         values = {key: np.asarray(getattr(content, key), float).ravel() for key in ("position", "velocity", "effort")}
         return SimpleNamespace(frame=frame, name=names, **values)
+    if kind in _MOUNTED:
+        return SimpleNamespace(frame=frame, **_vectors(content, kind))
     if kind == _POINT_STAMPED:
         return SimpleNamespace(frame=frame, point=_numbers(content.point, "xyz"), axes=None)
     if kind == _POSES[2]:
@@ -270,8 +281,41 @@ def _plain(content: Any, kind: str) -> SimpleNamespace:
     return SimpleNamespace(frame=frame, point=_numbers(place, "xyz"), axes=_numbers(turn, "xyzw"))
 
 
+def _vectors(content: Any, kind: str) -> dict[str, Any]:
+    """Values by quantity, and variances of their components where the message states them."""
+    if kind == _WRENCH:
+        return {"values": {name: _numbers(getattr(content.wrench, name), "xyz") for name in ("force", "torque")}}
+    parts = {"angular_velocity": "angular_velocity", "specific_force": "linear_acceleration"}
+    variances = {name: np.asarray(getattr(content, f"{own}_covariance"), float)[::4] for name, own in parts.items()}
+    return {
+        "values": {name: _numbers(getattr(content, own), "xyz") for name, own in parts.items()},
+        "variances": {name: own for name, own in variances.items() if np.all(own >= 0) and np.any(own > 0)},
+    }
+
+
 def _numbers(content: Any, names: str) -> tuple[float, ...]:
     return tuple(float(getattr(content, name)) for name in names)
+
+
+# -- wrist sensors and inertial units ---------------------------------------------------------------------------------
+
+
+def _mounted_sensors(bag: _Contents, seconds: Callable[[BagMessage], float]) -> tuple[SensorChannelGroup, ...]:
+    """A group for each topic of wrenches or inertial readings, with the frame of its headers as the sensor's name."""
+    made = []
+    for kind, group in _MOUNTED.items():
+        topics = _names_of(bag, kind)
+        for topic, name in topics.items():
+            messages = sorted((m for m in bag.mounted if m.source == topic), key=seconds)
+            if not messages:
+                continue
+            first = messages[0].content
+            values = {key: np.array([[m.content.values[key]] for m in messages]) for key in first.values}
+            stds = {f"{key}_std": math.sqrt(own.mean()) for key, own in getattr(first, "variances", {}).items()}
+            frame, own_name = first.frame.strip("/") or name, group if len(topics) == 1 else f"{group}_{name}"
+            t = np.array([seconds(message) for message in messages])
+            made.append(SensorChannelGroup(own_name, (frame,), t, values, stds))
+    return tuple(made)
 
 
 # -- joints -----------------------------------------------------------------------------------------------------------
@@ -387,10 +431,10 @@ def _joint_group(entry: _States, seconds: Callable[[BagMessage], float], where: 
 _MessagesByFrame = dict[str, list[tuple[str, BagMessage]]]
 
 
-def _names_of(bag: _Contents) -> dict[str, str]:
-    """Topics that become points by themselves, and the last part of each that says what was seen."""
+def _names_of(bag: _Contents, *kinds: str) -> dict[str, str]:
+    """Topics of some types, those of points when absent, and the last part of each that says what was seen."""
     names = dict[str, str]()
-    for topic in bag.file.topic_names_of_types(*_PLACES):
+    for topic in bag.file.topic_names_of_types(*(kinds or _PLACES)):
         parts = [part for part in topic.split("/") if part]
         telling = [part for part in parts if part.lower() not in _PLAIN_WORDS]
         names[topic] = (telling or parts)[-1]
@@ -453,7 +497,8 @@ def _positions(
 
 
 def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) -> base.FileDataSourceSummary:
-    own = [m for m in (*bag.states, *bag.places) if m.source.partition(":")[0] == topic.name]
+    messages = (*bag.states, *bag.places, *bag.mounted)
+    own = [m for m in messages if m.source.partition(":")[0] == topic.name]
     logged = [message.logged for message in own]
     span = 1e-9 * (max(logged) - min(logged)) if logged else 0.0
     rate = (topic.n_messages - 1) / span if span > 0 else float("nan")
@@ -464,6 +509,9 @@ def _preview_source(topic: _BagTopic, bag: _Contents, names: Mapping[str, str]) 
     elif topic.name in names:
         frames = ", ".join(dict.fromkeys(message.content.frame for message in own))
         becomes, note = f"point {names[topic.name]}", f"in {frames}" if frames else ""
+    elif topic.kind in _MOUNTED:
+        frames = ", ".join(dict.fromkeys(message.content.frame for message in own))
+        becomes, note = f"{_MOUNTED[topic.kind]} on {frames or topic.name}", ""
     elif topic.kind in _TREES:
         children = sorted({message.source.partition(":")[2] for message in own})
         note = f"frames {', '.join(children)}: --points {topic.name}:FRAME=POINT"

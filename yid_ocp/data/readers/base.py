@@ -159,7 +159,8 @@ def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAnd
         std = None if entry.std is None else factors["points"] * entry.std
         t, position = factors["t"] * entry.t, factors["points"] * entry.position
         seen.append(replace(entry, t=t, position=position, std=std))
-    return validate_recording(replace(raw, joints=group, points=tuple(seen)), where=where)
+    others = tuple(replace(entry, t=factors["t"] * entry.t) for entry in raw.channel_groups)
+    return validate_recording(replace(raw, joints=group, points=tuple(seen), channel_groups=others), where=where)
 
 
 def _chosen_points(groups: Sequence[PointGroup], chosen: Mapping[str, str], where: str) -> tuple[PointGroup, ...]:

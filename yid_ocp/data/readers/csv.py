@@ -16,18 +16,31 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from yid_ocp.arrays import Array
+from yid_ocp.arrays import Array, IntArray
 from yid_ocp.data.readers import base
-from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, RecordedOrNominalClock, Recording
+from yid_ocp.data.recording import (
+    JOINT_CHANNEL_UNITS,
+    JointGroup,
+    PointGroup,
+    RecordedOrNominalClock,
+    Recording,
+    SensorChannelGroup,
+)
 from yid_ocp.errors import DataError, nearest_name_hint, unknown_name_details
 from yid_ocp.files import MAX_INPUT_NUMBERS, check_input_file, check_number_count, file_sha256
+from yid_ocp.sensors import CHANNEL_KINDS
 
 _PREFIXES = {"q_": "position", **{f"{channel}_": channel for channel in JOINT_CHANNEL_UNITS}}
 _NUMBERED = {"q": "position", "dq": "velocity", "cmd": "position_command"}
 """What Isaac Sim's system identification calls the columns of joints 1, 2, ..., whatever the case."""
 _AXES = ("x", "y", "z")
 _Meaning = tuple[str, str] | None
-"""Of a column: ("t", ""), (channel, joint), (axis, point), or None for one to leave out."""
+"""Of a column: ("t", ""), (channel, joint), (axis, point), (component, sensor), or None for one to leave out."""
+_MOUNTED = [
+    channel for key in CHANNEL_KINDS if (channel := CHANNEL_KINDS[key]).components and channel.group != "points"
+]
+_COMPONENTS = tuple(f"{channel.quantity}_{axis}" for channel in _MOUNTED for axis in channel.components)
+"""Components of vectors that sensors on a link read, such as `force_x`."""
 _MOST_BAD = 0.5  # of a table's lines; beyond it the table is not understood at all
 _MAX_COLUMNS, _MAX_LINE_LENGTH = 5000, 1 << 20  # columns; characters
 _LINE_COST = 16  # in cells: what a line takes beside them
@@ -61,9 +74,11 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
 
     Columns are understood by their names: `t` or `time`; a channel and a joint, `q_<joint>`, `position_<joint>`,
     `velocity_<joint>`, `effort_<joint>` and so on; `q1`, `dq1` and `cmd1` as in telemetry of Isaac Sim's system
-    identification, position, velocity and commanded position of joint 1; else a point and an axis, `<point>_x`,
-    `<point>_y`, `<point>_z`. An empty cell is NaN; lines that begin with `#` are comments. Where a table has joints and
-    points, a row in which all cells of one of them are empty is a time at which only the other was measured.
+    identification, position, velocity and commanded position of joint 1; `<sensor>_force_x`, `<sensor>_torque_x` of a
+    wrist sensor, `<sensor>_angular_velocity_x`, `<sensor>_specific_force_x` of an inertial unit; else a point and an
+    axis, `<point>_x`, `<point>_y`, `<point>_z`. An empty cell is NaN; lines that begin with `#` are comments. Where a
+    table has joints, points or such sensors together, a row in which all cells of one of them are empty is a time at
+    which only the others were measured.
 
     `DataError` where the file, a column, a cell, an option or a unit cannot be understood, and as `validate_recording`.
     """
@@ -71,12 +86,13 @@ def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> R
     digest = file_sha256(path)
     meanings, table, notes = _read_table(path, options)
     raw = _raw(meanings, table, str(path), options)
-    made = Recording(raw.joints, raw.points, options.description, path.name, path.stem, digest, notes=notes)
+    said = options.description, path.name, path.stem, digest
+    made = Recording(raw.joints, raw.points, *said, notes=notes, channel_groups=raw.channel_groups)
     return base.convert_to_si_and_validate(made, str(path), options)
 
 
 def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options: CsvOptions = _DEFAULTS) -> Recording:
-    """The table's joints and points in its own units."""
+    """The table's joints, points and other sensors in its own units."""
     t = table[:, meanings.index(("t", ""))]
     found = [meaning for meaning in meanings if meaning[0] in JOINT_CHANNEL_UNITS]
     joint_names = tuple(dict.fromkeys(joint for _, joint in found))
@@ -85,15 +101,44 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
     point_names = tuple(dict.fromkeys(point for axis, point in meanings if axis in _AXES))
     wanted = [(axis, name) for name in point_names for axis in _AXES]
     position = _gather(meanings, table, wanted, where).reshape(len(table), len(point_names), 3)
-    joint_rows = point_rows = np.arange(len(t))
-    if joint_names and point_names:
-        joint_rows = np.flatnonzero(~np.isnan(np.hstack(list(channels.values()))).all(axis=1))
-        point_rows = np.flatnonzero(~np.isnan(position).all(axis=(1, 2)))
-    own: dict[str, Any] = {name: values[joint_rows] for name, values in channels.items()}
-    group = JointGroup(joint_names, t[joint_rows], clock=options.clock, **own) if joint_names else None
-    said = options.sensor, options.frame, None, options.clock
-    points = PointGroup("points", point_names, t[point_rows], position[point_rows], None, *said)
-    return Recording(group, (points,) if point_names else ())
+    mounted = _mounted_sensors(meanings, table, where)
+    is_alone = bool(joint_names) + bool(point_names) + len(mounted) < 2
+
+    def measured(values: Sequence[Array]) -> IntArray:
+        """Rows in which not all cells are empty; all of them where nothing else is in the table."""
+        flat = np.hstack([entry.reshape(len(table), -1) for entry in values])
+        return np.arange(len(t)) if is_alone else np.flatnonzero(~np.isnan(flat).all(axis=1))
+
+    joints, points, sensors = None, list[PointGroup](), list[SensorChannelGroup]()
+    if joint_names:
+        rows = measured(list(channels.values()))
+        own: dict[str, Any] = {name: values[rows] for name, values in channels.items()}
+        joints = JointGroup(joint_names, t[rows], clock=options.clock, **own)
+    if point_names:
+        rows, said = measured([position]), (options.sensor, options.frame, None, options.clock)
+        points.append(PointGroup("points", point_names, t[rows], position[rows], None, *said))
+    for name, (names, parts) in mounted.items():
+        rows = measured(list(parts.values()))
+        kept = {quantity: values[rows] for quantity, values in parts.items()}
+        sensors.append(SensorChannelGroup(name, names, t[rows], kept, clock=options.clock))
+    return Recording(joints, tuple(points), channel_groups=tuple(sensors))
+
+
+def _mounted_sensors(
+    meanings: Sequence[tuple[str, str]], table: Array, where: str
+) -> dict[str, tuple[tuple[str, ...], dict[str, Array]]]:
+    """Names of sensors on links, and values (M, k, components) by quantity, by group."""
+    found: dict[str, tuple[tuple[str, ...], dict[str, Array]]] = {}
+    for channel in _MOUNTED:
+        parts = [f"{channel.quantity}_{axis}" for axis in channel.components]
+        if not any(kind in parts for kind, _ in meanings):
+            continue
+        of_group = [f"{c.quantity}_{axis}" for c in _MOUNTED if c.group == channel.group for axis in c.components]
+        names = tuple(dict.fromkeys(name for kind, name in meanings if kind in of_group))
+        values = _gather(meanings, table, [(part, name) for name in names for part in parts], where)
+        held = found.setdefault(channel.group, (names, {}))[1]
+        held[channel.quantity] = values.reshape(len(table), len(names), len(parts))
+    return found
 
 
 @base.FILE_PREVIEWERS.register(".csv")
@@ -312,6 +357,9 @@ def _conventional_meaning(column: str) -> _Meaning:
     for prefix in sorted(_PREFIXES, key=len, reverse=True):
         if column.startswith(prefix) and column != prefix:
             return _PREFIXES[prefix], column.removeprefix(prefix)
+    for component in sorted(_COMPONENTS, key=len, reverse=True):
+        if (name := column.removesuffix(f"_{component}")) not in ("", column):
+            return component, name
     point, _, axis = column.rpartition("_")
     return (axis, point) if point and axis in _AXES else None
 
@@ -322,10 +370,12 @@ def _given_meaning(column: str, given: str, where: str) -> _Meaning:
     if given == "t":
         return "t", ""
     kind, _, name = given.partition(":")
-    known = (*JOINT_CHANNEL_UNITS, *_AXES)
+    known = (*JOINT_CHANNEL_UNITS, *_AXES, *_COMPONENTS)
     if not name or kind not in known:
         what, choice = f"column '{column}' is given the meaning '{given}'", f"one of {', '.join(known)}"
-        allowed = f"t, {base.SKIPPED_COLUMN_MEANING}, or KIND:NAME with a joint's or a point's name and {choice}"
+        allowed = (
+            f"t, {base.SKIPPED_COLUMN_MEANING}, or KIND:NAME with a joint's, a point's or a sensor's name and {choice}"
+        )
         hint = nearest_name_hint(kind, known) if kind not in known else f"{kind}:NAME"
         raise DataError(what, where=where, allowed=allowed, hint=hint)
     return kind, name
@@ -336,6 +386,6 @@ def _gather(meanings: Sequence[tuple[str, str]], table: Array, wanted: Sequence[
     for meaning in wanted:
         if meaning not in places:
             what = f"there is no column for {meaning[0]} of '{meaning[1]}'"
-            allowed = "every channel for all joints, position always; x, y and z of every point"
+            allowed = "every channel for all joints, position always; x, y and z of every point and every sensor"
             raise DataError(what, where=where, allowed=allowed)
     return table[:, [places[meaning] for meaning in wanted]]

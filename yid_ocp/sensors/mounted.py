@@ -1,0 +1,140 @@
+"""Sensors mounted on a frame of a link, whose readings are vectors along that frame's axes: what they share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import casadi as ca
+import numpy as np
+
+from yid_ocp.arrays import Array
+from yid_ocp.errors import DataError, nearest_name_hint
+from yid_ocp.model.system import NodeState
+from yid_ocp.sensors.base import (
+    RecordedChannelGroup,
+    Sensor,
+    SensorData,
+    SensorDataInputs,
+    expand_to_joint_values,
+    sensor_reading_function,
+)
+from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, smoothed_node_values
+
+
+@dataclass(frozen=True)
+class MountedSensor(Sensor):
+    """A sensor of three components along the axes of each of its frames."""
+
+    naive_prediction: ClassVar = "stays"
+    has_paper_weight = False
+    point_names = ()
+    names: tuple[str, ...]  # recorded ones of the sensors
+    signs: tuple[float, ...]  # of each, 1 or -1: whether it reads the opposite
+    frame_names: tuple[str, ...]  # of the model, one for each
+    group_name: str
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        return tuple(f"{self.group_name}.{name}" for name in self.names)
+
+    def ideal_reading(self, state: NodeState) -> ca.SX:
+        frames = zip(self.signs, self.frame_names, strict=True)
+        return ca.vertcat(*(sign * self.frame_reading(state, frame) for sign, frame in frames))
+
+    def frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+        """What the sensor in one frame reads, along the frame's axes, shape (3, 1)."""
+        raise NotImplementedError
+
+
+def read_mounted_sensors(around: SensorDataInputs, kind: type[MountedSensor]) -> list[SensorData]:
+    """Measurements of one kind of mounted sensor in a recording."""
+    channel, found = kind.channel, []
+    for group in around.recording.channel_groups:
+        key = f"{group.name}.{channel.quantity}"
+        held = channel.is_in_group(group.name) and channel.quantity in group.values_by_quantity
+        if held and around.sensor_usage(key).use is not False:
+            found.append(_measured(around, kind, group, key))
+    return found
+
+
+def _measured(around: SensorDataInputs, kind: type[MountedSensor], group: RecordedChannelGroup, key: str) -> SensorData:
+    choice, tree = around.sensor_usage(key), around.system.mechanism
+    where, channel, names = f"{around.recording.name}: {group.name}", kind.channel, group.names
+    frames = tuple(choice.frames.get(name, name) for name in names)
+    for name, frame in zip(names, frames, strict=True):
+        if not tree.has_frame(frame) or tree.frame(frame).joint_index < 0:
+            is_known = tree.has_frame(frame)
+            moving = [known for known, entry in tree.frames.items() if entry.joint_index >= 0]
+            what = (
+                f"sensor '{name}' sits on the frame '{frame}', which {'does not move' if is_known else 'is not there'}"
+            )
+            hint = f"{nearest_name_hint(frame, moving)} (sensors.{key}.frames: {{{name}: FRAME}}, or use: false)"
+            raise DataError(what, where=where, allowed="a frame that moves with a joint of the model", hint=hint)
+    stated = [group.stds_by_attribute.get(attribute) for attribute in channel.std_attribute_names]
+    std = stated[0] if choice.std is None else choice.std
+    if std is None:
+        what = f"the noise level of {channel.quantity} is neither recorded nor given"
+        raise DataError(what, where=where, hint=f"set sensors.{key}.std [{channel.unit}]")
+    bias = next((given for given in (choice.bias_std, stated[1]) if given is not None), 0.0)
+    by_output = [
+        np.repeat(expand_to_joint_values(given, names, names, f"sensors.{key}.{setting}"), 3)
+        for given, setting in ((std, "std"), (bias, "bias_std"))
+    ]
+    signs = expand_to_joint_values(choice.constants.get("sign", 1.0), names, names, f"sensors.{key}.constants")
+    if not np.all(np.abs(signs) == 1):
+        raise DataError(f"the sign of {key} is {signs}", where=where, allowed="1 or -1")
+    sensor = kind(names, tuple(signs.tolist()), frames, key)
+    values = group.values_by_quantity[channel.quantity].reshape(len(group.t), -1)
+    steps = len(around.node_times) - 1
+    inner = (1, steps - 1)  # a force at either end depends on the motion beyond it
+    if not around.system.prescribed:
+        last = around.node_times[list(inner)]
+        kept = (group.t >= last[0] - 1e-9) & (group.t <= last[1] + 1e-9)
+        own = np.broadcast_to(by_output[0], values[kept].shape)
+        return SensorData(sensor, group.t[kept], values[kept], own, inner, by_output[1])
+    low_pass = around.path_filter
+    period = float(np.median(np.diff(group.t)))
+    nodes, measured = smoothed_node_values(around, group.t, values, key, like_path=True)
+    times = around.node_times[nodes]
+    own = by_output[0] * low_pass.noise_gains_of_value_and_rates(period)[0]
+    total, correlation = _with_encoder_noise(around, sensor, own, times)
+    return SensorData(sensor, times, measured, total, inner, by_output[1], correlation)
+
+
+def _with_encoder_noise(
+    around: SensorDataInputs, sensor: MountedSensor, own: Array, times: Array
+) -> tuple[Array, Array | None]:
+    """Noise std (M, k) and correlation (M, k, k) of smoothed readings that are predicted from noisy encoders.
+
+    The path of prescribed joints is smoothed, and so are the errors of its angles, rates and accelerations, to which
+    the reading responds with its slopes in the recorded posture, at rest. Other coordinates are taken at zero.
+    """
+    joints, encoders = around.recording.joints, around.sensor_usage(JOINT_POSITION_GROUP_NAME)
+    known = None if joints is None else encoders.std if encoders.std is not None else joints.position_std
+    names = () if joints is None else tuple(name for name in around.system.prescribed if name in joints.names)
+    alone = np.broadcast_to(own, (len(times), len(own)))
+    if known is None or joints is None or not names:
+        return alone, None
+    angle = expand_to_joint_values(known, joints.names, names, f"sensors.{JOINT_POSITION_GROUP_NAME}.std")
+    if not np.any(angle > 0):
+        return alone, None
+    system = around.system
+    at, n = [system.mechanism.joint_index(name) for name in names], system.n_coordinates
+    columns = [joints.names.index(name) for name in names]
+    q = np.zeros((len(times), n))
+    q[:, at] = np.stack([np.interp(times, joints.t, joints.position[:, column]) for column in columns], axis=1)
+    function = sensor_reading_function(system, sensor, ())
+    symbols = [ca.SX.sym(name, function.size1_in(name)) for name in ("q", "theta")]
+    slopes = function(q=symbols[0], theta=symbols[1])
+    gains = around.path_filter.noise_gains_of_value_and_rates(float(np.median(np.diff(joints.t))))
+    parts = []
+    for name, gain in zip(("by_q", "by_v", "by_a"), gains, strict=True):
+        if slopes[name].shape[1] == n:
+            parts.append(ca.densify(slopes[name][:, at]) @ ca.diag(ca.DM(angle * gain)))
+    errors = ca.Function("errors", symbols, [ca.horzcat(*parts)]).map(len(times))
+    theta = np.repeat(system.parameters.vector()[:, None], len(times), axis=1)
+    spread = np.array(errors(q.T, theta)).reshape(len(own), len(times), -1).transpose(1, 0, 2)
+    covariance = spread @ spread.transpose(0, 2, 1) + np.diag(own**2)
+    total = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return total, covariance / (total[:, :, None] * total[:, None, :])

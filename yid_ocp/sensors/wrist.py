@@ -1,0 +1,112 @@
+"""Wrist force/torque sensors: what the bodies and grasps beyond a frame exert on the sensor there.
+
+The model is cut at the frame, and what is beyond hangs on six locked joints there: three that slide along the frame's
+axes, three that turn about them. What these joints must hold, by the Euler-Lagrange equations of the cut model,
+
+    d/dt dL/dv - dL/dq - F + Dphi(q)' lam,
+
+is the force and the torque that the sensor exerts on what is beyond it. The reading is the opposite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+
+from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
+from yid_ocp.model.mechanism import Inertia, Placement
+from yid_ocp.model.system import MidpointState, NodeState, System, floating_clamp
+from yid_ocp.sensors.base import CHANNEL_KINDS, SENSOR_READERS, ChannelKind, SensorData, SensorDataInputs
+from yid_ocp.sensors.mounted import MountedSensor, read_mounted_sensors
+
+_XYZ, _SIGN = ("x", "y", "z"), {"sign": "1"}
+_FORCE = CHANNEL_KINDS.register("wrist.force")(ChannelKind("wrist", "force", "N", _XYZ, _SIGN))
+_TORQUE = CHANNEL_KINDS.register("wrist.torque")(ChannelKind("wrist", "torque", "N m", _XYZ, _SIGN))
+_N_LOCKED_JOINTS = 6
+
+
+class _WristForceSensor(MountedSensor):
+    """Force on the sensor."""
+
+    channel = _FORCE
+
+    def frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+        return _wrench_on_sensor(state, frame)[:3]
+
+
+class _WristTorqueSensor(MountedSensor):
+    """Torque on the sensor about its frame's origin."""
+
+    channel = _TORQUE
+
+    def frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+        return _wrench_on_sensor(state, frame)[3:]
+
+
+@SENSOR_READERS.register("wrist.force")
+def _read_wrist_forces(around: SensorDataInputs) -> list[SensorData]:
+    return read_mounted_sensors(around, _WristForceSensor)
+
+
+@SENSOR_READERS.register("wrist.torque")
+def _read_wrist_torques(around: SensorDataInputs) -> list[SensorData]:
+    return read_mounted_sensors(around, _WristTorqueSensor)
+
+
+def _wrench_on_sensor(state: NodeState, frame: str) -> ca.SX:
+    """Force and torque that what is beyond a frame exerts on a sensor there, along the frame's axes, shape (6, 1)."""
+    system, first = _cut_at_frame(state.system, frame)
+    locked, n = slice(first, first + _N_LOCKED_JOINTS), system.n_coordinates
+    q, v = ca.SX.sym("q", n), ca.SX.sym("v", n)
+
+    def widened(values: ca.SX) -> ca.SX:
+        return ca.vertcat(values[:first], ca.SX(ca.DM.zeros(_N_LOCKED_JOINTS)), values[first:])
+
+    kinematics = forward_kinematics(system.mechanism, q)
+    rigid = rigid_body_lagrangian_derivatives(kinematics, v, system.gravity)
+    momentum, push = rigid.lagrangian_by_v[locked], rigid.lagrangian_by_q[locked]
+    u, z_rate = ca.SX(len(system.driven), 1), ca.SX(*state.z.shape)
+    middle = MidpointState(system, kinematics, q, v, state.z, z_rate, u, state.lam, state.internal_rows, ca.SX(1))
+    for effect in system.effects:
+        terms = effect.step_terms(middle)
+        momentum += ca.gradient(terms.lagrangian, v)[locked]
+        push += ca.gradient(terms.lagrangian, q)[locked]
+        wrenches = terms.force_with_derivatives
+        forces = (terms.generalized_force, terms.dissipative_force, wrenches.force if wrenches else None)
+        push += sum((force[locked] for force in forces if force is not None), ca.SX(_N_LOCKED_JOINTS, 1))
+    if system.n_constraints:
+        push -= ca.jtimes(system.constraint_residual(kinematics), q, state.lam, True)[locked]
+    needed = ca.jtimes(momentum, q, v) + ca.jtimes(momentum, v, widened(state.a)) - push
+    return ca.substitute(-needed, ca.vertcat(q, v), ca.vertcat(widened(state.q), widened(state.v)))
+
+
+def _cut_at_frame(system: System, name: str) -> tuple[System, int]:
+    """The system with all that is beyond a frame on six locked joints there, and the index of the first of them."""
+    tree = system.mechanism
+    frame = tree.frame(name)
+    before, first = frame.joint_index, frame.joint_index + 1
+    last, turn = before + _N_LOCKED_JOINTS, frame.placement.rotation.T
+    back = Placement(turn, -turn @ frame.placement.translation)
+    chain = list(floating_clamp(f"{name} cut").joints)
+    chain[0] = replace(chain[0], parent_index=before, placement=frame.placement)
+    near = (body.scaled_by(ca.SX(-1)) for body in frame.proximal_bodies)
+    bodies = tuple(body.transformed_by(back) for body in (*tree.joints[before].bodies, *near))
+    chain[-1] = replace(chain[-1], bodies=bodies)
+    wide = tree.with_inserted_joints(first, chain)
+    joints = list(wide.joints)
+    for i, joint in enumerate(wide.joints[last + 1 :], last + 1):
+        if joint.parent_index == before and joint.name not in frame.proximal_names:
+            joints[i] = replace(joint, parent_index=last, placement=back @ joint.placement)
+    frames = dict(wide.frames)
+    for key, entry in wide.frames.items():
+        if entry.joint_index == before and key not in frame.proximal_names:
+            frames[key] = replace(entry, joint_index=last, placement=back @ entry.placement)
+    if system.servos:  # a controller may carry the arm's own weight, but it still weighs on a sensor
+        joints = [replace(joint, bodies=tuple(map(_with_weight, joint.bodies))) for joint in joints]
+    return replace(system, mechanism=replace(wide, joints=tuple(joints), frames=frames)), first
+
+
+def _with_weight(body: Inertia) -> Inertia:
+    fraction = body.gravity_fraction
+    return replace(body, gravity_fraction=None) if fraction is not None and fraction.is_zero() else body
