@@ -15,6 +15,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.data import JointGroup, Recording, SensorChannelGroup, read_recording, write_recording
 from yid_ocp.effects import candidate_kinds_and_locations, make_effect
 from yid_ocp.errors import DataError
+from yid_ocp.inference.smoother_model import recording_models_with_unknown_forces
 from yid_ocp.integrator.step import compile_step
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
@@ -200,6 +201,29 @@ def test_slopes_with_effects_are_those_of_differences(urdf: Path, recorded: Reco
     with_sensors = candidate_kinds_and_locations(system, recorded_sensor_kinds([recorded]))
     places = {place for kind, place in with_sensors if kind == "sensor_bias"}
     assert places == {"wrist:lower", "imu:lower", "imu:w_T1"}
+
+
+@pytest.mark.parametrize("name", ["wrist", "imu_rod"])
+def test_unknown_forces_of_the_smoother_move_these_readings_as_an_effect_does(
+    urdf: Path, recorded: Recording, name: str
+) -> None:
+    """A curvature at rest is a constant moment at every joint: the chained intervals give the problem's own slopes."""
+    seen = replace(recorded, channel_groups=tuple(g for g in recorded.channel_groups if g.name == name))
+    curved = holding(urdf, effects={"rest_curvature@T1": {}}, prescribed=ARM)
+    made = problem(curved, seen, "rest_curvature@T1.qx")
+    [model] = recording_models_with_unknown_forces(
+        made, made.initial_unknowns, made.evaluate(made.initial_unknowns), interval=0.2
+    )
+    bent = [link[0] for link in curved.segment_layout("T1").link_joints]
+    moment = 4.0 * np.isin(model.unknown_names, bent) / model.reference_std
+    state, products = model.initial_state_jacobian @ moment, np.zeros(3)
+    for part in model.intervals:
+        own = part.state_jacobian @ state + part.unknown_jacobian @ moment
+        slope = -part.negative_residual_jacobian[:, 1] / made.unknown_scales[0]
+        products += own @ slope, own @ own, slope @ slope
+        state = part.state_transition @ state + part.unknown_input_matrix @ moment
+    assert len(model.intervals) > 3
+    np.testing.assert_allclose(products / products[2], 1.0, atol=1e-5)
 
 
 def test_stiffness_is_found_from_a_wrist_in_mujoco_and_from_a_synthetic_one(

@@ -433,7 +433,8 @@ class RunSettings:
     recordings: Annotated[RecordingSettings, OptionInfo("the data")] = RecordingSettings()
     import_: Annotated[ImportSettings, OptionInfo("how files of other tools become recordings")] = ImportSettings()
     sensors: Annotated[
-        Mapping[str, SensorOptions], OptionInfo("by group of the recordings: points, joints.effort, motors.current, wrist.force")
+        Mapping[str, SensorOptions],
+        OptionInfo("by group of the recordings: points, joints.effort, motors.current, wrist.force"),
     ] = field(default_factory=dict)
     parameters: Annotated[Mapping[str, ParameterSettings], OptionInfo("by name or pattern")] = field(
         default_factory=dict

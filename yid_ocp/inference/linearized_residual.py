@@ -54,61 +54,78 @@ def nominal_trajectory_from_prediction(
 
 @dataclass(frozen=True)
 class ResidualDerivativesAtNodes:
-    """Derivatives of a recording's r residuals [sensor noise] at the two nodes around each sample.
+    """Derivatives of a recording's r residuals [sensor noise] at the nodes around each sample, two or four of them.
 
     The shares of the interpolation are included.
     """
 
-    node: IntArray  # before the row, shape (r,)
-    before: Array  # by the state of that node, shape (r, nx)
-    after: Array  # by the state of the next, shape (r, nx)
-    by_effort_before: Array  # by the efforts of prescribed joints there, shape (r, nc)
-    by_effort_after: Array
+    node: IntArray  # first of each row's nodes, shape (r,)
+    by_state: Array  # by the state of that node and of the next ones, shape (2 or 4, r, nx)
+    by_effort: Array  # by the efforts of prescribed joints there, of four nodes then constraint forces, (2 or 4, r, ne)
 
     @staticmethod
-    def from_nominal_trajectory(course: NominalTrajectory) -> ResidualDerivativesAtNodes:
-        """The residual's derivatives from those of the sensors along a nominal trajectory."""
+    def from_nominal_trajectory(
+        course: NominalTrajectory, *, with_neighbours: bool = False
+    ) -> ResidualDerivativesAtNodes:
+        """The residual's derivatives from those of the sensors along a nominal trajectory.
+
+        A sensor that reads velocities, accelerations or constraint forces depends on four nodes, the first one before
+        its sample's; `DataError` of such a sensor unless that is allowed by `with_neighbours`.
+        """
         step, theta = course.model_functions.step, course.theta
         n, nx, fixed = step.sizes["n"], step.sizes["nx"], list(step.system.prescribed_coordinate_indices)
         found: list[IntArray] = []
         parts: list[tuple[Array, ...]] = []
-        for samples in course.measurements:
+        functions = [course.model_functions.compiled_sensor_function(s.sensor) for s in course.measurements]
+        pairs = zip(functions, course.measurements, strict=True)
+        readings = [function(course.node_values.at(s.evaluation_nodes), theta) for function, s in pairs]
+        n_forces, width = (step.sizes["m"], 4) if any(read.needs_neighbours for read in readings) else (0, 2)
+        for samples, read in zip(course.measurements, readings, strict=True):
             used = samples.evaluation_nodes
-            function = course.model_functions.compiled_sensor_function(samples.sensor)
-            read = function(course.node_values.at(used), theta)
-            if read.needs_neighbours:
+            if read.needs_neighbours and not with_neighbours:
                 name = samples.sensor.group_name
                 message = f"'{name}' depends on velocities, accelerations or constraint forces"
                 message += ", which cannot be weighted beside noise that drives the motion"
                 raise DataError(message, hint=f"set sensors.{name}.use: false, or prescribe the arms' motion")
-            slopes = np.zeros((*read.output.shape, nx))
-            slopes[:, :, :n], slopes[:, :, 2 * n :] = read.by_q, read.by_z
+            # of each reading by the states and efforts of the node before, its own and the next
+            before = 1 if read.needs_neighbours else 0
+            slopes = np.zeros((2 * before + 1, *read.output.shape, nx))
+            slopes[before, :, :, :n], slopes[before, :, :, 2 * n :] = read.by_q, read.by_z
+            for by_rate, stencil in ((read.by_v, (-0.5, 0.0, 0.5)), (read.by_a, (1.0, -2.0, 1.0))):
+                if by_rate.shape[2]:
+                    order = 1 if by_rate is read.by_v else 2
+                    slopes[:, :, :, :n] += np.multiply.outer(np.array(stencil) / step.time_step**order, by_rate)
+            efforts = np.zeros((*read.output.shape, len(fixed) + n_forces))
+            efforts[:, :, : len(fixed)] = read.by_load[:, :, fixed]
+            if read.by_lam.shape[2]:
+                efforts[:, :, len(fixed) :] = read.by_lam
             sample, column = np.nonzero(samples.used_output_mask)
             at = (sample, column) if samples.node.ndim > 1 else (sample,)
             node, fraction, weight = samples.node[at], samples.fraction[at], samples.weight[sample, column]
             place = np.searchsorted(used, node)
-            later, shares = np.minimum(place + 1, len(used) - 1), (weight * (1 - fraction), weight * fraction)
-            nodes = ((place, shares[0]), (later, shares[1]))
-            by_state = (samples.decorrelate(share[:, None] * slopes[k, column]) for k, share in nodes)
-            by_effort = (samples.decorrelate(share[:, None] * read.by_load[k, column][:, fixed]) for k, share in nodes)
-            found.append(np.minimum(node, len(course.rollout.torque)))
-            parts.append((*by_state, *by_effort))
-        arrays = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+            nodes = ((place, weight * (1 - fraction)), (np.minimum(place + 1, len(used) - 1), weight * fraction))
+            by_state, by_effort = np.zeros((width, len(node), nx)), np.zeros((width, len(node), efforts.shape[2]))
+            for shift, (k, share) in enumerate(nodes):
+                by_effort[shift + before] = samples.decorrelate(share[:, None] * efforts[k, column])
+                for there, slope in enumerate(slopes):
+                    by_state[shift + there] += samples.decorrelate(share[:, None] * slope[k, column])
+            found.append(np.minimum(node, len(course.rollout.torque)) - before)
+            parts.append((by_state, by_effort))
+        arrays = (np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True))
         return ResidualDerivativesAtNodes(np.concatenate(found), *arrays)
 
     @property
     def visible_state_mask(self) -> BoolArray:
         """Mask of the states that any of the residuals depends on, shape (nx,)."""
-        return np.any(self.before != 0, axis=0) | np.any(self.after != 0, axis=0)
+        return np.asarray(np.any(self.by_state != 0, axis=(0, 1)))
 
     def select_states(self, kept: IntArray) -> ResidualDerivativesAtNodes:
         """The derivatives by the states at the indices `kept` alone."""
-        return replace(self, before=self.before[:, kept], after=self.after[:, kept])
+        return replace(self, by_state=self.by_state[:, :, kept])
 
     def select_residual_rows(self, rows: IntArray) -> ResidualDerivativesAtNodes:
         """The derivatives of the residuals at the indices `rows` alone."""
-        slopes = (self.before, self.after, self.by_effort_before, self.by_effort_after)
-        return ResidualDerivativesAtNodes(self.node[rows], *(array[rows] for array in slopes))
+        return ResidualDerivativesAtNodes(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
         """Derivatives of the residuals in d directions (r, d), from those of states (K, nx, d) and efforts (K, nc, d).
@@ -116,8 +133,7 @@ class ResidualDerivativesAtNodes:
         They are of K nodes from `first` on; a row beyond them is read at the last.
         """
         found = np.zeros((len(self.node), by_node.shape[2]))
-        pairs = ((0, self.before, self.by_effort_before), (1, self.after, self.by_effort_after))
-        for shift, by_state, by_effort in pairs:
+        for shift, (by_state, by_effort) in enumerate(zip(self.by_state, self.by_effort, strict=True)):
             used = np.flatnonzero(by_state.any(axis=1) | by_effort.any(axis=1))
             local = np.minimum(self.node[used] + shift - first, len(by_node) - 1)
             found[used] += np.einsum("rx,rxd->rd", by_state[used], by_node[local])

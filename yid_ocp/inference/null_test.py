@@ -18,6 +18,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.estimation_problem import EstimationProblem
 from yid_ocp.problem.measurements import Measurements
 from yid_ocp.problem.signal_filters import LowPassFilter, effort_filter_from_path_cutoff
+from yid_ocp.sensors.mounted import MountedSensor
 
 RESIDUAL_WINDOW_SECONDS = 0.5  # length of the time windows in which a residual is tested
 
@@ -207,8 +208,10 @@ def residual_channel_indices(problem: EstimationProblem) -> tuple[ResidualChanne
             place = np.full(samples.used_output_mask.shape, -1)
             place[samples.used_output_mask] = np.arange(rows.start, rows.stop)
             autocorrelation = np.ones(1)
-            if samples.sensor.effort_joints:
-                low_pass, step = effort_filter_from_path_cutoff(problem.options.path_cutoff), episode.grid.time_step
+            is_smoothed = isinstance(samples.sensor, MountedSensor) and problem.system.prescribed
+            if samples.sensor.effort_joints or is_smoothed:
+                cutoff, step = problem.options.path_cutoff, episode.grid.time_step
+                low_pass = LowPassFilter(cutoff) if is_smoothed else effort_filter_from_path_cutoff(cutoff)
                 stride = low_pass.decorrelation_stride(step)
                 autocorrelation = _filtered_noise_autocorrelation(low_pass, step)[::stride]
             for column, channel in enumerate(samples.output_channel_names):

@@ -44,6 +44,7 @@ from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, mass_matrix_diagonal_at_zero
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.sensors import Sensor
+from yid_ocp.sensors.mounted import MountedSensor
 
 _UnknownKind = Literal["force", "push", "offset", "bias"]
 
@@ -171,9 +172,11 @@ def _unknown_forces(
 
 
 def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
-    """Return the location of a sensor's bias: the camera, the arm that holds the frame, else the sensor's group."""
+    """Return the location of a sensor's bias: camera, `wrist:FRAME`, the arm that holds the frame, else its group."""
     if sensor.camera_pose is not None:
         return "camera"
+    if isinstance(sensor, MountedSensor):
+        return f"{sensor.channel.group}:{frame}"
     for grasp in system.grasps:
         if frame in (grasp.held_frame, grasp.holder_frame):
             return grasp.name
@@ -308,13 +311,22 @@ def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> StepDe
 
 
 def _steps(
-    course: _LinearizedEpisode, loads: StepDerivativesByLoad, pushes: Array, moving: IntArray, first: int, last: int
+    course: _LinearizedEpisode,
+    loads: StepDerivativesByLoad,
+    pushes: Array,
+    moving: IntArray,
+    span: slice,
+    with_forces: bool,
 ) -> tuple[Array, Array, Array]:
-    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd'); pushes in forces."""
+    """A_k (steps, ns, ns), E_k (steps, ns, nd') and the effort's slopes (steps, nc, ns + nd'); pushes in forces.
+
+    With constraint forces efforts are followed by these.
+    """
     a, e, effort = [], [], []
     feedback, nominal, forces = course.episode.tracking_feedback, course.nominal, pushes.shape[1]
-    found = linearized_steps(course.problem.step, nominal.theta, nominal.rollout, loads, slice(first, last))
-    for k, one in enumerate(found, first):
+    about = course.problem.step, nominal.theta, nominal.rollout, loads, span
+    found = linearized_steps(*about, with_constraint_forces=with_forces)
+    for k, one in enumerate(found, span.start):
         by_state, effort_by_state = one.state_by_state, one.effort_by_state
         by_load, effort_by_load = one.state_by_load, one.effort_by_load
         if feedback is not None:
@@ -350,7 +362,9 @@ def _recording(
     linear = partial(linearized_steps, course.problem.step, course.nominal.theta, course.nominal.rollout, loads)
     ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
     moving = np.flatnonzero(moving_observable_state_mask(course.problem.step, ends))
-    slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course.nominal).select_states(moving)
+    slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course.nominal, with_neighbours=True)
+    slopes = slopes.select_states(moving)
+    beyond = len(slopes.by_state) - 2  # steps that samples at an interval's end depend on
     by_bias = _bias_slopes(course, unknowns)
     interval_of_row = np.clip(np.searchsorted(edges, slopes.node, side="right") - 1, 0, len(edges) - 2)
     rests = course.problem.options.initial_state != "fitted_to_points"
@@ -358,13 +372,15 @@ def _recording(
     at_rest = np.zeros((ns, len(unknowns.names)))
     intervals = []
     for j in range(len(edges) - 1):
-        made = _steps(course, loads, pushes, moving, int(edges[j]), int(edges[j + 1]))
+        span_of_steps = slice(int(edges[j]), min(int(edges[j + 1]) + beyond, steps))
+        made = _steps(course, loads, pushes, moving, span_of_steps, beyond > 0)
         if j == 0 and rests:
             # rest under constant unknowns, x = A x + E d; what has no stiffness does not come to rest
             at_rest[:, :driving] = np.linalg.lstsq(np.eye(ns) - made[0][0], made[1][0], rcond=1e-6)[0]
         rows = np.flatnonzero(interval_of_row == j)
         own = factor[rows, None] * by_bias[rows]
-        state, drive, moved = _interval_response(made, slopes.select_residual_rows(rows), int(edges[j]))
+        span_of_interval = int(edges[j]), int(edges[j + 1] - edges[j])
+        state, drive, moved = _interval_response(made, slopes.select_residual_rows(rows), *span_of_interval)
         moved *= factor[rows, None]
         by_unknown = np.hstack([moved[:, ns:], own])
         drive = np.pad(drive, ((0, 0), (0, own.shape[1])))
@@ -405,9 +421,12 @@ def _loose_start(course: _LinearizedEpisode) -> Array:
 
 
 def _interval_response(
-    steps: tuple[Array, Array, Array], slopes: ResidualDerivativesAtNodes, first: int
+    steps: tuple[Array, Array, Array], slopes: ResidualDerivativesAtNodes, first: int, length: int
 ) -> tuple[Array, Array, Array]:
-    """An interval's end by its beginning and by unknowns, its rows by both, from (A_k, E_k, effort's slopes)."""
+    """An interval's end by its beginning and by unknowns, its rows by both, from (A_k, E_k, effort's slopes).
+
+    The steps go beyond its `length` where its rows do; there its unknowns last.
+    """
     a, e, by_effort = steps
     count, ns, driving = len(a), a.shape[1], e.shape[2]
     node = np.zeros((count + 1, ns, ns + driving))
@@ -419,7 +438,7 @@ def _interval_response(
         effort[k] = by_effort[k][:, :ns] @ node[k]
         effort[k][:, ns:] += by_effort[k][:, ns:]
     effort[-1] = effort[-2]
-    return node[-1][:, :ns], node[-1][:, ns:], slopes.directional_residual_derivatives(node, effort, first)
+    return node[length][:, :ns], node[length][:, ns:], slopes.directional_residual_derivatives(node, effort, first)
 
 
 def _bias_slopes(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> Array:

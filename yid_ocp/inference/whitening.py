@@ -256,11 +256,11 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
         move, effort, shaken = np.eye(len(kept), len(kept) + 2 * nu), None, None
         if here is not None:
             move, effort, shaken = _error_step(here, kept, course, momentum, errors, k)
-        observe = slopes.after[rows] @ move
+        observe = slopes.by_state[1, rows] @ move
         by_torque = observe[:, len(kept) : len(kept) + nu].copy()
-        observe[:, : len(kept)] += slopes.before[rows]
+        observe[:, : len(kept)] += slopes.by_state[0, rows]
         if effort is not None:
-            observe += (slopes.by_effort_before[rows] + slopes.by_effort_after[rows]) @ effort
+            observe += slopes.by_effort[:, rows].sum(axis=0) @ effort
         # another w where it is fresh, and the same b
         transition = FilterStateTransition(move, np.repeat([0.0 if fresh else 1.0, 1.0], nu))
         kalman, covariance, _ = kalman_step_and_covariance(covariance, observe, transition)

@@ -379,21 +379,24 @@ def linearized_steps(
     rollout: Rollout,
     loads: StepDerivativesByLoad | None = None,
     chosen: slice = _ALL_STEPS,
+    *,
+    with_constraint_forces: bool = False,
 ) -> Iterator[LinearizedStep]:
     """Iterate over the linearized steps of a finished rollout, with prescribed coordinates unchanged.
 
-    `chosen` is a slice of steps in a row; all by default.
+    `chosen` is a slice of steps in a row; all by default. Where asked for, efforts are followed by constraint forces.
     """
     if loads is None:
         rows = sum(step.sizes[key] for key in ("n", "nz", "m"))
         loads = StepDerivativesByLoad(np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0)))
     begin, end, _ = chosen.indices(len(rollout.torque))
     for first in range(begin, end, _STEPS_PER_CHUNK):
-        yield from _chunk(step, theta, rollout, loads, slice(first, min(first + _STEPS_PER_CHUNK, end)))
+        span = slice(first, min(first + _STEPS_PER_CHUNK, end))
+        yield from _chunk(step, theta, rollout, loads, span, with_constraint_forces)
 
 
 def _chunk(
-    step: Step, theta: Array, rollout: Rollout, loads: StepDerivativesByLoad, span: slice
+    step: Step, theta: Array, rollout: Rollout, loads: StepDerivativesByLoad, span: slice, with_forces: bool
 ) -> list[LinearizedStep]:
     """Some steps by the implicit function theorem; `numpy.linalg.LinAlgError` where their equations are singular."""
     n, nz, nx, nu = (step.sizes[key] for key in ("n", "nz", "nx", "nu"))
@@ -417,6 +420,8 @@ def _chunk(
     after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
     effort = top[:, fixed] + found.residual_by_new[:, np.array(fixed, int)[:, None], solved] @ moved
     effort /= -step.clock_scaled_time_step(theta)
+    if with_forces:
+        effort = np.concatenate([effort, moved[:, len(free) + nz :] / step.time_step], axis=1)
     parts = (slice(0, nx), slice(nx, nx + nu), slice(nx + nu, None))
     return [
         LinearizedStep(*(a[:, part] for part in parts), *(e[:, part] for part in parts))

@@ -176,7 +176,8 @@ def _noise_levels(problem: EstimationProblem) -> set[tuple[str, str]]:
     recorded = [e.recording.joints.position_std for e in problem.episodes if e.recording.joints is not None]
     encoders = problem.options.sensors.get(JOINT_POSITION_GROUP_NAME)
     noisy = any(std is not None and np.any(std) for std in recorded)
-    compared = any(samples.sensor.effort_joints for episode in problem.episodes for samples in episode.measurements)
+    samples_of_all = [samples for episode in problem.episodes for samples in episode.measurements]
+    compared = any(s.sensor.effort_joints or s.noise_correlation is not None for s in samples_of_all)
     if (compared and noisy) or (encoders is not None and encoders.std is not None):
         levels.add((JOINT_POSITION_GROUP_NAME, "std"))  # the encoders' noise is part of that of efforts
     for errors in (episode.input_errors for episode in problem.episodes):

@@ -25,6 +25,8 @@ from yid_ocp.integrator.step_model import StepEquationLinearizations
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_sparsity_patterns
+from yid_ocp.sensors import Sensor
+from yid_ocp.sensors.mounted import MountedSensor
 from yid_ocp.workflow.build import build_step, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
@@ -190,14 +192,19 @@ def _nlp(symbols: StepSymbols, problem: EstimationProblem, picture: Path) -> dic
     stage = step_diagnostics.nlp_stage_sparsity(
         symbols,
         problem.shared_parameters,
-        [sensor for sensor in sensors if not sensor.effort_joints],
+        [sensor for sensor in sensors if not _is_left_out(sensor)],
         followed,
         problem.predictor.estimated_initial_state_indices,
     )
     steps = [entry.grid.steps for entry in problem.episodes]
     draw_sparsity_patterns(picture, [[step_diagnostics.kkt_sparsity_pattern(stage, min(_SHOWN_STEPS, *steps))]])
-    left_out = [*(sensor.group_name for sensor in sensors if sensor.effort_joints), *problem.local_parameters]
+    left_out = [*(sensor.group_name for sensor in sensors if _is_left_out(sensor)), *problem.local_parameters]
     return {**step_diagnostics.full_nlp_size(stage, steps), "left_out": left_out}
+
+
+def _is_left_out(sensor: Sensor) -> bool:
+    """Whether a program of node states does not have what the sensor reads."""
+    return bool(sensor.effort_joints) or isinstance(sensor, MountedSensor)
 
 
 def _dependence(
