@@ -17,7 +17,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem.measurements import TimeGrid
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.sensors import CHANNEL_KINDS, recorded_camera_pose, recorded_joint_columns
-from yid_ocp.sensors.base import channel_kinds_of_group
+from yid_ocp.sensors.base import channel_kinds_for_group_name
 
 _SLOW_LOAD_CUTOFF_FRACTION = 0.1
 """Fraction of the filter's cutoff below which measured loads are used on gears whose efforts are compared."""
@@ -205,7 +205,7 @@ def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
             if any(channel.matches_group_name(group) and channel.quantity in values for group, values in own.items()):
                 found.add(kind)
         for group in recording.channel_groups:
-            of_vectors = [channel.group for channel in channel_kinds_of_group(group.name) if channel.components]
+            of_vectors = [channel.group for channel in channel_kinds_for_group_name(group.name) if channel.components]
             mounted |= {f"{kind}:{name}" for kind in of_vectors for name in group.names}
         if any(recorded_camera_pose(group) is not None for group in recording.points):
             found.add("camera")

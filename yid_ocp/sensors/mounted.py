@@ -52,7 +52,7 @@ def read_mounted_sensors(around: SensorDataInputs, kind: type[MountedSensor]) ->
     channel, found = kind.channel, []
     for group in around.recording.channel_groups:
         key = f"{group.name}.{channel.quantity}"
-        held = channel.is_in_group(group.name) and channel.quantity in group.values_by_quantity
+        held = channel.matches_group_name(group.name) and channel.quantity in group.values_by_quantity
         if held and around.sensor_usage(key).use is not False:
             found.append(_measured(around, kind, group, key))
     return found
