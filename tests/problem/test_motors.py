@@ -135,12 +135,14 @@ def test_with_efforts_of_zero_and_no_commands_motors_are_off_and_joints_are_let_
 def test_a_column_switches_motors_within_a_recording(step) -> None:
     enabled = np.ones((61, 2))
     enabled[20:35, 1] = 0.0
-    problem = problem_of(step, swing(torque_enable=enabled))
+    moved = swing(position=0.9 * swing().position, torque_enable=enabled)
+    problem = problem_of(step, moved)
     off = problem.episodes[0].torque >= MOTOR_OFF_COMMAND / 2
     assert not off[:, 0].any()
     assert list(np.flatnonzero(off[:, 1])) == list(range(20, 35))
     found = problem.simulate_recording().joints
     assert np.array_equal(found.torque_enable[:60], enabled[:60])
+    assert found.position_command == pytest.approx(moved.position_command)
     with pytest.raises(DataError, match="neither 0 nor 1"):
         validate_recording(recording(swing(torque_enable=np.full((61, 2), 0.5))))
 

@@ -74,6 +74,7 @@ def test_simulated_joints_are_as_noisy_as_was_stated(urdf_folder, how):
     np.testing.assert_allclose(np.std(constant, axis=(0, 1)), np.hypot(stated, 0.3 / 5), rtol=0.3)
     levels = plain.position_std, plain.effort_std, 0.0 if plain.effort_bias_std is None else plain.effort_bias_std
     np.testing.assert_allclose(np.array(np.broadcast_arrays(*levels, stated)[:3]), [[1e-3] * 2, [0.3] * 2, stated])
+    assert np.array_equal(plain.effort[-1], plain.effort[-2])
     assert plain.effort_kind == ("command" if "driven" in how else "sample")
 
 
