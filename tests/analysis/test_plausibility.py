@@ -140,7 +140,7 @@ EFFORTS = {
     "wrist far off": (1, offset(12.0, 6), [("effort_offset", "left_w2", 5.334, "off by +12 N m")]),
     "a wrist that rubs off": (1, offset(-5.0, 6, rubs=True), [("effort_offset", "left_w2", 2.207, "off by -4.97 N m")]),
     "wrist ten times": (1, times(10.0, 6), [("effort_gain", "left_w2", 1.545, "10 times what gravity")]),
-    "what hangs on the gripper": (1, offset(10.0, 2), []),
+    "what may hang on the gripper": (1, offset(20.0, 2), []),
 }
 
 

@@ -199,6 +199,14 @@ def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
     assert np.array_equal(hidden[:, 1], before.used_output_mask[:, 1] & (t > 3.0 - smear) & (t < 3.4 + smear))
     elsewhere = problem_corrected_for_events(problem, EventSet((replace(event, recording="another"),)))
     assert elsewhere.episodes[0].measurements[0] is before
+    # beside torques that drive a joint its force acts, with its whole impulse
+    arm = EstimationProblem(compile_step(twin.driven, 0.01), [pushed], ["elbow.damping"], problem.options)
+    told = replace(event, detected_pulse=DetectedForcePulse(3.0, 3.4, -0.8, False, 0.01, 1e-9))
+    [plain], [driven] = (own.episodes for own in (arm, problem_corrected_for_events(arm, EventSet((told,)))))
+    added = driven.torque - plain.torque
+    assert not added[:, 0].any()
+    assert 0.01 * added[:, 1].sum() == pytest.approx(-0.16, rel=0.01)
+    assert 0.01 * added[300:340, 1].sum() == pytest.approx(-0.16, rel=0.1)
 
 
 def test_after_a_fall_nothing_counts(twin, pushed):
