@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from small_problems import (
 from yid_ocp.data.recording import validate_recording
 from yid_ocp.effects import candidate_kinds_and_locations
 from yid_ocp.errors import ConfigError, DataError
-from yid_ocp.integrator.step import simulate
+from yid_ocp.integrator.step import applied_joint_torque, simulate
 from yid_ocp.model.servos_and_springs import MOTOR_OFF_COMMAND, MOTOR_PRESETS, MotorOptions, PositionServoOptions
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
@@ -30,9 +32,9 @@ VALUES = {
 }  # fmt: skip
 DC = PositionServoOptions(motor=MotorOptions("dc"))
 FIRMWARE = PositionServoOptions(motor=MotorOptions("dc", "mx64"), firmware=("derivative", "dead_band"))
-FIRMWARE_VALUES = VALUES | {
-    f"{joint}.servo_{term}": value for joint in PENDULUM for term, value in (("derivative", 0.7), ("dead_band", 0.02))
-}
+INTEGRATING = replace(FIRMWARE, firmware=("integral", "derivative", "dead_band"))
+TERMS = {"integral": 3.0, "derivative": 0.7, "dead_band": 0.02}
+FIRMWARE_VALUES = VALUES | {f"{joint}.servo_{term}": value for joint in PENDULUM for term, value in TERMS.items()}
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +60,24 @@ def test_a_firmware_damps_within_its_duty_and_ignores_small_errors(urdf_folder) 
     assert torque([0.0, 0.0], [0.0, 0.0], [0.0, 0.0])[0] == 0.0
     with pytest.raises(ConfigError, match="has a derivative term already"):
         PositionServoOptions(firmware=("derivative",))
+
+
+def test_an_integral_takes_the_sag_away_and_stands_still_while_the_motor_is_off(urdf_folder) -> None:
+    step = pendulum_step(urdf_folder, driven=PENDULUM, servos=replace(DC, firmware=("integral",)))
+    command = np.tile([0.4, -0.3], (901, 1))
+    enabled = np.ones((901, 2))
+    enabled[600:] = 0.0
+    held = swing(900, position=command, position_command=command, torque_enable=enabled)
+    made = problem_of(step, held, values={f"{joint}.servo_integral": 3.0 for joint in PENDULUM})
+    [found] = made.evaluate(made.initial_unknowns, False).episode_predictions
+    q, z = found.rollout.state[:, :2], found.rollout.state[:, 4:]
+    assert np.all(np.abs(q[0] - command[0]) > 1e-3)  # it begins where it sags without one
+    assert q[600] == pytest.approx(command[0], abs=2e-4)
+    assert z[601:] == pytest.approx(np.tile(z[600], (300, 1)), abs=1e-9)
+    middle = (q[1:601] + q[:600]) / 2
+    assert z[600] == pytest.approx(H * np.sum(command[0] - middle, axis=0), abs=1e-9)
+    torque = applied_joint_torque(step, made.theta, found.rollout)
+    assert torque[599] == pytest.approx(np.array([60.0, 25.0]) * 3.0 * z[600], rel=0.02)
 
 
 def test_a_current_limit_takes_from_braking_as_well(urdf_folder) -> None:
@@ -161,7 +181,7 @@ LADDER = {
 @pytest.mark.parametrize("power", ["on", "switched", "off"])
 def test_slopes_through_sticking_reversal_and_rest_are_those_of_differences(urdf_folder, law, power) -> None:
     effects = [(kind, joint, values) for kind, values in LADDER[law] for joint in PENDULUM]
-    step = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=FIRMWARE if law == "firmware" else DC)
+    step = pendulum_step(urdf_folder, effects, driven=PENDULUM, servos=INTEGRATING if law == "firmware" else DC)
     enabled = np.ones((61, 2))
     enabled[20:35] = 0.0
     group = {

@@ -305,12 +305,14 @@ def applied_joint_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> Arra
     if not system.servos:
         return rollout.torque
     e, driven = step.equations, list(system.driven_coordinate_indices)
-    q = rollout.state[:, : system.n_coordinates]
+    n = system.n_coordinates
     with CASADI_LOCK:
         force = ca.densify(system.input_force(e.u, e.q0, e.q1)[driven])
-        function = ca.Function("applied", [e.u, e.q0, e.q1, e.theta], [force])
-    middle, rate = (q[1:] + q[:-1]) / 2, np.diff(q, axis=0) / h
-    return np.array(function.map(len(rate))(rollout.torque.T, middle.T, rate.T, np.asarray(theta, float))).T
+        internal = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
+        function = ca.Function("applied", [e.u, e.q0, e.q1, internal, e.theta], [force])
+    middle, rate = (rollout.state[1:] + rollout.state[:-1]) / 2, np.diff(rollout.state[:, :n], axis=0) / h
+    inputs = rollout.torque.T, middle[:, :n].T, rate.T, middle[:, 2 * n :].T
+    return np.array(function.map(len(rate))(*inputs, np.asarray(theta, float))).T
 
 
 def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:

@@ -28,7 +28,7 @@ SERVO_GAIN_FACTOR = "servo_gain_factor"  # parameter by which a recording states
 
 _MotorKind = Literal["ideal", "dc"]
 _MotorPreset = Literal["xl330", "xl320", "mx64", "mx106", "sts3215"]
-_FirmwareTerm = Literal["derivative", "dead_band"]
+_FirmwareTerm = Literal["integral", "derivative", "dead_band"]
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,8 @@ class PositionServoOptions:
     firmware: Annotated[
         tuple[_FirmwareTerm, ...],
         OptionInfo(
-            "further terms of the firmware, parameters that begin at zero: derivative (JOINT.servo_derivative: torque "
+            "further terms of the firmware, parameters that begin at zero: integral (JOINT.servo_integral: the error's "
+            "time integral in errors, from the start of the recording on), derivative (JOINT.servo_derivative: torque "
             "against the rate within the limit of a dc motor's duty), dead_band (JOINT.servo_dead_band: errors up to "
             "it are ignored)"
         ),
@@ -161,10 +162,10 @@ class PositionServoOptions:
 class PositionServo:
     """A position servo on one joint, whose input is the commanded coordinate u.
 
-        ideal:  torque = clip(gain e - damping dq/dt)
-        dc:     torque = clip(gain e - derivative dq/dt) - damping dq/dt
+        ideal:  torque = clip(gain (e + integral z) - damping dq/dt)
+        dc:     torque = clip(gain (e + integral z) - derivative dq/dt) - damping dq/dt
 
-    with e = u(t - delay) - q beyond the dead band, clip(x) = x / (1 + tightness x^p)^(1/p),
+    with e = u(t - delay) - q beyond the dead band, dz/dt = e, clip(x) = x / (1 + tightness x^p)^(1/p),
     p = `TORQUE_SATURATION_EXPONENT` and tightness = limit^-p, to which further limits add. Of a direct-current motor
     the limit is that of its duty, and the damping is its counter-voltage (torque = kt/R (duty V - kt dq/dt));
     `current_limit_tightness` clips the whole. At `MOTOR_OFF_COMMAND` there is no torque at all.
@@ -176,6 +177,7 @@ class PositionServo:
     torque_limit_tightness: ca.SX  # [(N m)^-p]
     command_interpolation: _CommandInterpolation = "held"
     motor_kind: _MotorKind = "ideal"
+    integral: ca.SX = field(default_factory=lambda: ca.SX(0))  # [1/s], in a system times z [rad or m]
     derivative: ca.SX = field(default_factory=lambda: ca.SX(0))  # of a dc motor's firmware [N m s/rad]
     dead_band: ca.SX = field(default_factory=lambda: ca.SX(0))  # either way [rad or m]
     current_limit_tightness: ca.SX = field(default_factory=lambda: ca.SX(0))  # [A^-p]
@@ -184,10 +186,8 @@ class PositionServo:
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
         """The servo's torque for a command, a coordinate and its rate [N m or N]."""
         on = command < MOTOR_OFF_COMMAND / 2
-        error, drag = ca.if_else(on, command, q) - q, self.damping * v
-        if not self.dead_band.is_zero():
-            near, far = (ca.sqrt((error + w) ** 2 + _DEAD_BAND_ROUNDING**2) for w in (-self.dead_band, self.dead_band))
-            error = error + (near - far) / 2
+        error, drag = self.error(command, q), self.damping * v
+        error = error if self.integral.is_zero() else error + self.integral
         if self.motor_kind == "ideal":
             return ca.if_else(on, _clipped(self.gain * error - drag, self.torque_limit_tightness), 0)
         torque = _clipped(self.gain * error - self.derivative * v, self.torque_limit_tightness) - drag
@@ -196,24 +196,19 @@ class PositionServo:
             torque = self.torque_constant * _clipped(current, self.current_limit_tightness)
         return ca.if_else(on, torque, 0)
 
-    def potential_energy(self, command: ca.SX, q: ca.SX) -> ca.SX:
-        """Energy 1/2 gain (u - q)^2 of the servo as a spring, without its limit [J]; none while its motor is off."""
+    def error(self, command: ca.SX, q: ca.SX) -> ca.SX:
+        """Error of a coordinate beyond the dead band, none while the motor is off [rad or m]."""
         error = ca.if_else(command < MOTOR_OFF_COMMAND / 2, command, q) - q
-        return 0.5 * self.gain * error**2
+        if self.dead_band.is_zero():
+            return error
+        near, far = (ca.sqrt((error + w) ** 2 + _DEAD_BAND_ROUNDING**2) for w in (-self.dead_band, self.dead_band))
+        return error + (near - far) / 2
 
 
 def _clipped(x: ca.SX, tightness: ca.SX) -> ca.SX:
     """x / (1 + tightness x^p)^(1/p)."""
     p = TORQUE_SATURATION_EXPONENT
     return x / (1 + tightness * x**p) ** (1 / p)
-
-
-def joint_damping_parameters(tree: Mechanism, wanted: Mapping[str, float]) -> dict[str, Parameter]:
-    """Parameters `JOINT.damping` of the named joints, by joint."""
-    for joint in wanted:
-        tree.joint_index(joint)
-    per, text = "N m s/rad", "viscous damping of"
-    return {n: Parameter(f"{n}.damping", value, per, 0.0, math.inf, f"{text} {n}") for n, value in wanted.items()}
 
 
 def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJointSpring) -> tuple[Parameter, Parameter]:
@@ -276,6 +271,7 @@ def _firmware_parameters(joint: Joint, terms: Sequence[_FirmwareTerm]) -> dict[_
     angle = joint.coordinate_unit
     rate, words = "N m s/rad" if angle == "rad" else "N s/m", f"servo of {joint.name}"
     known = {
+        "integral": ("1/s", math.inf, f"integral over proportional gain, {words}"),
         "derivative": (rate, math.inf, f"torque against the rate within the duty's limit, {words}"),
         "dead_band": (angle, _MAX_DEAD_BAND, f"error that is ignored, {words}"),
     }

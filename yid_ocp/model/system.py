@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,13 +17,12 @@ from yid_ocp.errors import ModelError, nearest_name_hint
 from yid_ocp.model.flexible import AXIS_UNIT_VECTORS, ElasticJoint, FlexibleObject, SegmentLayout
 from yid_ocp.model.kinematics import Kinematics
 from yid_ocp.model.mechanism import Frame, Joint, Mechanism, Placement, map_expressions
-from yid_ocp.model.parameters import Parameters
+from yid_ocp.model.parameters import Parameter, Parameters
 from yid_ocp.model.servos_and_springs import (
     PositionServo,
     PositionServoOptions,
     RobotJointSpring,
     build_joint_servos,
-    joint_damping_parameters,
     mechanism_without_gravity,
     stiffness_and_rest_parameters,
 )
@@ -204,6 +204,27 @@ class Effect:
         return ca.SX(0)
 
 
+class _ServoIntegral(Effect):
+    """The integral z of a position servo's error, dz/dt = error, which is zero where a recording begins."""
+
+    @classmethod
+    def of_joint(cls, joint: str) -> _ServoIntegral:
+        name = f"servo_integral@{joint}.z"
+        return cls("servo_integral", joint, Parameters(()), {name: ca.SX.sym(name)})
+
+    def apply_to_system(self, system: System) -> System:
+        servo, [z] = system.servos[self.location], self.internal_coordinate_symbols.values()
+        return replace(system, servos={**system.servos, self.location: replace(servo, integral=servo.integral * z)})
+
+    def step_terms(self, state: MidpointState) -> StepTerms:
+        [name], system = self.internal_coordinate_symbols, state.system
+        row, rate = state.internal_rows[name], state.z_rate[state.internal_rows[name]]
+        if self.location in system.servos:  # not while the joint is held
+            command = state.u[system.driven.index(self.location)]
+            rate -= system.servos[self.location].error(command, state.q[system.mechanism.joint_index(self.location)])
+        return StepTerms(internal_equations={name: rate}, static_equations={name: state.z[row]})
+
+
 class SystemBuildArguments(TypedDict, total=False):
     """What `System.build` takes beside mechanism and effects."""
 
@@ -272,7 +293,11 @@ class System(ReprMixin):
         driven, prescribed = tuple(options.get("driven", ())), tuple(options.get("prescribed", ()))
         damping, servos = options.get("damping", 0.0), options.get("servos")
         wanted = damping if isinstance(damping, Mapping) else dict.fromkeys(tree.joint_names, float(damping))
-        dampers = joint_damping_parameters(tree, wanted)
+        dampers = {
+            joint: Parameter(f"{joint}.damping", size, "N m s/rad", 0.0, math.inf, f"viscous damping of {joint}")
+            for joint, size in wanted.items()
+            if tree.joint_index(joint) >= 0  # raises where there is none of the name
+        }
         entries = list(dampers.values())
         elastic: list[ElasticJoint] = []
         for joint, spring in options.get("springs", {}).items():
@@ -293,7 +318,8 @@ class System(ReprMixin):
         coefficients = {joint: parameter.symbol for joint, parameter in dampers.items()}
         known = (grasps, driven, moved, prescribed, ca.SX(ca.DM(gravity)))
         system = System(tree, parameters, tuple(elastic), coefficients, *known, point_frames=seen)
-        return replace(system, segment_layouts=tuple(segments)).with_effects(effects)
+        integrals = [_ServoIntegral.of_joint(name) for name, servo in moved.items() if not servo.integral.is_zero()]
+        return replace(system, segment_layouts=tuple(segments)).with_effects([*integrals, *effects])
 
     def with_effects(self, effects: Sequence[Effect]) -> System:
         """This system with additional effects, whose parameters are appended to theta in the order given."""
