@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from small_problems import joints, places, recording, seen
 
 from yid_ocp.data.recording import Recording
 from yid_ocp.diagnosis import diagnose
@@ -20,7 +21,8 @@ from yid_ocp.diagnosis.events import (
 from yid_ocp.diagnosis.pulse_detection import DetectedForcePulse
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.inference.null_test import times_since_recording_start
-from yid_ocp.integrator.step import compile_step
+from yid_ocp.inference.smoother import select_and_smooth_unknowns
+from yid_ocp.integrator.step import compile_step, simulate
 from yid_ocp.model import System
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.problem import EstimationProblem, ProblemOptions, SensorOptions
@@ -207,6 +209,31 @@ def test_samples_of_an_events_joint_in_its_window_do_not_count(twin, pushed):
     assert not added[:, 0].any()
     assert 0.01 * added[:, 1].sum() == pytest.approx(-0.16, rel=0.01)
     assert 0.01 * added[300:340, 1].sum() == pytest.approx(-0.16, rel=0.1)
+
+
+def test_a_push_beside_driving_torques_is_an_event_where_the_smoother_finds_a_force(twin):
+    step, t, push = compile_step(twin.driven, 0.01), 0.01 * np.arange(201), Push("elbow", 0.8, 1.2, 0.12)
+    torque = np.zeros((200, 2))
+    torque[:, 0] = 1.5 * np.sin(2 * np.pi * 0.7 * t[:-1])
+    wave = np.sin(np.pi * np.clip((t[:-1] - push.start) / (push.end - push.start), 0, 1)) ** 2
+    pushed = torque + push.peak * np.stack([0 * wave, wave], axis=1)
+    state = simulate(step, twin.driven.parameters.vector(), np.zeros(4), 200, pushed).state[:, :2]
+    frames = list(twin.driven.mechanism.frames)[-2:]
+    place = places(twin.driven, frames, state)
+    place += 1e-3 * np.random.default_rng(3).standard_normal(place.shape)
+    arm = joints(JOINTS, t, state, effort=np.vstack([torque, torque[-1:]]), effort_std=0.0, effort_kind="command")
+    made = recording(arm, seen(frames, t, place, std=np.full(place.shape, 1e-3)))
+    sensors = {"joints.position": SensorOptions(use=False)}
+    options = ProblemOptions(initial_state="equilibrium", feedback="none", sensors=sensors)
+    problem = EstimationProblem(step, [made], ["shoulder.damping"], options)
+    x = solve(problem, GaussNewton()).x
+    evaluation = problem.evaluate(x)
+    smoothed = select_and_smooth_unknowns(problem, x, evaluation)
+    (event,) = find_force_and_fault_events(problem, x, evaluation, smoothed).disturbances
+    assert (event.kind, event.location, event.channel, event.unit) == ("force", "elbow", "elbow", "N m")
+    assert (event.start_time, event.end_time) == pytest.approx((push.start, push.end), abs=0.15)
+    assert event.impulse == pytest.approx(push.impulse, rel=0.2)
+    assert abs(event.impulse - push.impulse) < 3 * event.impulse_std
 
 
 def test_after_a_fall_nothing_counts(twin, pushed):
