@@ -2,6 +2,7 @@
 
     python benchmarks/information.py parameter [--starts 20] [--recordings 5]
     python benchmarks/information.py pair [--starts 3] [--case heavy_free_branch] [--share 1]
+    python benchmarks/information.py wrist
 
 `parameter`: one arm with a camera (`configs/single_arm_vision.yaml`), whose recording tells T3.bend to some 20 %. Its
 solution is where the motion is planned that tells T3.bend best; that motion is recorded in MuJoCo with the true
@@ -11,33 +12,42 @@ stiffness and the noise of the shipped recordings, several draws of it, and each
 `pair`: an effect of `diagnosis_cases.py`, or a share of its size, is withheld in MuJoCo, and the diagnosis finds
 another one as likely. Two motions that tell them apart are planned, recorded with the same effect at work, and
 diagnosed beside the first two recordings: one to estimate on, one held out.
+
+`wrist`: relative standard deviations of the stiffnesses of T1 and T3 with and without a wrist force/torque sensor at
+every gripper, 100 Hz, noise of 0.1 N and 0.01 N m: at the true values, on the shipped recordings of one and two arms,
+which are prescribed, with the efforts' noise and offsets and the encoders' noise that the recordings state.
 """
 
 from __future__ import annotations
 
 import argparse
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from diagnosis_cases import CASES, record
 from make_recordings import ROUGH, TRUTH
 from planning import PlannedMovement
 
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
-from yid_ocp.data.recording import Recording
+from yid_ocp.data.recording import Recording, SensorChannelGroup
+from yid_ocp.data.recording_hdf5 import write_recording
 from yid_ocp.diagnosis import DiagnosisResult, Thresholds, diagnose
 from yid_ocp.effects import make_effect
 from yid_ocp.planning.information_plan import InformativeMotionPlan, plan_informative_motion
 from yid_ocp.planning.joint_paths import PlanLimits, PlanOptions
-from yid_ocp.problem import EstimationProblem
+from yid_ocp.problem import EstimationProblem, SensorOptions
 from yid_ocp.report.terminal import aligned_table_lines
 from yid_ocp.solvers import GaussNewton, Solution, solve
 from yid_ocp.virtual.experiment import PointCamera, VirtualExperiment, baxter_foam_y_system, run_virtual_experiment
 from yid_ocp.virtual.injected import InjectedEffect, run_experiment_with_effects
 from yid_ocp.virtual.mujoco_simulation import SimulationOptions
-from yid_ocp.workflow.build_problem import build_problem
+from yid_ocp.workflow.build import build_step
+from yid_ocp.workflow.build_problem import build_problem, problem_options
 from yid_ocp.workflow.command_runner import StderrLogLinesProgress
 from yid_ocp.workflow.plan import parameter_and_effect_values
+from yid_ocp.workflow.run_inputs import read_recordings
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.yaml"
 SOUGHT = "T3.bend"
@@ -151,6 +161,39 @@ def pair(name: str, starts: int, share: float) -> None:
     )
 
 
+def wrist() -> None:
+    rows: list[tuple[str, ...]] = [("", *(name for name in TRUTH if not name.startswith("T2")))]
+    for noun, name, sides in (("one arm", "single", ("left",)), ("two arms", "dual", ("left", "right"))):
+        config = CONFIG.parent / f"{name}_arm_no_vision.yaml"
+        asked = ["model.arms.mode=prescribed", "recordings.held_out=[]"]
+        [recording] = read_recordings(load_config(config, asked))
+        joints = recording.joints
+        assert joints is not None
+        frames = tuple(f"{side}_gripper" for side in sides)
+        none = np.zeros((len(joints.t), len(frames), 3))  # what is read does not change what it tells
+        stds = {"force_std": 0.1, "torque_std": 0.01}
+        sensed = SensorChannelGroup("wrist", frames, joints.t, {"force": none, "torque": none}, stds)
+        with tempfile.TemporaryDirectory() as folder:
+            write_recording(replace(recording, channel_groups=(sensed,), points=()), f"{folder}/sensed.h5")
+            run = load_config(config, [*asked, f"recordings.estimate=[{folder}/sensed.h5]"])
+            step, [sensed_recording] = build_step(run), read_recordings(run)
+            options = problem_options(run, step.system)
+        for words, efforts, wrists in (("efforts", True, False), ("wrist", False, True), ("both", True, True)):
+            used = {f"wrist.{quantity}": SensorOptions(use=wrists) for quantity in ("force", "torque")}
+            used["joints.effort"] = SensorOptions(use=efforts)
+            asked_of = replace(options, sensors=used)
+            problem = EstimationProblem(step, [sensed_recording], tuple(TRUTH), asked_of)
+            evaluation = problem.evaluate(x := np.array([TRUTH[name] for name in problem.free]))
+            assert evaluation.jacobian is not None, evaluation.message
+            scaled = evaluation.jacobian[problem.residual_rows.data] * x
+            # nothing else is known of a stiffness than that it is within a factor of 100
+            std = np.sqrt(np.diag(np.linalg.inv(scaled.T @ scaled + 1e-4 * np.eye(len(x)))))
+            known = dict(zip(problem.free, std, strict=True))
+            cells = (f"{100 * known[name]:.2g} %" if known[name] < 1 else "not" for name in rows[0][1:])
+            rows.append((f"{noun}, {words}", *cells))
+    print("\n".join(aligned_table_lines(rows)))
+
+
 def _share(effect: InjectedEffect, share: float) -> InjectedEffect:
     """The same effect, its amplitudes that part of the way from neutral."""
     kind = make_effect(effect.kind, effect.location, baxter_foam_y_system(1))
@@ -170,7 +213,7 @@ def _diagnosed(nominal: EstimationProblem, estimate: list[Recording], held_out: 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Planned motions that tell more, in MuJoCo.")
-    parser.add_argument("what", choices=("parameter", "pair"))
+    parser.add_argument("what", choices=("parameter", "pair", "wrist"))
     parser.add_argument("--starts", type=int, default=5)
     parser.add_argument("--recordings", type=int, default=5)
     parser.add_argument("--case", default="heavy_free_branch", help="of diagnosis_cases.py")
@@ -178,6 +221,8 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.what == "parameter":
         parameter(arguments.starts, arguments.recordings)
+    elif arguments.what == "wrist":
+        wrist()
     else:
         pair(arguments.case, arguments.starts, arguments.share)
 

@@ -26,6 +26,7 @@ from yid_ocp.sensors import sensor_reading_function
 from yid_ocp.sensors.imu import _Accelerometer, _Gyroscope
 from yid_ocp.sensors.wrist import _WristForceSensor, _WristTorqueSensor
 from yid_ocp.solvers import GaussNewton, solve
+from yid_ocp.workflow.build_problem import load_problem
 
 LINK = """<link name="{}"><inertial><origin xyz="{}"/><mass value="{}"/>
 <inertia ixx="{}" iyy="{}" izz="{}" ixy="{}" ixz="0" iyz="{}"/></inertial></link>"""
@@ -275,3 +276,36 @@ def test_sensors_that_cannot_be_compared_are_refused(
     sensors = {"wrist.force": SensorOptions(**options), "wrist.torque": SensorOptions(use=False)}
     with pytest.raises(DataError, match=message):
         problem(holding(urdf, prescribed=ARM), replace(recorded, channel_groups=(wrist,)), "T1.bend", sensors=sensors)
+
+
+def test_a_configuration_names_them_and_keeps_prescribed_arms_prescribed(
+    urdf: Path, recorded: Recording, tmp_path: Path
+) -> None:
+    """Recorded efforts would drive arms whose grasps close loops, but such torques have noise."""
+    efforts = replace(recorded.joints, effort=np.zeros((len(recorded.joints.t), 2)), effort_std=1.0, position_std=1e-4)
+    write_recording(replace(recorded, joints=efforts), tmp_path / "run.h5")
+    root = holding(urdf).mechanism.joints[2].placement.translation
+    base = [float(x) for x in np.array(ca.DM(ca.evalf(root))).ravel()]
+    (tmp_path / "run.yaml").write_text(f"""
+model:
+  robot: {urdf}
+  arms: {{joints: [shoulder, elbow], mode: prescribed}}
+  object:
+    kind: segments
+    segments: {{T1: {{length: 0.6, mass: 0.1, radius: 0.02, links: 3}}}}
+    mount: {{xyz: {base}}}
+  grasp: {{hand: {{holder_frame: tool, held_frame: w_T1, kind: point}}}}
+recordings: {{estimate: [run.h5]}}
+sensors: {{joints.effort: {{use: false}}}}
+parameters: {{T1.bend: {{free: true, initial: 4.0}}}}
+problem: {{path_cutoff: 10.0, use_compiler: false}}
+""")
+    made = load_problem(tmp_path / "run.yaml")
+    assert made.system.prescribed == ARM
+    assert {s.sensor.group_name.partition("_")[0] for s in made.episodes[0].measurements} == {
+        "wrist.force",
+        "wrist.torque",
+        "imu",
+    }
+    unused = [f"sensors.{key}.use=false" for key in recorded.sensor_setting_keys if key[:3] in ("imu", "wri")]
+    assert load_problem(tmp_path / "run.yaml", unused).system.driven == ARM

@@ -28,6 +28,7 @@ from yid_ocp.model.rotations import rotation_from_rpy, transform_from_xyz_rpy
 from yid_ocp.model.servos_and_springs import MOTOR_PRESETS, RobotJointSpring
 from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
+from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.workflow import run_inputs
 from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings, unknown_name_error
 
@@ -118,10 +119,19 @@ def clamped_cable_topology(run: RunSettings) -> CableTopology | None:
 
 
 def arms_are_estimated_states(run: RunSettings) -> bool:
-    """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders."""
+    """Whether prescribed arms become estimated states, driven by measured torques and corrected by encoders.
+
+    Not beside sensors on links, which cannot be weighted where noise drives the motion.
+    """
     if run.model.arms.mode != "prescribed" or not run.model.grasp:
         return False
     recordings = read_recordings(run)
+    for group in (group for recording in recordings for group in recording.channel_groups):
+        of_vectors = (kind.quantity for kind in channel_kinds_for_group_name(group.name) if kind.components)
+        for quantity in (quantity for quantity in of_vectors if quantity in group.values_by_quantity):
+            said = run.sensors.get(f"{group.name}.{quantity}")
+            if said is None or said.use is not False:
+                return False
     return bool(recordings) and all(r.joints is not None and r.joints.effort is not None for r in recordings)
 
 
