@@ -20,7 +20,7 @@ class _Gyroscope(MountedSensor):
 
     channel = _ANGULAR_VELOCITY
 
-    def frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
         kinematics = state.kinematics
         return kinematics.frame_pose(frame).rotation.T @ (kinematics.angular_jacobian(frame) @ state.v)
 
@@ -30,7 +30,7 @@ class _Accelerometer(MountedSensor):
 
     channel = _SPECIFIC_FORCE
 
-    def frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
         kinematics = state.kinematics
         jacobian = kinematics.position_jacobian(frame)
         acceleration = jacobian @ state.a + ca.jtimes(jacobian @ state.v, state.q, state.v)

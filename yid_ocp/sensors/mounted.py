@@ -40,9 +40,9 @@ class MountedSensor(Sensor):
 
     def ideal_reading(self, state: NodeState) -> ca.SX:
         frames = zip(self.signs, self.frame_names, strict=True)
-        return ca.vertcat(*(sign * self.frame_reading(state, frame) for sign, frame in frames))
+        return ca.vertcat(*(sign * self._frame_reading(state, frame) for sign, frame in frames))
 
-    def frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
         """What the sensor in one frame reads, along the frame's axes, shape (3, 1)."""
         raise NotImplementedError
 

@@ -31,7 +31,7 @@ class _WristForceSensor(MountedSensor):
 
     channel = _FORCE
 
-    def frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
         return _wrench_on_sensor(state, frame)[:3]
 
 
@@ -40,7 +40,7 @@ class _WristTorqueSensor(MountedSensor):
 
     channel = _TORQUE
 
-    def frame_reading(self, state: NodeState, frame: str) -> ca.SX:
+    def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
         return _wrench_on_sensor(state, frame)[3:]
 
 
