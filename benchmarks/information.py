@@ -47,7 +47,7 @@ from yid_ocp.workflow.build import build_step
 from yid_ocp.workflow.build_problem import build_problem, problem_options
 from yid_ocp.workflow.command_runner import StderrLogLinesProgress
 from yid_ocp.workflow.plan import parameter_and_effect_values
-from yid_ocp.workflow.run_inputs import read_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "single_arm_vision.yaml"
 SOUGHT = "T3.bend"
@@ -166,7 +166,7 @@ def wrist() -> None:
     for noun, name, sides in (("one arm", "single", ("left",)), ("two arms", "dual", ("left", "right"))):
         config = CONFIG.parent / f"{name}_arm_no_vision.yaml"
         asked = ["model.arms.mode=prescribed", "recordings.held_out=[]"]
-        [recording] = read_recordings(load_config(config, asked))
+        [recording] = read_recordings_of_role(load_config(config, asked))
         joints = recording.joints
         assert joints is not None
         frames = tuple(f"{side}_gripper" for side in sides)
@@ -176,7 +176,7 @@ def wrist() -> None:
         with tempfile.TemporaryDirectory() as folder:
             write_recording(replace(recording, channel_groups=(sensed,), points=()), f"{folder}/sensed.h5")
             run = load_config(config, [*asked, f"recordings.estimate=[{folder}/sensed.h5]"])
-            step, [sensed_recording] = build_step(run), read_recordings(run)
+            step, [sensed_recording] = build_step(run), read_recordings_of_role(run)
             options = problem_options(run, step.system)
         for words, efforts, wrists in (("efforts", True, False), ("wrist", False, True), ("both", True, True)):
             used = {f"wrist.{quantity}": SensorOptions(use=wrists) for quantity in ("force", "torque")}

@@ -31,7 +31,7 @@ from yid_ocp.integrator.step_model import TrackingFeedback
 from yid_ocp.model import Grasp, Segment, System, flexible_object
 from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.solvers import GaussNewton, Status, solve
-from yid_ocp.workflow.solve import solution_marked_if_step_unstable
+from yid_ocp.workflow.solve import checked_solution_and_step_stability
 
 OPEN = {"a": (-math.inf, math.inf), "b": (-math.inf, math.inf)}
 
@@ -385,7 +385,7 @@ def test_a_fit_that_walked_away_from_an_unstable_truth_has_not_converged(light, 
     assert found.status == Status.CONVERGED
     entry = found.parameters["cable.bend"]
     assert (abs(entry.value - 0.5) > 100 * entry.std) == (status == Status.STALLED)
-    judged, said = solution_marked_if_step_unstable(problem, found)
+    judged, said = checked_solution_and_step_stability(problem, found)
     assert judged.status == status
     assert set(said) == {"start", "estimate"}
     if status == Status.STALLED:
@@ -412,12 +412,12 @@ def test_a_search_may_begin_but_not_end_where_the_step_is_not_stable(monkeypatch
     grown = {x: AlternatingErrorGrowth("run", size, 1.3, 0.1, H) for x, size in decades.items()}
     monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: grown[float(x[0])])
     found = replace(solution(status=before, a=estimated(1.0)), message="done")
-    judged, said = solution_marked_if_step_unstable(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    judged, said = checked_solution_and_step_stability(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert judged.status == after
     assert (said["start"]["decades"], said["estimate"]["decades"]) == (start, estimate)
     named = "at the estimate run" if estimate else "at the start run" if start and before == Status.FAILED else "done"
     assert judged.message.startswith(named)
     assert "done" in judged.message
     monkeypatch.setattr(discretisation, "largest_alternating_error_growth", lambda problem, x: None)
-    unchecked = solution_marked_if_step_unstable(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
+    unchecked = checked_solution_and_step_stability(SimpleNamespace(initial_unknowns=np.zeros(1)), found)
     assert unchecked == (found, {"start": None, "estimate": None})

@@ -9,7 +9,7 @@ from yid_ocp.config.reader import load_config
 from yid_ocp.errors import SolverError, WorkerError
 from yid_ocp.parallel import InlineExecutor
 from yid_ocp.workflow import identifiability as identifiability_command
-from yid_ocp.workflow.build import build_system, system_with_second_arm
+from yid_ocp.workflow.build import build_system, system_with_second_arm_holding_object
 from yid_ocp.workflow.identifiability import IdentifiabilityOptions, run_identifiability
 
 VERDICTS = {"identifiable", "weak", "not_identifiable", "at_bound", "not_trusted"}
@@ -194,12 +194,15 @@ def test_a_part_that_fails_is_said(run, tmp_path, monkeypatch):
 def test_the_other_arm_of_a_robot(repository):
     run = load_config(repository / "configs" / "single_arm_vision.yaml")
     system = build_system(run)
-    both = system_with_second_arm(run, system)
+    both = system_with_second_arm_holding_object(run, system)
     assert both is not None
     assert both.driven[:7] == system.driven
     assert both.driven[7:] == tuple(name.replace("left_", "right_") for name in system.driven)
     found = {grasp.name: (grasp.holder_frame, grasp.held_frame) for grasp in both.grasps}
     assert found == {"left": ("left_gripper", "w_T2"), "right": ("right_gripper", "w_T3")}
-    assert system_with_second_arm(load_config(repository / "configs" / "dual_arm_vision.yaml"), both) is None
+    assert (
+        system_with_second_arm_holding_object(load_config(repository / "configs" / "dual_arm_vision.yaml"), both)
+        is None
+    )
     moved = replace(run, model=replace(run.model, arms=replace(run.model.arms, mode="prescribed")))
-    assert system_with_second_arm(moved, system) is None
+    assert system_with_second_arm_holding_object(moved, system) is None

@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.schema import config_json_schema
-from yid_ocp.config.settings import DiagnosisSettings, ProblemSettings, dump_config
+from yid_ocp.config.settings import DiagnosisSettings, ProblemSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis import Thresholds
 from yid_ocp.errors import ConfigError
 from yid_ocp.model.objects.cable import Cable, CableOptions
@@ -88,7 +88,7 @@ def test_the_schema_refuses_typos(rules, data, valid):
 @pytest.mark.parametrize("name", ["dual_arm_vision", "baxter_arm", "panda_beam", "deft_bdlo1", "springs_torsion"])
 def test_written_back_it_is_the_same_run(repository, tmp_path, name):
     run = load_config(repository / "configs" / f"{name}.yaml")
-    (tmp_path / f"{name}.yaml").write_text(dump_config(run))
+    (tmp_path / f"{name}.yaml").write_text(config_yaml_with_defaults(run))
     assert load_config(tmp_path / f"{name}.yaml") == run
 
 
@@ -97,14 +97,14 @@ def test_written_back_every_setting_is_there(written):
         "solver: {name: single_shooting, max_iterations: 3}\ntrack: {options: {filters: {max_depth_behind_base: null}}}"
     )
     run = load_config(written(f"{text}\ncompare: {{methods: {{single_shooting: {{cost_tolerance: 2}}}}}}\n"))
-    told = YAML(typ="safe", pure=True).load(dump_config(run))
+    told = YAML(typ="safe", pure=True).load(config_yaml_with_defaults(run))
     assert told["solver"] == {"name": "single_shooting", "max_iterations": 3, "cost_tolerance": 1e-9}
     assert told["compare"]["methods"] == {"single_shooting": {"max_iterations": 200, "cost_tolerance": 2}}
     assert told["problem"]["time_step"] == 0.01
     assert told["track"]["options"]["filters"]["max_depth_behind_base"] is None
     assert not {"duration", "known_initial_states"} & set(told["problem"])
     assert not {"name", "config_file", "key_locations"} & set(told)
-    assert load_config(written(dump_config(run))) == run
+    assert load_config(written(config_yaml_with_defaults(run))) == run
 
 
 def test_sections_are_what_their_users_take(written):

@@ -10,7 +10,7 @@ import pytest
 from made_series import without
 
 from yid_ocp.data.channel_checks import typical_point_pair_distances
-from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_at_gaps
+from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_recording_at_gaps
 from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording
 from yid_ocp.errors import DataError
@@ -257,7 +257,7 @@ def test_doubts_have_a_cause_that_is_listed_and_say_how_sure_they_are():
 
 
 def test_a_recording_is_cut_at_a_gap_and_every_part_is_kept_where_it_may_start_in_motion():
-    parts = split_at_gaps(without(made(), 3.0, 5.0), (), True)
+    parts = split_recording_at_gaps(without(made(), 3.0, 5.0), (), True)
     assert [(p.joints.t[0], p.joints.t[-1]) for p in parts.recordings] == [(0.0, 2.99), (5.01, 8.0)]
     assert [p.name for p in parts.recordings] == ["made_part1", "made_part2"]
     (doubt,) = parts.issues
@@ -267,22 +267,22 @@ def test_a_recording_is_cut_at_a_gap_and_every_part_is_kept_where_it_may_start_i
 
 def test_where_a_model_starts_from_rest_only_parts_that_do_are_kept():
     recording = without(made(), 3.0, 5.0)
-    parts = split_at_gaps(recording, (), False)
+    parts = split_recording_at_gaps(recording, (), False)
     assert [(p.name, p.joints.t[-1]) for p in parts.recordings] == [("made", 2.99)]
     assert "a part counts only where it starts at rest" in parts.issues[0].what
     resting = np.where(np.abs(recording.joints.t - 5.2) < 0.3, 0.0, 1.0)[:, None] * recording.joints.position
-    assert len(split_at_gaps(changed(recording, position=resting), (), False).recordings) == 2
+    assert len(split_recording_at_gaps(changed(recording, position=resting), (), False).recordings) == 2
 
 
 def test_a_few_samples_missing_are_no_gap_and_short_parts_are_left_out():
-    assert split_at_gaps(without(made(), 3.0, 3.05), (), True).issues == ()
-    assert [p.joints.t[0] for p in split_at_gaps(without(made(), 0.3, 1.0), (), True).recordings] == [1.01]
+    assert split_recording_at_gaps(without(made(), 3.0, 3.05), (), True).issues == ()
+    assert [p.joints.t[0] for p in split_recording_at_gaps(without(made(), 0.3, 1.0), (), True).recordings] == [1.01]
 
 
 def test_a_clock_that_jumps_is_told_from_joints_that_went_on_unseen():
     recording = made()
     late = np.where(recording.joints.t > 4.0, 2.0, 0.0)
-    parts = split_at_gaps(changed(recording, t=recording.joints.t + late), (), True)
+    parts = split_recording_at_gaps(changed(recording, t=recording.joints.t + late), (), True)
     assert [doubt.cause for doubt in parts.issues] == ["clock_jump"]
     assert len(parts.recordings) == 2
 
@@ -292,8 +292,8 @@ def test_points_that_drive_a_model_may_be_hidden_for_a_while():
     seen = np.zeros((500, 2, 3)) + np.sin(t)[:, None, None]
     seen[200:300, 0] = np.nan
     recording = Recording(None, (PointGroup("points", ("p0", "p5"), t, seen),), name="cable")
-    assert [len(p.points[0].t) for p in split_at_gaps(recording, ("p0",), True).recordings] == [200, 200]
-    assert split_at_gaps(recording, ("p5",), True).issues == ()
+    assert [len(p.points[0].t) for p in split_recording_at_gaps(recording, ("p0",), True).recordings] == [200, 200]
+    assert split_recording_at_gaps(recording, ("p5",), True).issues == ()
 
 
 def stretched(lengths: list[float], name: str = "r") -> Recording:

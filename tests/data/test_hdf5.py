@@ -19,7 +19,12 @@ from recording_examples import assert_same, changed, example, finite, joints_of,
 
 from yid_ocp.data import recording_hdf5
 from yid_ocp.data.recording import JOINT_CHANNEL_UNITS, JointGroup, PointGroup, Recording, validate_recording
-from yid_ocp.data.recording_hdf5 import create_hdf5_atomically, open_checked_hdf5, read_recording, write_recording
+from yid_ocp.data.recording_hdf5 import (
+    create_hdf5_atomically,
+    open_hdf5_after_read_check,
+    read_recording,
+    write_recording,
+)
 from yid_ocp.errors import DataError, OutputError
 
 ROOT = Path(__file__).parents[2]
@@ -269,7 +274,7 @@ def plain_file(tmp_path):
 
 
 def test_what_was_written_is_read(plain_file):
-    with open_checked_hdf5(plain_file) as data:
+    with open_hdf5_after_read_check(plain_file) as data:
         assert data.attrs["format"] == "test"
         np.testing.assert_array_equal(data["a/values"], [0.0, 1.0, 2.0])
     assert [path.name for path in plain_file.parent.iterdir()] == ["file.h5"]
@@ -312,7 +317,7 @@ def test_a_file_of_other_files_or_of_more_than_it_holds_is_refused(plain_file, t
         other.create_dataset("secret", data=[1.0])
         make(data, tmp_path / "other.h5")
     assert plain_file.stat().st_size < 100_000
-    with pytest.raises(DataError, match=message), open_checked_hdf5(plain_file):
+    with pytest.raises(DataError, match=message), open_hdf5_after_read_check(plain_file):
         pass
 
 
@@ -335,5 +340,5 @@ def test_a_file_that_ends_the_library_or_never_ends_does_not_end_us(plain_file, 
     if done is signal.pause:
         monkeypatch.setattr(recording_hdf5, "_READ_TIMEOUT", 0.3)
     monkeypatch.setattr(recording_hdf5, "_foreign", lambda group: done())
-    with pytest.raises(DataError, match=said), open_checked_hdf5(plain_file):
+    with pytest.raises(DataError, match=said), open_hdf5_after_read_check(plain_file):
         pass

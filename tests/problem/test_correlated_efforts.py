@@ -246,7 +246,7 @@ def test_settings_say_what_recorded_efforts_are(urdf_folder, kind):
     recorded, free = taken(step, 1), ["shoulder.damping"]
     stated = ProblemOptions(sensors={JOINT_EFFORT_GROUP_NAME: SensorOptions(effort_kind=kind)})
     [said] = EstimationProblem(step, [recorded], free, stated).episodes
-    [held] = EstimationProblem(step, [recorded.with_effort_kind(kind)], free, ProblemOptions()).episodes
+    [held] = EstimationProblem(step, [recorded.with_effort_sampling_kind(kind)], free, ProblemOptions()).episodes
     assert said.recording.joints.effort_kind == kind
     np.testing.assert_array_equal(said.torque, held.torque)
     assert (np.abs(said.torque - recorded.joints.effort[:-1]).max() < 1e-12) == (kind != "sample")

@@ -236,6 +236,6 @@ def test_long_curves_are_thinned_and_gaps_stay():
 
 
 def test_cost_history_has_a_curve_for_each_horizon():
-    figure = figures.cost_history_figure([5.0, 3.0, 9.0, 2.0], ["first 1 s", "first 1 s", "", ""])
+    figure = figures.solution_cost_history_figure([5.0, 3.0, 9.0, 2.0], ["first 1 s", "first 1 s", "", ""])
     assert [trace.name for trace in figure.data] == ["first 1 s", "whole recordings"]
     assert [list(trace.x) for trace in figure.data] == [[0, 1], [2, 3]]

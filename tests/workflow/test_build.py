@@ -11,14 +11,14 @@ import pytest
 import yid_ocp as yid
 from yid_ocp.analysis.compare import PAPER_ESTIMATES
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import dump_config
+from yid_ocp.config.settings import config_yaml_with_defaults
 from yid_ocp.errors import ConfigError, ModelError
 from yid_ocp.model import forward_kinematics
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.solvers import GaussNewton
 from yid_ocp.workflow.build import arms_are_estimated_states, build_system, load_system, settings_by_parameter_name
 from yid_ocp.workflow.build_problem import build_problem, load_problem, problem_options
-from yid_ocp.workflow.run_inputs import read_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def test_effects_bring_their_parameters(written):
     assert [(effect.kind, effect.location) for effect in system.effects] == [("kelvin_voigt", "T3"), ("density", "T2")]
     assert system.parameters["kelvin_voigt@T3.tau"].value == 0.02
     assert system.parameters["density@T2.scale"].value == 1.1
-    assert load_config(written(dump_config(run))) == run
+    assert load_config(written(config_yaml_with_defaults(run))) == run
 
 
 @pytest.mark.parametrize(
@@ -239,7 +239,7 @@ def test_prescribed_arms_that_hold_an_object_are_states(repository, file, overri
 def test_their_encoders_are_measurements_and_the_points_of_the_arm_are_not(repository):
     file = repository / "configs" / "dual_arm_vision.yaml"
     run = load_config(file, ["model.arms.mode=prescribed", "recordings.held_out=[]", "problem.use_compiler=false"])
-    options = problem_options(run, build_system(run), read_recordings(run))
+    options = problem_options(run, build_system(run), read_recordings_of_role(run))
     used = {group: said.use for group, said in options.sensors.items()}
     assert used == {"joints.position": True, "points_arm": False}
 

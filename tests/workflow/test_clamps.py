@@ -16,7 +16,7 @@ from yid_ocp.solvers import GaussNewton, MultipleShooting, solve
 from yid_ocp.workflow import run_history
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.run_inputs import read_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role
 from yid_ocp.workflow.simulate import run_simulate
 
 BEAM = """
@@ -172,16 +172,16 @@ def test_a_baseline_of_another_model_is_refused_by_what_differs(tmp_path):
     (tmp_path / "old" / "config.yaml").write_text(BEAM.replace("links: 2", "links: 3"), encoding="utf-8")
     run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
     with pytest.raises(ConfigError, match=r"model\.object differs"):
-        run_history.baseline_estimates(run)
+        run_history.estimates_of_each_baseline_run(run)
 
 
 def test_recordings_of_the_baseline_are_those_without_what_is_looked_for(tmp_path):
     folder = folder_of(tmp_path / "old")
     (folder / "config.yaml").write_text(BEAM.replace("[beam.h5]", "[../beam.h5]"), encoding="utf-8")
     run = settings(tmp_path, None, ("diagnosis.baseline=[old]",))
-    [found], message = run_history.load_recordings_without_effect(run)
+    [found], message = run_history.load_reference_or_baseline_recordings(run)
     assert (found.name, message) == ("beam (without)", "")
-    assert found.sha256 == read_recordings(run, "estimate")[0].sha256
+    assert found.sha256 == read_recordings_of_role(run, "estimate")[0].sha256
 
 
 def test_report_says_what_drifted_and_writes_the_history(tmp_path, cli):

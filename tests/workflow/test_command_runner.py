@@ -185,7 +185,7 @@ def test_a_command_ends_with_its_table_and_its_folder(tmp_path, monkeypatch, cap
 
     def work(progress):
         progress.begin_stage("working")
-        return command_runner.CommandResult(folder, {"format": "made", "a": 1}, None, reached)
+        return command_runner.CommandResultAndOutput(folder, {"format": "made", "a": 1}, None, reached)
 
     folder = tmp_path / "runs" / "x"
     code = command_runner.run_command_and_print(asked(quiet=quiet), work)
@@ -199,6 +199,6 @@ def test_a_folder_elsewhere_is_named_in_full(tmp_path, monkeypatch, capsys):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setattr(command_runner, "SUMMARY_BY_FORMAT", {"made": lambda result: []})
-    made = command_runner.CommandResult(tmp_path / "there", {"format": "made"}, None)
+    made = command_runner.CommandResultAndOutput(tmp_path / "there", {"format": "made"}, None)
     command_runner.run_command_and_print(asked(), lambda progress: made)
     assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "there")

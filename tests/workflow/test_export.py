@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
-from yid_ocp.config.settings import dump_config
+from yid_ocp.config.settings import config_yaml_with_defaults
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.diagnose import run_diagnose
-from yid_ocp.workflow.run_inputs import read_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip install 'yid-ocp[blind]'")
 
@@ -22,7 +22,7 @@ mujoco = pytest.importorskip("mujoco", reason="exported models need MuJoCo: pip 
 def written_run(folder, effects, run, recorded=True):
     """A run folder as `diagnose` leaves it that found the truth of the embedded recordings, and some effects."""
     system = build_system(run)
-    truth = read_recordings(run, "estimate")[0].true_parameters
+    truth = read_recordings_of_role(run, "estimate")[0].true_parameters
     values = {p.name: p.value for p in system.parameters} | effects
     values |= {name: value for name, value in truth.items() if name.endswith((".bend", ".twist"))}
     free = {*(name for name in values if name.endswith((".bend", ".twist"))), *effects}
@@ -32,7 +32,7 @@ def written_run(folder, effects, run, recorded=True):
     }
     folder.mkdir()
     said = run if recorded else replace(run, recordings=replace(run.recordings, held_out=(), estimate=()))
-    (folder / "config.yaml").write_text(dump_config(said))
+    (folder / "config.yaml").write_text(config_yaml_with_defaults(said))
     result = {"format": "yid-diagnosis/2", "verdict": "effect", "model": {"parameters": parameters, "covariance": {}}}
     (folder / "result.json").write_text(json.dumps(result))
     return folder

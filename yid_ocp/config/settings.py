@@ -16,7 +16,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedSeq
 
-from yid_ocp.data.recording import RecordedOrNominalClock
+from yid_ocp.data.recording import RecordedOrNominalTimes
 from yid_ocp.diagnosis.thresholds import Thresholds
 from yid_ocp.effects.friction import FrictionLawName
 from yid_ocp.errors import ConfigError
@@ -254,7 +254,7 @@ class ImportSettings:
         _Numbers, OptionInfo("turns of the motor per turn of the joint, by joint or pattern; 1 when absent")
     ] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
-    clock: Annotated[RecordedOrNominalClock | None, OptionInfo("of a table: whether its times were measured")] = None
+    clock: Annotated[RecordedOrNominalTimes | None, OptionInfo("of a table: whether its times were measured")] = None
     sensor: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
     frame: Annotated[str | None, OptionInfo("frame of reference of the points, of a table or C3D file")] = None
 
@@ -466,7 +466,7 @@ class RunSettings:
         return ConfigError(what, where=self.describe_location(*path), allowed=allowed, hint=hint)
 
 
-def dump_config(run: RunSettings) -> str:
+def config_yaml_with_defaults(run: RunSettings) -> str:
     """YAML text of a run's settings, with every default, that `load_config` reads back to the same run."""
     stream = io.StringIO()
     yaml = YAML()

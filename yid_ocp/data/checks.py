@@ -39,7 +39,7 @@ class _RecordingParts(NamedTuple):
     issues: tuple[Issue, ...] = ()
 
 
-def split_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
+def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
     """Parts between gaps in the joints, or else in the `driving` points that clamps follow, and one issue for each gap.
 
     Where a rollout may not start `anywhere`, in motion too, later parts are kept only where they start at rest.
@@ -108,7 +108,7 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
     `choice` says how a group is used, its stated noise above all; `driving`, whether joints drive the model, so that
     what lies between their samples matters.
     """
-    recording = recording.with_effort_kind(choice("joints.effort").effort_kind)
+    recording = recording.with_effort_sampling_kind(choice("joints.effort").effort_kind)
     # nothing else can be said in times that are not seconds
     found = list(_units_of_time(recording)) or chain(
         _common_clock(recording),

@@ -17,7 +17,7 @@ from yid_ocp.display import ReprMixin, ReprSummary, count_with_noun
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.sensors.base import EffortSamplingKind, channel_kinds_for_group_name
 
-RecordedOrNominalClock = Literal["recorded", "nominal"]
+RecordedOrNominalTimes = Literal["recorded", "nominal"]
 
 JOINT_CHANNEL_UNITS: Mapping[str, str] = {
     "position": "rad",
@@ -91,7 +91,7 @@ class JointGroup(ReprMixin):
     position_resolution: float | Array | None = None
     proportional_gain: float | Array | None = None
     effort_kind: EffortSamplingKind | None = None
-    clock: RecordedOrNominalClock = "recorded"
+    clock: RecordedOrNominalTimes = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -149,7 +149,7 @@ class PointGroup(ReprMixin):
     sensor: str = "unknown"
     frame: str = "world"
     pose: Array | None = None
-    clock: RecordedOrNominalClock = "recorded"
+    clock: RecordedOrNominalTimes = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -195,7 +195,7 @@ class SensorChannelGroup(ReprMixin):
     t: Array
     values_by_quantity: Mapping[str, Array]
     stds_by_attribute: Mapping[str, float | Array] = field(default_factory=dict)
-    clock: RecordedOrNominalClock = "recorded"
+    clock: RecordedOrNominalTimes = "recorded"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -293,7 +293,7 @@ class Recording(ReprMixin):
         """Time from the first sample of any group to the last of any [s]."""
         return float(max(group.t[-1] for group in self.all_groups) - min(group.t[0] for group in self.all_groups))
 
-    def with_effort_kind(self, kind: EffortSamplingKind | None) -> Recording:
+    def with_effort_sampling_kind(self, kind: EffortSamplingKind | None) -> Recording:
         """The recording with the given effort kind; unchanged for None."""
         if kind is None or self.joints is None:
             return self
@@ -513,7 +513,7 @@ def _check_names_and_clock(group: JointGroup | PointGroup | SensorChannelGroup, 
         require_data(usable, what, place, allowed, "rename it")
         what = f"the name '{name}' occurs {count} times"
         require_data(count == 1, what, place, "every name once", "rename all but one")
-    clocks, place = get_args(RecordedOrNominalClock), f"{where}, attribute clock"
+    clocks, place = get_args(RecordedOrNominalTimes), f"{where}, attribute clock"
     require_data(group.clock in clocks, f"the clock is '{group.clock}'", place, ", ".join(clocks))
     _check_shape(group.t, (group.t.size,), f"{where}/t", "one-dimensional")
     bad = np.flatnonzero(~np.isfinite(group.t))

@@ -63,7 +63,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
     allowed = f"HDF5 in the format {_RECORDING_FORMAT}"
     hint = "read other formats (CSV, rosbag, MCAP) with `yid-ocp import` or yid_ocp.data.read_any"
     require_data(h5py.is_hdf5(path), "the file is not an HDF5 file", str(path), allowed, hint)
-    with open_checked_hdf5(path) as file:
+    with open_hdf5_after_read_check(path) as file:
         recording = _from_file(file, path, digest)
     return validate_recording(recording, allow_nan_effort=allow_nan_effort, where=str(path))
 
@@ -275,7 +275,7 @@ def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
 
 
 @contextlib.contextmanager
-def open_checked_hdf5(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
+def open_hdf5_after_read_check(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
     """Context manager of an HDF5 file, opened after another process has checked that it can be read.
 
     `DataError` where the file is damaged, holds more than `MAX_INPUT_NUMBERS`, takes too long to read, or refers to

@@ -24,7 +24,7 @@ from yid_ocp.virtual.mjcf import (
     effect_joint_terms_and_changed_aspects,
     format_xml_numbers,
     joint_dynamics_terms,
-    model_aspects_of_parameters,
+    model_aspects_depending_on_symbols,
 )
 
 EXPORT_MANIFEST_FORMAT = "yid-export/1"
@@ -210,7 +210,7 @@ def format_support_by_parameter(
     """Support of an export format for each parameter, by name; that of an effect's is the effect's."""
     found = {}
     for entry in system.parameters:
-        owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_of_parameters(system, entry.symbol))
+        owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_depending_on_symbols(system, entry.symbol))
         parts = [_SUPPORT_BY_FORMAT[form][aspect] for aspect in aspects] or [_UNUSED]
         found[entry.name] = effects[owner] if owner in effects else _worst(parts)
     return found

@@ -224,7 +224,9 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     `DataError` where the recording does not fit the model, is too short, or states no noise level.
     """
     step, system = functions.step, functions.step.system
-    recording = recording.with_effort_kind(options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_kind)
+    recording = recording.with_effort_sampling_kind(
+        options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_kind
+    )
     grid = make_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:
         raise DataError("the model's arms are driven but the recording has no joints", where=recording.name)

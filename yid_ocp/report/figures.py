@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from yid_ocp.arrays import Array
-from yid_ocp.report.terminal import display_scale_and_unit
+from yid_ocp.report.terminal import scale_and_unit_with_metres_as_mm
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -74,7 +74,7 @@ def _add_curves(figure: Figure, curves: Iterable[tuple[str, _Curve]], later_dash
     return figure
 
 
-def cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> Figure:
+def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -> Figure:
     """Figure of the cost at every accepted point, one curve per intermediate horizon."""
     figure = _styled_figure(320, "accepted point", "cost")
     figure.update_yaxes(**_POWERS)
@@ -113,7 +113,7 @@ def prediction_and_residual_plots(
     All are (M,); `course` (t (K,), value (K,)) is the first of the lines at more times, for what is measured seldom.
     """
     seen = np.isfinite(measured) & np.isfinite(std)
-    factor, shown = display_scale_and_unit(unit)
+    factor, shown = scale_and_unit_with_metres_as_mm(unit)
     drawn = {name: (t, values) for name, values in lines.items()}
     if course is not None:
         drawn[next(iter(lines))] = course
@@ -222,14 +222,16 @@ def whitened_residual_histogram_figure(residuals: Mapping[str, Array]) -> Figure
     return figure.add_scatter(**normal, mode="lines", line=line, name="standard normal")
 
 
-def excess_cost_over_time_figure(costs: Mapping[str, _Curve]) -> Figure:
+def method_costs_over_wall_time_figure(costs: Mapping[str, _Curve]) -> Figure:
     """Figure of each method's relative excess cost over wall time, from (seconds, cost)."""
     figure = _styled_figure(340, "wall time [s]", "cost over its lowest, less one")
     figure.update_yaxes(**_POWERS)
-    return _add_curves(figure, ((name, (t, relative_excess_costs(cost))) for name, (t, cost) in costs.items()))
+    return _add_curves(
+        figure, ((name, (t, relative_excess_over_lowest_cost(cost))) for name, (t, cost) in costs.items())
+    )
 
 
-def relative_excess_costs(costs: Sequence[float]) -> list[float]:
+def relative_excess_over_lowest_cost(costs: Sequence[float]) -> list[float]:
     """Relative excess of costs over the lowest of them, cost / min(costs) - 1; at least 1e-9."""
     least = max(min(costs, default=0.0), 1e-300)
     return [max(cost / least - 1.0, 1e-9) for cost in costs]

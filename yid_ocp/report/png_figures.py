@@ -13,14 +13,14 @@ import numpy as np
 from yid_ocp.analysis.compare import MethodComparison
 from yid_ocp.analysis.step_diagnostics import NamedIndexRange, SparsityPattern
 from yid_ocp.errors import OutputError
-from yid_ocp.report.figures import LINE_COLORS, asymmetric_error_bars, relative_excess_costs
+from yid_ocp.report.figures import LINE_COLORS, asymmetric_error_bars, relative_excess_over_lowest_cost
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-def blind_calibration_rates(result: Mapping[str, Any]) -> dict[str, dict[float, Mapping[str, float]]]:
+def interval_and_p_value_calibration_rates(result: Mapping[str, Any]) -> dict[str, dict[float, Mapping[str, float]]]:
     """Rates by promised level of a blind validation: of intervals of effects' parameters, and of p-values."""
     labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
     rates = {label: result["calibration"][key] for key, label in labels.items()}
@@ -36,7 +36,7 @@ def draw_method_convergence(path: Path, comparison: MethodComparison) -> None:
     for run in comparison.method_results:
         history = [entry for entry in run.solution.history if np.isfinite(entry.cost) and not entry.note]
         if history:
-            relative = relative_excess_costs([entry.cost for entry in history])
+            relative = relative_excess_over_lowest_cost([entry.cost for entry in history])
             for axes, places in ((by_iteration, range(len(history))), (by_time, [entry.seconds for entry in history])):
                 axes.plot(places, relative, marker=".", label=run.method)
     for axes, label in ((by_iteration, "iteration"), (by_time, "wall time [s]")):
@@ -91,7 +91,7 @@ def draw_blind_results(folder: Path, result: Mapping[str, Any]) -> None:
     figure = Figure(figsize=(5.0, 4.6), layout="constrained")
     axes = figure.subplots()
     axes.plot([0, 1], [0, 1], color="grey", linewidth=1)
-    _draw_rates(axes, blind_calibration_rates(result), "upper left")
+    _draw_rates(axes, interval_and_p_value_calibration_rates(result), "upper left")
     axes.set(xlabel="promised", ylabel="kept")
     _save(figure, folder / "calibration.png")
 

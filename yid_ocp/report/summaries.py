@@ -16,18 +16,18 @@ from yid_ocp.inference.uncertainty import (
 from yid_ocp.report.terminal import (
     MAX_CHANNELS_SHOWN_SINGLY,
     CodeBlock,
-    SummaryParts,
+    SummaryBlocksAndTexts,
     SummaryStatement,
     SummaryTable,
     TableRows,
     channel_or_group_unit,
     discretisation_shift_sentences,
-    display_scale_and_unit,
     format_error_value_and_unit,
     issue_summary_blocks,
     misfit_summary_blocks,
     parameter_bounds_text,
     register_summary,
+    scale_and_unit_with_metres_as_mm,
     torque_offset_table_rows,
 )
 
@@ -42,7 +42,7 @@ _MAX_INSPECTED_PARAMETERS = 12  # free parameters of which `inspect` speaks; res
 
 
 @register_summary("yid-solve/1")
-def _solve_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _solve_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of a fit."""
     free = {name: entry for name, entry in result["parameters"].items() if entry["free"]}
     failed = result["status"] == "failed"
@@ -76,7 +76,7 @@ def _solve_summary(result: Mapping[str, Any]) -> SummaryParts:
     yield SummaryStatement(ended, "note" if result["status"] == "converged" else "conclusion")
 
 
-def _held_out_blocks(result: Mapping[str, Any]) -> SummaryParts:
+def _held_out_blocks(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Errors of each shown channel, in each recording and over three or more, with those of guesses without a model."""
     units = {channel: entry["unit"] for channel, entry in result["residuals"].items()}
     found: dict[str, list[tuple[str, str, float, dict[str, float]]]] = {}
@@ -134,7 +134,7 @@ def _found_and_lost(free: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
 
 
 @register_summary("yid-compare/1")
-def _compare_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _compare_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of several methods on one problem."""
     methods: dict[str, Any] = result["methods"]
     judged, disturbed = result["judged"], result["disturbed"]
@@ -198,7 +198,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
         unit = channel_or_group_unit(units, channel)
         errors = [[h["rmse"][channel] for h in e["held_out"] if channel in h.get("rmse", {})] for e in entries]
         cells = (format_error_value_and_unit(sum(e) / len(e), unit)[0] if e else "failed" for e in errors)
-        yield f"held out: {channel}" + (f" [{display_scale_and_unit(unit)[1]}]" if unit else ""), *cells
+        yield f"held out: {channel}" + (f" [{scale_and_unit_with_metres_as_mm(unit)[1]}]" if unit else ""), *cells
     for words, key, form in (
         ("iterations", "iterations", "d"),
         ("evaluations", "evaluations", "d"),
@@ -210,7 +210,7 @@ def _effort_rows(methods: Mapping[str, Mapping[str, Any]]) -> Iterator[Sequence[
 
 
 @register_summary("yid-identifiability/1")
-def _identifiability_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _identifiability_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of what recordings tell of each parameter."""
     parameters: Mapping[str, Any] = result["parameters"]
     if not parameters:
@@ -257,7 +257,7 @@ def _relative(value: float | None) -> str:
 
 
 @register_summary("yid-friction/1")
-def _friction_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _friction_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of which friction law the recordings warrant."""
     unit, best = result["unit"], result["warranted"]
     rows: TableRows = [("law", "error on kinds left out", "± standard error", f"beyond {best}", "±", "unit", "")]
@@ -277,7 +277,7 @@ def _friction_summary(result: Mapping[str, Any]) -> SummaryParts:
 
 
 @register_summary("yid-plan/1")
-def _plan_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _plan_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of a planned motion."""
     rows: TableRows = [("joint", "travel [rad or m]", "largest velocity, of its limit", "largest effort, of its limit")]
     for name, own in result["joints"].items():
@@ -311,7 +311,7 @@ def _place_sentences(result: Mapping[str, Any]) -> Iterator[str]:
         yield "the parameters are those of the configuration, so nothing is said of how uncertain that is"
 
 
-def _information_parts(result: Mapping[str, Any]) -> SummaryParts:
+def _information_parts(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     rows: TableRows = [("parameter", "from the recordings", "from this motion", "from both", "verdict of this motion")]
     for name, own in result["parameters"].items():
         stds = (own[f"std_relative_{when}"] for when in ("before", "after", "together"))
@@ -341,7 +341,7 @@ def _information_parts(result: Mapping[str, Any]) -> SummaryParts:
 
 
 @register_summary("yid-check/1")
-def _check_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _check_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of a model and its recordings before a run."""
     model = result["model"]
     yield (
@@ -395,7 +395,7 @@ def _noise_words(noise: Mapping[str, Any], name: str) -> str:
 
 
 @register_summary("yid-inspect/1")
-def _inspect_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _inspect_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of a model's equations and linearised step."""
     roles = [entry["role"] for entry in result["variables"]]
     counts = [f"{roles.count(role)} {role}" for role in ("driven", "prescribed", "free") if role in roles]
@@ -435,7 +435,7 @@ def _inspect_summary(result: Mapping[str, Any]) -> SummaryParts:
     yield f"exported: {', '.join(result['exported'])}" if result["exported"] else ""
 
 
-def _patterns(result: Mapping[str, Any]) -> SummaryParts:
+def _patterns(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     rows: TableRows = [("matrix (sparsity.png)", "size", "can differ from zero", "do at this point")]
     for name, entry in result["patterns"].items():
         height, width = entry["shape"]
@@ -453,7 +453,7 @@ def _patterns(result: Mapping[str, Any]) -> SummaryParts:
 
 
 @register_summary("yid-simulate/1")
-def _simulate_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _simulate_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of a simulation."""
     if result["status"] == "failed":
         yield SummaryStatement(f"failed: {result['message']}", "verdict")
@@ -464,7 +464,7 @@ def _simulate_summary(result: Mapping[str, Any]) -> SummaryParts:
 
 
 @register_summary("yid-track/1")
-def _track_summary(result: Mapping[str, Any]) -> SummaryParts:
+def _track_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of points tracked in the frames of a depth camera."""
     truth = result["truth_errors"]
     heads = ("error, median [mm]", "error, largest [mm]") if truth else ("", "")
@@ -485,7 +485,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryParts:
 
 
 @register_summary("yid-export/1")
-def export_summary(manifest: Mapping[str, Any]) -> SummaryParts:
+def export_summary(manifest: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary of a manifest: what of a model a format cannot express, and its replay."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     changed = {
@@ -506,7 +506,7 @@ def export_summary(manifest: Mapping[str, Any]) -> SummaryParts:
     rows = [("replayed channel", "nominal", "exported", "noise", "unit")]
     for name, entry in gate["channels"].items():
         sizes = (format_error_value_and_unit(entry[key], entry["unit"])[0] for key in ("before", "after", "noise"))
-        rows.append((name, *sizes, display_scale_and_unit(entry["unit"])[1]))
+        rows.append((name, *sizes, scale_and_unit_with_metres_as_mm(entry["unit"])[1]))
     yield SummaryTable(rows)
     if gate["fall"] is not None:
         held = "held-out recordings" if gate["which"] == "held_out" else "the recordings that were fitted"

@@ -56,20 +56,20 @@ class CodeBlock:
 SummaryBlock = SummaryStatement | SummaryTable | CodeBlock
 
 
-SummaryParts = Iterator[SummaryBlock | str]
+SummaryBlocksAndTexts = Iterator[SummaryBlock | str]
 """Blocks of a summary as they are made: a string is a note, and some may be empty."""
 _Summary = Callable[[Mapping[str, Any]], list[SummaryBlock]]
 SUMMARY_BY_FORMAT: dict[str, _Summary] = {}
 """The summary of every result, by its format."""
 
 
-def register_summary(result_format: str) -> Callable[[Callable[[Mapping[str, Any]], SummaryParts]], _Summary]:
+def register_summary(result_format: str) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlocksAndTexts]], _Summary]:
     """Decorator that registers the summary of a result format, and turns its parts into a list of blocks.
 
     Texts without a word and tables without a row below the header are left out.
     """
 
-    def enter(make: Callable[[Mapping[str, Any]], SummaryParts]) -> _Summary:
+    def enter(make: Callable[[Mapping[str, Any]], SummaryBlocksAndTexts]) -> _Summary:
         @functools.wraps(make)
         def summary(result: Mapping[str, Any]) -> list[SummaryBlock]:
             blocks = (SummaryStatement(part) if isinstance(part, str) else part for part in make(result))
@@ -81,14 +81,14 @@ def register_summary(result_format: str) -> Callable[[Callable[[Mapping[str, Any
     return enter
 
 
-def display_scale_and_unit(unit: str) -> tuple[float, str]:
+def scale_and_unit_with_metres_as_mm(unit: str) -> tuple[float, str]:
     """Scale factor and unit for display: metres become millimetres, other units stay."""
     return (1e3, "mm") if unit == "m" else (1.0, unit)
 
 
 def format_error_value_and_unit(value: float | None, unit: str) -> tuple[str, str]:
     """Formatted value and display unit of an error; a dash for None."""
-    factor, shown = display_scale_and_unit(unit)
+    factor, shown = scale_and_unit_with_metres_as_mm(unit)
     return ("–" if value is None else f"{factor * value:.3g}"), shown
 
 
@@ -102,7 +102,7 @@ def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
-def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryParts:
+def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Summary blocks on issues of the recordings: a table and advice."""
     doubts = result.get("doubts", ())
     rows: TableRows = [("in doubt", "where", "how sure", "times its limit")]
@@ -121,7 +121,7 @@ def issue_summary_blocks(result: Mapping[str, Any]) -> SummaryParts:
         yield SummaryStatement(text, "verdict")
 
 
-def misfit_summary_blocks(fit: Mapping[str, Any]) -> SummaryParts:
+def misfit_summary_blocks(fit: Mapping[str, Any]) -> SummaryBlocksAndTexts:
     """Conclusions on a poor fit: a model-free guess predicts better, or the model does not explain the recordings."""
     worse = fit.get("worse_than_guess", ())
     for entry in worse[:MAX_CHANNELS_SHOWN_SINGLY]:

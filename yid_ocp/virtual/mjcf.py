@@ -106,7 +106,7 @@ class ParameterEvaluator:
         return ca.substitute(expression, self._symbols, ca.DM(self._theta))
 
 
-def model_aspects_of_parameters(system: System, symbols: ca.SX) -> set[str]:
+def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[str]:
     """Keys of `MODEL_ASPECT_DESCRIPTIONS` for the parts of the description that depend on given parameters."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
@@ -139,7 +139,7 @@ def effect_joint_terms_and_changed_aspects(
     system: System, effect: Effect, value: ParameterEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
     """Terms that a system's effect adds at single joints, and the `MODEL_ASPECT_DESCRIPTIONS` it changes."""
-    aspects = model_aspects_of_parameters(system, effect.parameters.symbols)
+    aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_KINDS:
         size = effect.parameters[f"{effect.kind}@{effect.location}.tau_c"].symbol

@@ -72,7 +72,7 @@ def replay_in_mujoco(text: str, system: System, recording: Recording) -> dict[st
         raise ModelError(f"'{recording.name}' has no torques", where="replay", allowed="recorded torques")
     t, position = joints.t - joints.t[0], joints.position[:, columns]
     effort = None if joints.effort is None else joints.effort[:, columns]
-    scene = MujocoScene.from_model(system, mujoco, model)
+    scene = MujocoScene.from_compiled_model(system, mujoco, model)
     scene.data.qpos[:] = model.qpos_spring
     scene.data.qpos[scene.moved_joint_ids] = position[:_START].mean(axis=0)
     if system.servos:

@@ -151,7 +151,7 @@ def simulate_in_mujoco(
     model = compile_mjcf(mujoco_xml(system, values, time_step=chosen.time_step, gear_play=gear_play))
     nominal_damping = np.array(model.dof_damping)
     with _at_work(mujoco, model, injected):
-        scene = MujocoScene.from_model(system, mujoco, model)
+        scene = MujocoScene.from_compiled_model(system, mujoco, model)
         start = grasping_joint_angles(system, values) if initial_joint_angles is None else initial_joint_angles
         scene.data.qpos[:] = model.qpos_spring
         scene.data.qpos[[model.joint(name).id for name in start]] = list(start.values())
@@ -183,7 +183,7 @@ class MujocoScene:
     point_site_ids: list[int]
 
     @staticmethod
-    def from_model(system: System, mujoco: ModuleType, model: Any) -> MujocoScene:
+    def from_compiled_model(system: System, mujoco: ModuleType, model: Any) -> MujocoScene:
         """The scene of a compiled model; its driven joints are moved, or its prescribed ones if none is driven."""
         # Every joint has one coordinate, so positions, velocities and joints share their addresses.
         order = np.array([model.joint(name).id for name in system.mechanism.joint_names])

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from yid_ocp.config.reader import DEFAULT_CONFIG_FILE, DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
-from yid_ocp.config.settings import RunSettings, dump_config
+from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.diagnosis import blind, blind_scores
 from yid_ocp.diagnosis.diagnosis_result import decision_statistics_to_dict
@@ -38,9 +38,9 @@ from yid_ocp.virtual.experiment import ArmSensorNoise
 from yid_ocp.virtual.mujoco_simulation import DEFAULT_SIMULATOR_TIME_STEP, SimulationOptions
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, run_command_and_print, workers_from_arguments
 from yid_ocp.workflow.run_folder import local_time_text
-from yid_ocp.workflow.run_inputs import read_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 _MIN_TWO_ARM_CASES = 100  # cases from which the embedded proof has experiments with two arms as well
 _TORQUE_NOISE_STD, _TORQUE_OFFSET_STD = 0.1, 0.3
@@ -71,7 +71,7 @@ def run_blind(
     progress: Progress = NULL_PROGRESS,
     workers: WorkerConfig | Executor = LOCAL_WORKER_CONFIG,
     purpose: str = blind.ENSEMBLE_PURPOSES[0],
-) -> CommandResult[None]:
+) -> CommandResultAndOutput[None]:
     """Run a blind validation of the diagnosis in several processes; finished parts in the folder are reused.
 
     Models, postures and sensors are those of the runs' first recordings, varied (`EXPERIMENT_VARIATIONS`) as far as
@@ -98,7 +98,7 @@ def run_blind(
     try:
         commitment, cases = proof.commit()
         progress.begin_stage(f"diagnosing {count} cases")
-        answers = proof.done(diagnose_case_task, cases, "answers")
+        answers = proof.done(diagnose_case_from_recordings_task, cases, "answers")
         sealed = read_input_text(proof.folder / "sealed/labels.json")
         labels = blind.open_sealed_labels(sealed, commitment["sha256"])
         progress.begin_stage("scoring")
@@ -135,7 +135,7 @@ def run_blind(
         progress.begin_stage("writing the report")
         said = f"{written['cases']} virtual cases whose effect was withheld, diagnosed, then opened."
         write_report(folder / "report.html", ReportData(folder.name, said, written))
-    return CommandResult(folder, written, None)
+    return CommandResultAndOutput(folder, written, None)
 
 
 # -- the ensemble -----------------------------------------------------------------------------------------------------
@@ -159,7 +159,7 @@ class _Proof:
     def commit(self) -> tuple[dict[str, Any], list[Task]]:
         """The commitment to the labels and the diagnosis of every case, of those in the folder or made now."""
         file = self.folder / "commitment.json"
-        configs = {entry.name: dump_config(entry) for entry in self.runs}
+        configs = {entry.name: config_yaml_with_defaults(entry) for entry in self.runs}
         if not file.exists():
             self._draw(file, configs)
         said = read_input_json(file)
@@ -263,7 +263,7 @@ def _draw_case(
     return dict(to_json_types({"label": label.to_dict(), "case": told}))
 
 
-def diagnose_case_task(
+def diagnose_case_from_recordings_task(
     experiment: Mapping[str, Any], first: Path, name: str, recordings: Sequence[Path], without: Sequence[str]
 ) -> dict[str, Any]:
     """Task: diagnose a case from its recordings, the last one held out; returns {seconds, result}.
@@ -373,7 +373,7 @@ class BlindExperiment:
     def _write_first_recording(self, file: Path) -> None:
         """Write the first recording, which fixes initial configuration and sensors."""
         varied, run = EXPERIMENT_VARIATIONS[self.variation], load_config(self.config_file)
-        first = read_recordings(run, count=1)
+        first = read_recordings_of_role(run, count=1)
         if not first:
             what = "there is no recording that says where the arms begin"
             raise run.config_error(what, "recordings", "estimate", hint="list one")

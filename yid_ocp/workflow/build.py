@@ -30,7 +30,7 @@ from yid_ocp.model.system import floating_clamp
 from yid_ocp.model.urdf import read_urdf
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.workflow import run_inputs
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings, unknown_name_error
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role, unknown_name_error
 
 _OBJECT_DAMPING_KEY = "object"  # key of the object's damping beside those of the joints
 _DEFAULT_JOINT_DAMPING = 0.05  # of joints that a damping by name does not mention [N m s/rad]
@@ -89,7 +89,7 @@ def build_system(run: RunSettings, link_division: int = 1) -> System:
         )
     if any(said.marker_reference_pose for said in model.frames.values()) and run.recordings.estimate:
         # where markers sit when nobody says which recording is meant
-        [places] = marker_positions_from_reference_pose(run, system, read_recordings(run, count=1)).values()
+        [places] = marker_positions_from_reference_pose(run, system, read_recordings_of_role(run, count=1)).values()
         system = replace(system, parameters=system.parameters.with_nominal_values(places))
     return _completed(run, system, link_division)
 
@@ -125,7 +125,7 @@ def arms_are_estimated_states(run: RunSettings) -> bool:
     """
     if run.model.arms.mode != "prescribed" or not run.model.grasp:
         return False
-    recordings = read_recordings(run)
+    recordings = read_recordings_of_role(run)
     for group in (group for recording in recordings for group in recording.channel_groups):
         of_vectors = (kind.quantity for kind in channel_kinds_for_group_name(group.name) if kind.components)
         for quantity in (quantity for quantity in of_vectors if quantity in group.values_by_quantity):
@@ -164,7 +164,7 @@ def _clamped_system(run: RunSettings, item: ClampedObject, kind: str) -> System:
         if getattr(run.model, key):
             what = f"a {kind} takes no {key}: its clamps hold it"
             raise run.config_error(what, "model", key, hint=f"remove {key}")
-    recordings = read_recordings(run)
+    recordings = read_recordings_of_role(run)
     if not recordings:
         what = f"a {kind}'s lengths come from recordings"
         raise run.config_error(what, "recordings", "estimate", hint="list at least one")
@@ -283,7 +283,7 @@ def divided_link_parameter_scale(run: RunSettings, name: str, link_division: int
     return 1 if item is None else item.link_division_parameter_factor(name, link_division)
 
 
-def system_with_second_arm(run: RunSettings, system: System) -> System | None:
+def system_with_second_arm_holding_object(run: RunSettings, system: System) -> System | None:
     """The run's system with the second arm at a free end of the object; None where impossible."""
     model, joints = run.model, run.model.arms.joints
     if joints is None or model.arms.mode != "driven" or len(model.grasp) != 1:

@@ -19,7 +19,7 @@ from yid_ocp.analysis.joint_checks import RecordedJointsModel
 from yid_ocp.config.reader import load_config
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.channel_checks import typical_point_pair_distances
-from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_at_gaps
+from yid_ocp.data.checks import duplicate_data_issue, recording_quality_issues, split_recording_at_gaps
 from yid_ocp.data.issues import ISSUE_CAUSE_DESCRIPTIONS, Issue
 from yid_ocp.data.recording import Recording
 from yid_ocp.errors import DataError, unknown_name_details
@@ -33,7 +33,7 @@ from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
 from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, free_parameter_names
-from yid_ocp.workflow.run_inputs import read_recordings, unknown_name_error
+from yid_ocp.workflow.run_inputs import read_recordings_of_role, unknown_name_error
 
 _START_FRAMES = 2  # of a cable's free points, from which every prediction starts
 _MAX_GRASP_GAP = 0.01  # what encoder noise and a slightly wrong length of the object can make of a grasp [m]
@@ -117,7 +117,7 @@ def build_problem(
     if same:
         what = "a recording is both estimated on and held out"
         raise run.config_error(what, "recordings", "held_out", allowed="one of the two", hint=same[0])
-    estimate, held_out = read_recordings(run), read_recordings(run, "held_out")
+    estimate, held_out = read_recordings_of_role(run), read_recordings_of_role(run, "held_out")
     if not estimate:
         hint = "list at least one recording"
         raise run.config_error("there is no recording to estimate on", "recordings", "estimate", hint=hint)
@@ -199,7 +199,7 @@ def _check_recordings(
             doubts += found
             if any(doubt.weight == "refused" for doubt in found):
                 continue
-            parts = split_at_gaps(recording, clamped, anywhere)
+            parts = split_recording_at_gaps(recording, clamped, anywhere)
             doubts += parts.issues
             for part in parts.recordings:
                 doubts += _beside_the_model(run, system, arm, cable, part)
@@ -260,7 +260,7 @@ def _beside_the_model(
     run: RunSettings, system: System, arm: RecordedJointsModel | None, cable: CableTopology | None, recording: Recording
 ) -> list[Issue]:
     gravity = np.array(run.model.gravity, float)
-    recording = recording.with_effort_kind(_choice(run)(JOINT_EFFORT_GROUP_NAME).effort_kind)
+    recording = recording.with_effort_sampling_kind(_choice(run)(JOINT_EFFORT_GROUP_NAME).effort_kind)
     if cable is not None:
         return list(point_checks.check_cable_point_geometry(cable, recording, gravity))
     found: list[Issue] = []

@@ -25,7 +25,7 @@ from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
 from yid_ocp.workflow.build_problem import build_problem, initial_closure_error_by_grasp, issues_to_plain_data
-from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResult, command_with_settings
+from yid_ocp.workflow.command_runner import EXIT_FAILED, EXIT_WRONG_INPUT, CommandResultAndOutput, command_with_settings
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_WRONG_INPUT if code == EXIT_FAILED else code
 
 
-def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResult[None]:
+def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResultAndOutput[None]:
     with atomic_run_folder(run, out, "check") as folder:
         folder.record_run_start(run, "check")
         warnings: list[str] = []
@@ -77,7 +77,7 @@ def _run_check(run: RunSettings, out: str | Path | None, progress: Progress) -> 
             "warnings": warnings,
         }
         written = folder.write_result_and_report(run, progress, result, **shown)
-    return CommandResult(folder.path, written, None, not (run.recordings.strict and warnings))
+    return CommandResultAndOutput(folder.path, written, None, not (run.recordings.strict and warnings))
 
 
 def _mechanics(run: RunSettings, step: Step, problem: EstimationProblem | None, warnings: list[str]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ _CommandOutput = TypeVar("_CommandOutput")
 
 
 @dataclass(frozen=True)
-class CommandResult(Generic[_CommandOutput]):
+class CommandResultAndOutput(Generic[_CommandOutput]):
     """Run folder of a command, contents of its result.json, what it computed, and whether it reached its goal."""
 
     folder: Path
@@ -42,7 +42,9 @@ class CommandResult(Generic[_CommandOutput]):
     is_successful: bool = True
 
 
-def command_with_settings(work: Callable[..., CommandResult[Any]], *names: str) -> Callable[[argparse.Namespace], int]:
+def command_with_settings(
+    work: Callable[..., CommandResultAndOutput[Any]], *names: str
+) -> Callable[[argparse.Namespace], int]:
     """A command that runs `work(settings, out, progress, ...)`, at the end the arguments of these names."""
 
     def run(arguments: argparse.Namespace) -> int:
@@ -53,7 +55,9 @@ def command_with_settings(work: Callable[..., CommandResult[Any]], *names: str) 
     return run
 
 
-def run_command_and_print(arguments: argparse.Namespace, work: Callable[[Progress], CommandResult[Any]]) -> int:
+def run_command_and_print(
+    arguments: argparse.Namespace, work: Callable[[Progress], CommandResultAndOutput[Any]]
+) -> int:
     """Run a command's function, print the summary of its result and its run folder, and return its exit code."""
     with stderr_progress_display(arguments) as progress:
         outcome = work(progress)

@@ -13,12 +13,12 @@ from yid_ocp.progress import Progress
 from yid_ocp.report.png_figures import draw_method_convergence
 from yid_ocp.solvers import SOLVERS, Iterate, Status
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.solve import solution_and_fit_issues, solve_result
 
 
-def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResult[None]:
+def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResultAndOutput[None]:
     """Run every method, compare, and write the run folder; successful where any method converged."""
     solvers, experiment = list(run.compare.methods.values()), run.compare.paper_experiment
     if not solvers:
@@ -59,7 +59,7 @@ def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -
         known = {"problem": own, "solution": judged, "held_out": held_out, "section_data": {"comparison": comparison}}
         written = folder.write_result_and_report(run, progress, _compare_result(problem, comparison) | about, **known)
     done = any(run.solution.status == Status.CONVERGED for run in comparison.method_results)
-    return CommandResult(folder.path, written, None, done)
+    return CommandResultAndOutput(folder.path, written, None, done)
 
 
 def _compare_result(problem: EstimationProblem, comparison: MethodComparison) -> dict[str, Any]:

@@ -73,8 +73,8 @@ class _GroupNoise:
 
 
 @dataclass(frozen=True)
-class ConfigProposal:
-    """Proposed contents of a generated configuration."""
+class ProposedConfigChoices:
+    """Choices proposed for a generated configuration, and the reasons for them."""
 
     joints: tuple[str, ...]  # recorded ones that move the object, in the URDF's order
     unused_joints: tuple[str, ...]  # recorded ones that the model does not need or know
@@ -113,7 +113,7 @@ class ConfigProposal:
         return self.arm_mode == "prescribed" and not any(seen)
 
 
-def propose_config(
+def propose_config_choices(
     robot: str,
     recordings: Sequence[Recording],
     branches: Sequence[Segment],
@@ -121,8 +121,8 @@ def propose_config(
     holder: str | None = None,
     grasps: Mapping[str, str] | None = None,
     standing: bool = False,
-) -> ConfigProposal:
-    """Propose a configuration from a robot and its recordings, of which at least one has joints.
+) -> ProposedConfigChoices:
+    """Choices for a configuration, from a robot and its recordings, of which at least one has joints.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ def propose_config(
         if not moving and (mover := _moving_joint_or_point(recording, joints, start)):
             moving = f"{mover} of {recording.name} moves at the start, which is estimated along"
     period = float(np.median(np.diff(recorded.t))) if len(recorded.t) > 1 else _MAX_TIME_STEP
-    return ConfigProposal(
+    return ProposedConfigChoices(
         joints,
         tuple(name for name in recorded.names if name not in joints),
         tuple(name for name in whole.joint_names if name not in recorded.names),

@@ -15,7 +15,7 @@ import numpy as np
 
 from yid_ocp.analysis.estimate_history import pool_estimates
 from yid_ocp.config.reader import DEFAULT_DIAGNOSIS_CONFIG_FILE, load_config
-from yid_ocp.config.settings import RunSettings, dump_config
+from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.diagnosis import DiagnosisResult, StoredFit, diagnose
 from yid_ocp.diagnosis.baseline import BaselineData, with_baseline_prior
 from yid_ocp.diagnosis.diagnosis_result import final_model_to_dict
@@ -37,7 +37,7 @@ from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Iterate
 from yid_ocp.workflow import prediction_outputs, run_history
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, run_command_and_print
 from yid_ocp.workflow.plan import discrimination_plan_settings
 from yid_ocp.workflow.prediction_outputs import HeldOutPredictionPair
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder, software_and_plugin_versions
@@ -57,15 +57,17 @@ def run(arguments: argparse.Namespace) -> int:
 
 def run_diagnose(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> CommandResult[DiagnosisResult]:
+) -> CommandResultAndOutput[DiagnosisResult]:
     """Diagnose and write the run folder; finished refits of an interrupted, identical run are reused."""
     with atomic_run_folder(run, out, "diagnose") as folder:
         folder.record_run_start(run, "diagnose", _flags(run))
-        refits = JsonRefitStore(folder, folder.input_hashes, dump_config(run), software_and_plugin_versions())
+        refits = SingleJsonFileRefitStore(
+            folder, folder.input_hashes, config_yaml_with_defaults(run), software_and_plugin_versions()
+        )
         logged = _LoggedProgress(progress, folder)
         progress.begin_stage("building the model and its compiled step", ahead=18.5)
-        runs = run_history.baseline_estimates(run)
-        without, said = run_history.load_recordings_without_effect(run)
+        runs = run_history.estimates_of_each_baseline_run(run)
+        without, said = run_history.load_reference_or_baseline_recordings(run)
         if said:
             folder.log_event("message", level="WARNING", source="baseline", text=said)
         run = run_history.settings_with_baseline_effects(run, runs)
@@ -109,7 +111,7 @@ def run_diagnose(
         more = {"finding": finding, "predictions": predicted}
         written = folder.write_result_and_report(run, progress, told | own, **known, section_data=more)
     refits.delete_file()
-    return CommandResult(folder.path, written, finding)
+    return CommandResultAndOutput(folder.path, written, finding)
 
 
 @dataclass(frozen=True)
@@ -218,7 +220,7 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]
     return scenes
 
 
-class JsonRefitStore:
+class SingleJsonFileRefitStore:
     """A store of refits in one JSON file, replaced as a whole after every refit.
 
     One that was made from other inputs, by another configuration or version is skipped with a notice. Refits run in

@@ -13,10 +13,10 @@ import numpy as np
 
 from yid_ocp.arrays import Array
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import ParameterSettings, RunSettings, dump_config
+from yid_ocp.config.settings import ParameterSettings, RunSettings, config_yaml_with_defaults
 from yid_ocp.data import read_recording
 from yid_ocp.data.recording import Recording
-from yid_ocp.data.recording_hdf5 import open_checked_hdf5
+from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check
 from yid_ocp.errors import ConfigError, DataError, ModelError
 from yid_ocp.export import models
 from yid_ocp.export.models import EXPORT_MANIFEST_FORMAT, FormatSupport
@@ -34,7 +34,7 @@ from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_prog
 from yid_ocp.workflow.import_recording import recording_contents_summary
 from yid_ocp.workflow.prediction_outputs import DIAGNOSIS_TRAJECTORIES_FORMAT, SOLVE_TRAJECTORIES_FORMAT
 from yid_ocp.workflow.run_folder import software_and_plugin_versions
-from yid_ocp.workflow.run_inputs import read_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 _MODEL_FORMATS = ("mjcf", "urdf", "sdf", "yaml")
 _MCAP = "mcap"
@@ -146,7 +146,7 @@ def _export_model(folder: Path, out: Path, form: str, progress: Progress) -> dic
         for name in calibrated.parameter_stds:
             said = chosen.get(name, ParameterSettings(free=True))
             chosen[name] = replace(said, initial=calibrated.parameter_values[name])
-        write_text(out, dump_config(replace(calibrated.settings, parameters=chosen)))
+        write_text(out, config_yaml_with_defaults(replace(calibrated.settings, parameters=chosen)))
         head = {"format": EXPORT_MANIFEST_FORMAT, "file": str(out), "kind": form}
         return head | {"effects": {}, "parameters": {}, "gate": None}
     system, supports = _expressible(calibrated, full, form)
@@ -212,7 +212,7 @@ def _gate(calibrated: _CalibratedModel, system: System, text: str, progress: Pro
     """Errors of the exported model, and of the nominal one, on recordings that neither was fitted to."""
     which = "held_out" if calibrated.settings.recordings.held_out else "estimate"
     try:
-        recordings = read_recordings(calibrated.settings, which)
+        recordings = read_recordings_of_role(calibrated.settings, which)
         if not recordings:
             return {"status": "not done", "reason": "the run has no recordings"}
         nominal = calibrated.system([f"{e.kind}@{e.location}" for e in system.effects], nominal=True)
@@ -262,7 +262,7 @@ def _export_run_signals(folder: Path, out: str) -> tuple[list[Path], list[str]]:
     """Write `OUT/RECORDING.mcap` for every recording of a run; its topics stand in docs/reports.md."""
     source, files, notes = folder / "trajectories.h5", [], []
     run_history.read_estimation_result(folder)
-    with open_checked_hdf5(source) as file:
+    with open_hdf5_after_read_check(source) as file:
         form = str(file.attrs.get("format", ""))
         if form not in _PREDICTION_TOPICS:
             what, allowed = f"the trajectories are of format '{form}'", ", ".join(_PREDICTION_TOPICS)

@@ -16,11 +16,11 @@ from yid_ocp.progress import Progress
 from yid_ocp.solvers import Solution, Status, solve
 from yid_ocp.workflow.build import friction_joints, friction_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 
-def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResult[None]:
+def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResultAndOutput[None]:
     """Fit every friction law to all recordings but one kind of motion in turn, and write the run folder.
 
     Successful where the warranted law's fit to all recordings converged. `DataError` for fewer than two motions that
@@ -64,7 +64,7 @@ def _run_friction(run: RunSettings, out: str | Path | None, progress: Progress) 
         folder.log_event("end", warranted=best.law)
         known = {"problem": problem, "solution": solution, "section_data": more}
         written = folder.write_result_and_report(run, progress, result, **known)
-    return CommandResult(folder.path, written, None, best.is_converged)
+    return CommandResultAndOutput(folder.path, written, None, best.is_converged)
 
 
 def _law_result(fit: FrictionLawFit, best: FrictionLawFit, kinds: dict[str, tuple[str, ...]]) -> dict[str, Any]:

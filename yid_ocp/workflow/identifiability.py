@@ -30,9 +30,9 @@ from yid_ocp.parallel import Task, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers import Solution, Status
-from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm
+from yid_ocp.workflow.build import build_step, build_system, system_with_second_arm_holding_object
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResult, command_with_settings, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings, workers_from_arguments
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_inputs import input_files_by_name
 from yid_ocp.workflow.solve import solve_and_decide_cable_memory
@@ -87,7 +87,7 @@ def run_identifiability(
     progress: Progress = NULL_PROGRESS,
     options: IdentifiabilityOptions | None = None,
     workers: WorkerConfig | Executor | None = None,
-) -> CommandResult[IdentifiabilityResult | None]:
+) -> CommandResultAndOutput[IdentifiabilityResult | None]:
     """Solve, analyse identifiability and write the run folder.
 
     Where the solver failed there is no analysis, and the run folder holds the reason. `workers` work out intervals, one
@@ -134,7 +134,7 @@ def run_identifiability(
             elif wanted:
                 information = judged(intervals=wanted, progress=progress)
             if asked.rank_changes:
-                other = system_with_second_arm(run, system)
+                other = system_with_second_arm_holding_object(run, system)
                 known: dict[str, Any] = {"start": asked.start_knowledge, "grasp_std": asked.grasp_offset_std}
                 known["two_arm_system"] = None if other is None else system_with_grasp_offset_effects(other)
                 known["evaluate_changes"] = None if tasks is None else tasks.evaluate_change_sets
@@ -146,7 +146,7 @@ def run_identifiability(
         with contextlib.suppress(OSError):
             shutil.rmtree(tasks.results_folder)
             tasks.results_folder.parent.rmdir()
-    return CommandResult(folder.path, written, information, information is not None)
+    return CommandResultAndOutput(folder.path, written, information, information is not None)
 
 
 def _identifiability_result(
@@ -257,7 +257,7 @@ def _change_set_outcomes(
 ) -> list[dict[str, Any]]:
     """Task: expected information of the experiment with each set of changes, as plain data."""
     run, problem = _problem(common)
-    other = system_with_second_arm(run, build_system(run))
+    other = system_with_second_arm_holding_object(run, build_system(run))
     two_arms = None if other is None else system_with_grasp_offset_effects(other)
     x = fisher.unknowns_from_solution(problem, common["x"])
     setting = RecordedExperiment(problem, x, common["start"], common["grasp_std"], two_arms)

@@ -25,7 +25,7 @@ from yid_ocp.version import package_version
 from yid_ocp.workflow import import_recording
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.command_runner import EXIT_DONE, print_result, stderr_progress_display
-from yid_ocp.workflow.config_proposal import ConfigProposal, held_out_split_time, propose_config
+from yid_ocp.workflow.config_proposal import ProposedConfigChoices, held_out_split_time, propose_config_choices
 
 _SCHEMA_FILE = "yid-ocp.schema.json"
 
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     recordings = [recording or read_recording(file) for file, recording in made.items()]
     segments, grasps = [] if item is None else item.settings.build_segments(), _grasps(arguments.grasp)
     asked = {"holder": arguments.holder, "grasps": grasps, "standing": item is not None and item.stands_in_world}
-    proposal = propose_config(robot, recordings, segments, **asked)
+    proposal = propose_config_choices(robot, recordings, segments, **asked)
     made = _split(made, recordings, proposal, out)
     written = {file: raw for file, raw in made.items() if raw is not None}
     for file in (out, *written):
@@ -130,7 +130,7 @@ def _recordings(arguments: argparse.Namespace, out: Path, progress: Progress) ->
 
 
 def _split(
-    made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: ConfigProposal, out: Path
+    made: dict[Path, Recording | None], recordings: Sequence[Recording], proposal: ProposedConfigChoices, out: Path
 ) -> dict[Path, Recording | None]:
     """A single recording in two files where it comes to rest in between, the second one to be held out."""
     time = held_out_split_time(recordings[0], proposal.joints) if len(recordings) == 1 else None
@@ -162,7 +162,7 @@ def _write(out: Path, text: str, made: Mapping[Path, Recording]) -> None:
     write_text(out.parent / _SCHEMA_FILE, json.dumps(config_json_schema(), indent=1) + "\n")
 
 
-def _summary_lines(proposal: ConfigProposal, out: Path) -> list[str]:
+def _summary_lines(proposal: ProposedConfigChoices, out: Path) -> list[str]:
     held = ", ".join(dict.fromkeys([proposal.holder_frame, *proposal.grasps]))
     lines = [
         f"joints: {', '.join(proposal.joints)}",
@@ -187,7 +187,7 @@ def _config_lines(
     robot: str,
     about: str,
     item: InitObjectConfiguration | None,
-    proposal: ConfigProposal,
+    proposal: ProposedConfigChoices,
     recordings: Sequence[str],
     imports: Mapping[str, Any],
 ) -> Iterator[str]:
@@ -257,7 +257,7 @@ def _listed(indent: str, key: str, values: Iterable[str], comment: str) -> list[
     return [f"{indent}# {comment}", f"{indent}{key}: [{text}]"]
 
 
-def _arms(proposal: ConfigProposal) -> Iterator[str]:
+def _arms(proposal: ProposedConfigChoices) -> Iterator[str]:
     unused, mode = proposal.unused_joints, proposal.arm_mode
     yield "  arms:"
     yield from _listed("    ", "joints", proposal.joints, "recorded joints that move the object")
@@ -286,7 +286,7 @@ def _arms(proposal: ConfigProposal) -> Iterator[str]:
         )
 
 
-def _object(item: InitObjectConfiguration, proposal: ConfigProposal) -> Iterator[str]:
+def _object(item: InitObjectConfiguration, proposal: ProposedConfigChoices) -> Iterator[str]:
     holder, grasps = proposal.holder_frame, proposal.grasps
     yield "  object:"
     if item.stands_in_world:
@@ -332,7 +332,7 @@ def _settings_lines(indent: str, settings: Any) -> Iterator[str]:
         yield _line(indent, key, f"{value:g}" if isinstance(value, float) else _value(numbers), comment)
 
 
-def _friction(proposal: ConfigProposal) -> Iterator[str]:
+def _friction(proposal: ProposedConfigChoices) -> Iterator[str]:
     about = "of geared arms, its sizes free; which law, `yid-ocp friction` says"
     if proposal.motor_preset:
         moving = [name for name in proposal.joints if name not in proposal.still_joints]
@@ -342,7 +342,7 @@ def _friction(proposal: ConfigProposal) -> Iterator[str]:
         yield _line("  ", "# friction", "{law: coulomb}", about)
 
 
-def _effects(proposal: ConfigProposal, has_payload: bool) -> Iterator[str]:
+def _effects(proposal: ProposedConfigChoices, has_payload: bool) -> Iterator[str]:
     if proposal.arm_mode == "servo":
         kind, words = "rotor_inertia", "what rotors add through their gears, free below"
     elif proposal.is_object_measured_only_by_effort:
@@ -372,7 +372,7 @@ def _recording_lines(files: Sequence[str], imports: Mapping[str, Any]) -> Iterat
         yield f"  {key}: {_value(value)}"
 
 
-def _sensors(proposal: ConfigProposal) -> Iterator[str]:
+def _sensors(proposal: ProposedConfigChoices) -> Iterator[str]:
     if proposal.noise_by_group or proposal.clock_descriptions:
         yield "sensors:"
     for group, noise in proposal.noise_by_group.items():
@@ -397,7 +397,7 @@ def _sensors(proposal: ConfigProposal) -> Iterator[str]:
         yield f"  # {group} come at {clock}"
 
 
-def _parameters(item: InitObjectConfiguration | None, proposal: ConfigProposal) -> Iterator[str]:
+def _parameters(item: InitObjectConfiguration | None, proposal: ProposedConfigChoices) -> Iterator[str]:
     free, preset = "{free: true}", proposal.motor_preset
     if item is None:
         yield _line("", "parameters", "", "`yid-ocp inspect` lists all that there are")

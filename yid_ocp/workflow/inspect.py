@@ -29,7 +29,7 @@ from yid_ocp.sensors import Sensor
 from yid_ocp.sensors.mounted import MountedSensor
 from yid_ocp.workflow.build import build_step, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 
 _SHOWN_STEPS = 2  # of the NLP in its picture: what comes after looks the same
@@ -51,7 +51,7 @@ class _LinearisationPoint:
 
 def _run_inspect(
     run: RunSettings, out: str | Path | None, progress: Progress, entries: Sequence[str], export: str | None
-) -> CommandResult[None]:
+) -> CommandResultAndOutput[None]:
     """Write result.json, equations.txt, sparsity.png, kkt.png and linearisation.h5, and what is asked for beside."""
     with atomic_run_folder(run, out, "inspect") as folder:
         folder.record_run_start(run, "inspect", [part for name in entries for part in ("--entry", name)])
@@ -120,7 +120,7 @@ def _run_inspect(
         }
         shown = {"pictures": [path for path in pictures if path.exists()]}
         written = folder.write_result_and_report(run, progress, result, section_data=shown)
-    return CommandResult(folder.path, written, None)
+    return CommandResultAndOutput(folder.path, written, None)
 
 
 run = command_with_settings(_run_inspect, "entries", "export")

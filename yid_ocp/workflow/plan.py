@@ -14,7 +14,7 @@ import numpy as np
 from yid_ocp.arrays import Array
 from yid_ocp.config.settings import RunSettings
 from yid_ocp.data.recording import JointGroup, PointGroup, Recording, validate_recording
-from yid_ocp.data.recording_hdf5 import open_checked_hdf5, write_recording
+from yid_ocp.data.recording_hdf5 import open_hdf5_after_read_check, write_recording
 from yid_ocp.errors import DataError
 from yid_ocp.export.signals import export_csv, joint_trajectory_message
 from yid_ocp.files import named_attributes
@@ -28,10 +28,10 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import ConfigurationTrajectory, make_animation
 from yid_ocp.workflow.build import build_step, clamped_cable_topology, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
-from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
 from yid_ocp.workflow.run_history import ESTIMATE_RESULT_FORMATS, read_result_file
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, read_recordings_of_role
 
 _EFFORT_STD, _POINT_STD = 0.1, 1e-3  # stated in the recording of a plan, for whoever estimates on it [N m], [m]
 _MAX_DISCRIMINATED_EFFECTS = 3  # effects that one motion is asked to separate, the likeliest ones
@@ -40,7 +40,7 @@ _Plan = TargetMotionPlan | InformativeMotionPlan
 
 def run_plan(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> CommandResult[_Plan]:
+) -> CommandResultAndOutput[_Plan]:
     """Plan the motion of a run's goal; write `recording.h5`, CSV tables, `trajectory.json`, result.json and the report.
 
     Successful where the goal was reached within all limits; the run folder says why not.
@@ -54,7 +54,7 @@ def run_plan(
         else:
             step = compile_step_for_planning(run)
             theta, known, source = identified_parameters_with_covariance(run, step)
-            options = replace(run.plan, start_joint_positions=start_joint_positions_from_run(run, step))
+            options = replace(run.plan, start_joint_positions=configured_or_recorded_start_positions(run, step))
             with add_setting_location_to_errors(run, "plan"):
                 found = plan_motion_to_target(step, options, theta, known, progress)
         recording = _plan_as_recording(run, found)
@@ -72,7 +72,7 @@ def run_plan(
         more = {"plan" if isinstance(found, TargetMotionPlan) else "information": found}
         result = _motion_result(run, found, source) | told
         written = folder.write_result_and_report(run, progress, result, animations=[scene], section_data=more)
-    return CommandResult(folder.path, written, found, found.is_successful)
+    return CommandResultAndOutput(folder.path, written, found, found.is_successful)
 
 
 run = command_with_settings(run_plan)
@@ -85,7 +85,7 @@ def compile_step_for_planning(run: RunSettings) -> Step:
     return build_step(replace(run, model=model, recordings=recordings))
 
 
-def start_joint_positions_from_run(run: RunSettings, step: Step) -> Mapping[str, float] | None:
+def configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapping[str, float] | None:
     """Joint positions at the start of the motion: from the settings, else from the first recording.
 
     None where neither says it: then it begins where the arms first grasp the undeformed object. Two arms that hold a
@@ -93,7 +93,7 @@ def start_joint_positions_from_run(run: RunSettings, step: Step) -> Mapping[str,
     """
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
-    [recording], cable, system = read_recordings(run, count=1), clamped_cable_topology(run), step.system
+    [recording], cable, system = read_recordings_of_role(run, count=1), clamped_cable_topology(run), step.system
     clamps = () if cable is None else cable.clamp_pose_definitions
     grid = make_time_grid(recording, step.time_step, run.problem.duration)
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
@@ -115,7 +115,7 @@ def identified_parameters_with_covariance(
     found = {name: entry["value"] for name, entry in result["parameters"].items() if name in parameters}
     for name, value in found.items():
         theta[parameters.index(name)] = value
-    with open_checked_hdf5(folder / "trajectories.h5") as data:
+    with open_hdf5_after_read_check(folder / "trajectories.h5") as data:
         names = [str(name) for name in data["unknowns"].attrs["names"]]
         covariance = np.array(data["unknowns/covariance"])
     usable = [i for i, name in enumerate(names) if name in found and np.all(np.isfinite(covariance[i, i]))]

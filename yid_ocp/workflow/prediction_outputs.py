@@ -187,14 +187,14 @@ def predicted_configuration_trajectory(
 
 SOLVE_TRAJECTORIES_FORMAT = "yid-trajectories/1"
 DIAGNOSIS_TRAJECTORIES_FORMAT = "yid-diagnosis-trajectories/1"
-Prediction = tuple[Episode, EpisodePrediction | str]
+EpisodeAndPrediction = tuple[Episode, EpisodePrediction | str]
 """A recording and its prediction, or why there is none."""
 HeldOutPredictionPair = tuple[Episode, EpisodePrediction, EpisodePrediction]
 """A held-out recording, its prediction by the nominal model and that with the effects."""
 
 
 def write_solve_trajectories(
-    path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[Prediction]
+    path: Path, problem: EstimationProblem, solution: Solution, held_out: Sequence[EpisodeAndPrediction]
 ) -> None:
     """Write trajectories, predictions and unknowns with covariance as `yid-trajectories/1`.
 

@@ -20,7 +20,7 @@ from typing import Any, TextIO
 from filelock import FileLock, Timeout
 
 from yid_ocp import interruption
-from yid_ocp.config.settings import RunSettings, dump_config
+from yid_ocp.config.settings import RunSettings, config_yaml_with_defaults
 from yid_ocp.errors import OutputError, YidError
 from yid_ocp.files import file_sha256, os_error_reason, to_json_types, write_text
 from yid_ocp.progress import Progress
@@ -48,7 +48,7 @@ class RunFolder:
 
     def record_run_start(self, run: RunSettings, command: str, flags: Sequence[str] = ()) -> None:
         """Write config.yaml, hash what the run reads, log the start of a command; errors as `input_files_by_name`."""
-        self.write_text_file("config.yaml", dump_config(run))
+        self.write_text_file("config.yaml", config_yaml_with_defaults(run))
         self.input_hashes |= {name: file_sha256(path) for name, path in input_files_by_name(run).items()}
         origins = list(run.key_locations.values())
         said = [] if any(origin.startswith("embedded default") for origin in origins) else [run.config_file]

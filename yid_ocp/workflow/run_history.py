@@ -25,9 +25,9 @@ from yid_ocp.files import file_sha256, is_file, named_attributes, read_input_jso
 from yid_ocp.model.objects import ObjectKind
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import Progress
-from yid_ocp.workflow.command_runner import CommandResult, run_command_and_print
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, run_command_and_print
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import resolve_recording_path
+from yid_ocp.workflow.run_inputs import given_or_shipped_recording_path
 
 ESTIMATE_RESULT_FORMATS = {"solve": "yid-solve/1", "diagnose": "yid-diagnosis/2"}
 """Format identifiers of result.json by command, for commands that estimate parameters."""
@@ -113,7 +113,7 @@ def read_result_file(file: Path) -> dict[str, Any]:
     return result
 
 
-def baseline_estimates(run: RunSettings) -> tuple[RunEstimates, ...]:
+def estimates_of_each_baseline_run(run: RunSettings) -> tuple[RunEstimates, ...]:
     """Estimates of the runs in `diagnosis.baseline`; `ConfigError` for one of another model, or given twice."""
     found: list[RunEstimates] = []
     for i, folder in enumerate(run.diagnosis.baseline):
@@ -199,11 +199,11 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
     return replace(settings_with_effect_values(run, added), parameters={**run.parameters, **freed})
 
 
-def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
+def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
     """Recordings made without the sought effect, those of the settings or of the baseline; why there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.reference_recordings):
-        file = resolve_recording_path(path)
+        file = given_or_shipped_recording_path(path)
         if not is_file(file):
             where = ("recordings", "reference_recordings", i)
             raise run.config_error(f"there is no such recording: {file}", *where, hint="check the path")
@@ -212,7 +212,7 @@ def load_recordings_without_effect(run: RunSettings) -> tuple[tuple[Recording, .
         there = _settings(folder)
         for path in () if there is None else (*there.recordings.estimate, *there.recordings.held_out):
             try:
-                found.append(read_recording(resolve_recording_path(path)))
+                found.append(read_recording(given_or_shipped_recording_path(path)))
             except YidError as error:
                 return (), f"a recording of {folder} cannot be read: {error.what}"
     return tuple(replace(recording, name=f"{recording.name} (without)") for recording in found), ""
@@ -239,7 +239,7 @@ def run(arguments: argparse.Namespace) -> int:
     return run_command_and_print(arguments, lambda shown: _run_report(paths, arguments.out, shown))
 
 
-def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandResult[None]:
+def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progress) -> CommandResultAndOutput[None]:
     """Compare runs of one model, given in the order of time, and write `history.json` and report.html."""
     if len(paths) < 2:
         hint = "add the runs of other days"
@@ -256,7 +256,7 @@ def _run_report(paths: Sequence[Path], out: str | Path | None, progress: Progres
         folder.input_hashes |= {str(path): file_sha256(path / "result.json") for path in paths}
         folder.log_command_start(["report", *map(str, paths)])
         written = folder.write_result_and_report(settings, progress, estimate_history_to_dict(found), "history.json")
-    return CommandResult(folder.path, written, None)
+    return CommandResultAndOutput(folder.path, written, None)
 
 
 def estimate_history_to_dict(found: DriftAndOutlierTests) -> dict[str, Any]:

@@ -141,7 +141,7 @@ def input_files_by_name(run: RunSettings) -> dict[str, Path]:
         files[name] = _existing(run, Path(name), "file", "model", "object", key)
     for which in ("estimate", "held_out"):
         for i, path in enumerate(getattr(run.recordings, which)):
-            files[path] = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
+            files[path] = _existing(run, given_or_shipped_recording_path(path), "recording", "recordings", which, i)
     return files
 
 
@@ -154,22 +154,22 @@ def _existing(run: RunSettings, file: Path, noun: str, *key: str | int) -> Path:
     raise run.config_error(f"there is no such {noun}: {file}", *key, hint=hint)
 
 
-def resolve_recording_path(path: str) -> Path:
+def given_or_shipped_recording_path(path: str) -> Path:
     """Path of a recording named in the settings; `default:NAME` is one shipped with the package."""
     if not path.startswith("default:"):
         return Path(path)
     return Path(str(resources.files("yid_ocp.data").joinpath("defaults", path.removeprefix("default:"))))
 
 
-def read_recordings(run: RunSettings, which: str = "estimate", count: int | None = None) -> list[Recording]:
-    """The first so many, or all, recordings under `recordings.estimate` or `recordings.held_out`, each named uniquely.
+def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: int | None = None) -> list[Recording]:
+    """List of the first so many, or all, recordings under `recordings.estimate` or `held_out`, each named uniquely.
 
     Errors as `read_recording`, which name the setting.
     """
     paths: Sequence[str] = getattr(run.recordings, which)
     result: list[Recording] = []
     for i, path in enumerate(paths[:count]):
-        file = _existing(run, resolve_recording_path(path), "recording", "recordings", which, i)
+        file = _existing(run, given_or_shipped_recording_path(path), "recording", "recordings", which, i)
         with add_setting_location_to_errors(run, "recordings", which, i):
             recording = read_recording(file)
         if recording.name in [entry.name for entry in result]:

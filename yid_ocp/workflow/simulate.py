@@ -18,10 +18,10 @@ from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.report.animation import Animation, make_animation, recording_animation
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import problem_options
-from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
 from yid_ocp.workflow.prediction_outputs import predicted_configuration_trajectory
 from yid_ocp.workflow.run_folder import atomic_run_folder
-from yid_ocp.workflow.run_inputs import read_recordings
+from yid_ocp.workflow.run_inputs import read_recordings_of_role
 
 _Made = tuple[Recording | str, list[Animation]]
 _DEFAULT_DURATION = 5.0  # of a virtual experiment whose configuration does not say [s]
@@ -33,7 +33,7 @@ def run_simulate(
     progress: Progress = NULL_PROGRESS,
     seed: int = 0,
     noise: bool = False,
-) -> CommandResult[Recording | None]:
+) -> CommandResultAndOutput[Recording | None]:
     """Write `recording.h5`: the model moved by the inputs of the first recording, or a virtual experiment without one.
 
     With a recording under `recordings.estimate`, its torques or prescribed motion drive the model with the parameters'
@@ -61,7 +61,7 @@ def run_simulate(
             result |= {"groups": groups, "truth": truth}
         more = {"recordings": [] if recording is None else [recording], "system": system}
         written = folder.write_result_and_report(run, progress, result, animations=scenes, section_data=more)
-    return CommandResult(folder.path, written, recording, recording is not None)
+    return CommandResultAndOutput(folder.path, written, recording, recording is not None)
 
 
 run = command_with_settings(run_simulate, "seed", "noise")
@@ -87,7 +87,7 @@ def _virtual(run: RunSettings, system: System, progress: Progress, seed: int) ->
 def _predicted(run: RunSettings, system: System, progress: Progress, seed: int | None) -> _Made:
     progress.begin_stage("building the model and its compiled step")
     step = build_step(run, system)
-    recordings = read_recordings(run, count=1)
+    recordings = read_recordings_of_role(run, count=1)
     options = replace(problem_options(run, step.system, recordings), local_parameters=(), prior_stds={})
     problem = EstimationProblem(step, recordings, (), options)
     episode, theta = problem.episodes[0], problem.theta

@@ -29,8 +29,8 @@ from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow import prediction_outputs
 from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, divided_link_parameter_scale
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
-from yid_ocp.workflow.command_runner import CommandResult, command_with_settings
-from yid_ocp.workflow.prediction_outputs import Prediction
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
+from yid_ocp.workflow.prediction_outputs import EpisodeAndPrediction
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
 
 _Refinement = Literal["links", "time_step"]
@@ -41,7 +41,7 @@ _RESULT_FORMAT = "yid-solve/1"
 
 def run_solve(
     run: RunSettings, out: str | Path | None = None, progress: Progress = NULL_PROGRESS
-) -> CommandResult[Solution]:
+) -> CommandResultAndOutput[Solution]:
     """Estimate, validate and write the run folder; successful where the solver converged.
 
     Where it failed the run folder holds the reason and the best point.
@@ -50,7 +50,7 @@ def run_solve(
         folder.record_run_start(run, "solve")
         progress.begin_stage("building the model and its compiled step", ahead=20.0)
         safe = solve_and_decide_cable_memory(run, build_problem(run), folder, progress)
-        solution, stability = solution_marked_if_step_unstable(safe.problem, safe.solution)
+        solution, stability = checked_solution_and_step_stability(safe.problem, safe.solution)
         problem = solution.problem or safe.problem
         solution = solution_with_profile_intervals(problem, solution, progress)
         shifts: dict[str, EstimateShiftByLinksAndTimeStep] = {}
@@ -83,7 +83,7 @@ def run_solve(
         result = solve_result(problem, solution, held_out, cable) | more
         known = {"problem": problem, "solution": solution, "held_out": tuple(held_out)}
         written = folder.write_result_and_report(run, progress, result, **known)
-    return CommandResult(folder.path, written, solution, solution.status == Status.CONVERGED)
+    return CommandResultAndOutput(folder.path, written, solution, solution.status == Status.CONVERGED)
 
 
 run = command_with_settings(run_solve)
@@ -110,7 +110,7 @@ def solve_and_decide_cable_memory(
 def solution_and_fit_issues(
     problem: EstimationProblem,
     solution: Solution,
-    held_out: Sequence[Prediction],
+    held_out: Sequence[EpisodeAndPrediction],
     cable: CableTopology | None = None,
 ) -> tuple[Solution, tuple[Issue, ...]]:
     """The solution, its verdicts set to untrusted where the fit is poor, and all issues of data and fit.
@@ -140,7 +140,7 @@ def _covariance_result(solution: Solution, data_std: Mapping[str, float]) -> dic
 def solve_result(
     problem: EstimationProblem,
     solution: Solution,
-    held_out: Sequence[Prediction],
+    held_out: Sequence[EpisodeAndPrediction],
     cable: CableTopology | None = None,
 ) -> dict[str, Any]:
     """Contents of a `yid-solve/1` result.json, without inputs and versions."""
@@ -162,7 +162,10 @@ def solve_result(
 
 
 def _prediction_errors(
-    problem: EstimationProblem, solution: Solution, held_out: Sequence[Prediction], cable: CableTopology | None
+    problem: EstimationProblem,
+    solution: Solution,
+    held_out: Sequence[EpisodeAndPrediction],
+    cable: CableTopology | None,
 ) -> tuple[list[dict[str, Any]], dict[str, str], Mapping[str, Any]]:
     """Errors beside baselines of recordings held out and then of those fitted, units, and errors of channels fitted."""
     residuals: Mapping[str, Any] = {}
@@ -247,7 +250,9 @@ def _refined_problem(
     return discretisation.FinerDiscretisationProblem(made, factors, joints)
 
 
-def solution_marked_if_step_unstable(problem: EstimationProblem, solution: Solution) -> tuple[Solution, dict[str, Any]]:
+def checked_solution_and_step_stability(
+    problem: EstimationProblem, solution: Solution
+) -> tuple[Solution, dict[str, Any]]:
     """The solution, marked as not converged where the step is unstable, and stability data for result.json.
 
     Along the recorded motions, at the start of the search and at the estimate. A search may begin where the step is not

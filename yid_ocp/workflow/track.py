@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from yid_ocp.config.reader import load_config
-from yid_ocp.config.settings import OutputSettings, RecordingSettings, RunSettings, dump_config
+from yid_ocp.config.settings import OutputSettings, RecordingSettings, RunSettings, config_yaml_with_defaults
 from yid_ocp.data.recording import Recording
 from yid_ocp.data.recording_hdf5 import read_recording, write_recording
 from yid_ocp.errors import DataError, YidError
@@ -47,9 +47,9 @@ from yid_ocp.vision.track import FrameTracker
 from yid_ocp.vision.track_result import FrameReport, TrackResult
 from yid_ocp.workflow.build import build_system
 from yid_ocp.workflow.build_problem import issues_to_plain_data, single_recording_issues
-from yid_ocp.workflow.command_runner import CommandResult, command_with_settings, workers_from_arguments
+from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings, workers_from_arguments
 from yid_ocp.workflow.run_folder import RunFolder, atomic_run_folder
-from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, resolve_recording_path
+from yid_ocp.workflow.run_inputs import add_setting_location_to_errors, given_or_shipped_recording_path
 
 _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_track(
     run: RunSettings, out: str | Path | None, progress: Progress, workers: WorkerConfig | None
-) -> CommandResult[None]:
+) -> CommandResultAndOutput[None]:
     """Track the frames of `track.frames_path`, or of a virtual camera; what an interrupted run did is used again.
 
     Where not one frame is good, the run folder says why when the error is raised.
@@ -115,7 +115,7 @@ def _run_track(
     if refused is not None:
         hint = f"{refused.hint}; {folder.path} has the reason of every frame and pictures"
         raise DataError(refused.what, where=refused.where, allowed=refused.allowed, hint=hint)
-    return CommandResult(folder.path, written, None)
+    return CommandResultAndOutput(folder.path, written, None)
 
 
 def _drawn(frames: Sequence[FrameReport], count: int) -> list[FrameReport]:
@@ -270,7 +270,7 @@ def _read_joints(run: RunSettings) -> Recording | None:
     if not run.recordings.estimate:
         return None
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):
-        path = resolve_recording_path(run.recordings.estimate[0])
+        path = given_or_shipped_recording_path(run.recordings.estimate[0])
         return replace(read_recording(path, allow_nan_effort=True), name=path.stem)
 
 
@@ -337,7 +337,7 @@ def _frame_tasks(
 ) -> tuple[_FrameTasks, VirtualFrames | None]:
     """Tracking tasks of frames in files, written before where a virtual camera sees them; and the latter's truth."""
     said, work, made, own_files = run.track, folder.resume_folder, None, tuple[Path, ...]()
-    joints = resolve_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
+    joints = given_or_shipped_recording_path(run.recordings.estimate[0]) if run.recordings.estimate else None
     if said.frames_path is not None:
         _read_joints(run)
         _read_frames(run, "frames_path")  # says in words of the settings what is wrong with the files
@@ -358,7 +358,7 @@ def _frame_tasks(
     files = {"frames": frames, "joints": joints, "background": said.background_frames}
     with add_setting_location_to_errors(run, "track", "frames_path"):
         inputs = {key: file_sha256(Path(path)) for key, path in files.items() if path is not None}
-        text = dump_config(own)
+        text = config_yaml_with_defaults(own)
         work_folder = work / json_sha256([text, inputs])[:16]
         make_folder(work_folder)
         write_text(work_folder / _CONFIG_FILE, text)

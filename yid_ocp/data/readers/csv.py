@@ -22,7 +22,7 @@ from yid_ocp.data.recording import (
     JOINT_CHANNEL_UNITS,
     JointGroup,
     PointGroup,
-    RecordedOrNominalClock,
+    RecordedOrNominalTimes,
     Recording,
     SensorChannelGroup,
 )
@@ -59,7 +59,7 @@ class CsvOptions(base.SelectionAndUnitOptions):
     header: bool = True  # whether the first row has names; where not, columns are called `1`, `2` and so on
     skip_bad_lines: bool = False  # leave out lines that are no rows of numbers, and count them in `notes`
     delimiter: str = ","  # one character between cells
-    clock: RecordedOrNominalClock = "recorded"  # whether the times were measured
+    clock: RecordedOrNominalTimes = "recorded"  # whether the times were measured
     sensor: str = "unknown"  # what saw the points
     frame: str = "world"  # their frame of reference
     description: str = ""  # what was recorded

@@ -18,7 +18,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import figures
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
-from yid_ocp.report.terminal import display_scale_and_unit, format_error_value_and_unit
+from yid_ocp.report.terminal import format_error_value_and_unit, scale_and_unit_with_metres_as_mm
 
 _MAX_CANDIDATES = 15  # candidates; the rest is in result.json
 _MAX_MAPS = 3  # recordings of which a map is drawn; trajectories.h5 has them all
@@ -60,7 +60,7 @@ def _gap(finding: DiagnosisResult) -> _Chapter:
     floor = {own.channel: math.sqrt(width.get(own.channel, 1)) * own.noise_std for own in finding.noise_floor}
     rows = []
     for channel, (error, unit) in before.items():
-        factor, shown = display_scale_and_unit(unit)
+        factor, shown = scale_and_unit_with_metres_as_mm(unit)
         later = factor * after[channel][0] if changed and channel in after else None
         reference = factor * floor[channel] if channel in floor else None
         rows.append((channel, shown, ValueBeforeAfter(factor * error, later, reference=reference)))

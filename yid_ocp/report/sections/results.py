@@ -20,7 +20,7 @@ from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
 from yid_ocp.report.animation import ConfigurationTrajectory, make_animation
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
-from yid_ocp.report.png_figures import blind_calibration_rates
+from yid_ocp.report.png_figures import interval_and_p_value_calibration_rates
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
 from yid_ocp.report.terminal import SUMMARY_BY_FORMAT, SummaryBlock, SummaryStatement, SummaryTable
 
@@ -80,7 +80,9 @@ def _solver_history(findings: ReportData) -> Mapping[str, Any] | None:
     solution = findings.solution
     if solution is None or len(solution.history) < 2:
         return None
-    figure = figures.cost_history_figure([h.cost for h in solution.history], [h.note for h in solution.history])
+    figure = figures.solution_cost_history_figure(
+        [h.cost for h in solution.history], [h.note for h in solution.history]
+    )
     return {"solution": solution, "finite": math.isfinite(solution.cost), "figure": figure}
 
 
@@ -128,7 +130,7 @@ def _method_comparison(findings: ReportData) -> Iterator[tuple[str, Any]]:
     for run in comparison.method_results:
         history = [entry for entry in run.solution.history if math.isfinite(entry.cost) and not entry.note]
         costs[run.method] = ([entry.seconds for entry in history], [entry.cost for entry in history])
-    yield "Cost over time", figures.excess_cost_over_time_figure(costs)
+    yield "Cost over time", figures.method_costs_over_wall_time_figure(costs)
 
 
 @register_report_section("proof", 10, "What was seen and named")
@@ -146,7 +148,7 @@ def _blind_validation(findings: ReportData) -> Iterator[tuple[str, Any]]:
     counts = np.array(said["counts"], float).reshape(len(said["true"]), len(said["said"]))
     if counts.size:
         yield "What was said of what", figures.confusion_matrix_figure(said["true"], said["said"], counts)
-    kept = blind_calibration_rates(result)
+    kept = interval_and_p_value_calibration_rates(result)
     if any(kept.values()):
         yield "What is promised, and what is kept", figures.rate_intervals_figure(kept, "promised", "kept", True)
 
