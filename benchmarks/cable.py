@@ -57,7 +57,7 @@ GRAVITY = 9.81  # [m/s^2]
 BRANCH = CableBranchOptions(
     bend_rigidity=1.5e-3, twist_rigidity=1e-3, bend_damping=1e-3, separate_twist_damping=True
 )  # a guess
-OPTIONS = CableOptions(default_branch=BRANCH, shape_memory=0.5, has_rest_angle_parameters=True)
+OPTIONS = CableOptions(default_branch=BRANCH, shape_memory_fraction=0.5, has_rest_angle_parameters=True)
 
 
 def branched_cable(folder: Path = FOLDER) -> CableTopology:
@@ -76,9 +76,9 @@ def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptio
         names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
         if options.branches.get(name, options.default_branch).separate_twist_damping:
             names.append(f"{name}.twist_damping")
-        if options.shape_memory is not None:
+        if options.shape_memory_fraction is not None:
             names.append(f"{name}.memory")
-    if options.shape_memory is not None:
+    if options.shape_memory_fraction is not None:
         names.append("start.speed_scale")
     if options.has_rest_angle_parameters:
         for name, chain in cable.vertex_names_by_branch.items():
@@ -134,7 +134,11 @@ def baselines(recording: Recording, cable: CableTopology) -> dict[str, float]:
         "stay": constant_position_baseline(recording, free),
         "move_with_clamps": mean_clamp_displacement_baseline(recording, free, cable.clamped_vertex_names),
         "linear_carry": interpolated_displacement_baseline(
-            recording, free, cable.parent_branch_points, cable.child_branch_points, cable.clamped_vertex_names
+            recording,
+            free,
+            cable.points_along_parent_branch,
+            cable.points_along_child_branches,
+            cable.clamped_vertex_names,
         ),
     }
     return {name: position_rmse(predicted, measured) for name, predicted in predictions.items()}

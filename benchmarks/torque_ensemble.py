@@ -42,7 +42,7 @@ ERRORS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
 METHOD = (
     "solver={name: steepest_descent, max_iterations: 200}",
     "problem.weighting=paper",
-    "compare.paper_experiment=null",
+    "compare.reference_paper_experiment=null",
 )
 
 

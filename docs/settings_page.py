@@ -170,7 +170,7 @@ import:
     "sensors.NAME": """\
 sensors:
   points_camera: {std: 0.005, frames: {marker_7: w_T1}}    # [m]
-  joints.effort: {std: 0.1, bias_std: 0.3, effort_kind: sample}   # [N m]
+  joints.effort: {std: 0.1, bias_std: 0.3, effort_sampling_kind: sample}   # [N m]
 """,
     "parameters.NAME": """\
 parameters:

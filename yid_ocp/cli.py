@@ -181,7 +181,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     text = "of a bag: topic of joint states whose positions were asked for"
     group.add_argument("--command-topic", metavar="TOPIC", help=text)
     text = "of a bag: make points so far along the axes of every pose [m]"
-    group.add_argument("--pose-axes", type=float, metavar="METRES", help=text)
+    group.add_argument("--pose-axis-point-distance", type=float, metavar="METRES", help=text)
     text = "of a table: its first row holds numbers"
     group.add_argument("--no-header", dest="header", action="store_const", const=False, help=text)
     text = "of a table: leave lines that are no numbers out, and count them"
@@ -189,7 +189,7 @@ def _importing(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--delimiter", metavar="CHARACTER", help="of a table: between its cells")
     group.add_argument("--episode", type=int, metavar="NUMBER", help="of a LeRobot dataset; 0 when absent")
     group.add_argument("--clock", choices=("recorded", "nominal"), help="of a table: whether its times were measured")
-    group.add_argument("--sensor", metavar="TEXT", help="what saw the points")
+    group.add_argument("--sensor-description", metavar="TEXT", help="what saw the points")
     group.add_argument("--frame", metavar="TEXT", help="frame of reference of the points, of a table or C3D file")
 
 

@@ -227,7 +227,7 @@ def informed(problem, *mechanics):
     return found, found.fisher_information(views)
 
 
-COSTS = [{}, {"huber_threshold": 0.1}, {"weighting": "paper"}, {"weak_prior_factor": 0.01}, {"duration": 0.8}]
+COSTS = [{}, {"huber_threshold": 0.1}, {"weighting": "paper"}, {"weak_prior_std_as_factor": 0.01}, {"duration": 0.8}]
 
 
 @pytest.mark.parametrize("options", [*COSTS, {"prior_stds": {"elbow.stiffness": 1e-3}}])

@@ -214,8 +214,8 @@ ANY_NUMBER = {
     "parameters.NAME.initial",
     "track.virtual_frames.latency",
     "track.options.filters.floor_height",
-    "track.options.filters.floor_margin",
-    "track.options.filters.max_depth_behind_base",
+    "track.options.filters.floor_margin_above_object_foot",
+    "track.options.filters.max_depth_behind_robot_base",
     "track.options.clock.initial_offset",
 }
 

@@ -93,15 +93,14 @@ def test_written_back_it_is_the_same_run(repository, tmp_path, name):
 
 
 def test_written_back_every_setting_is_there(written):
-    text = (
-        "solver: {name: single_shooting, max_iterations: 3}\ntrack: {options: {filters: {max_depth_behind_base: null}}}"
-    )
+    text = "solver: {name: single_shooting, max_iterations: 3}\n"
+    text += "track: {options: {filters: {max_depth_behind_robot_base: null}}}"
     run = load_config(written(f"{text}\ncompare: {{methods: {{single_shooting: {{cost_tolerance: 2}}}}}}\n"))
     told = YAML(typ="safe", pure=True).load(config_yaml_with_defaults(run))
     assert told["solver"] == {"name": "single_shooting", "max_iterations": 3, "cost_tolerance": 1e-9}
     assert told["compare"]["methods"] == {"single_shooting": {"max_iterations": 200, "cost_tolerance": 2}}
     assert told["problem"]["time_step"] == 0.01
-    assert told["track"]["options"]["filters"]["max_depth_behind_base"] is None
+    assert told["track"]["options"]["filters"]["max_depth_behind_robot_base"] is None
     assert not {"duration", "known_initial_states"} & set(told["problem"])
     assert not {"name", "config_file", "key_locations"} & set(told)
     assert load_config(written(config_yaml_with_defaults(run))) == run

@@ -99,7 +99,7 @@ def arm_and_camera() -> Messages:
 def test_bag_round_trip(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, heard = write_bag(tmp_path, kind, arm_and_camera()), Heard()
     monkeypatch.setattr("yid_ocp.data.readers.bags._PROGRESS_INTERVAL", 3)
-    recording = read_any(path, sensor="camera", progress=heard)
+    recording = read_any(path, sensor_description="camera", progress=heard)
     assert heard.parts == [(done, 8, "messages") for done in (0, 3, 6)]
     joints = joints_of(recording)
     assert joints.names == ("a", "b")
@@ -297,11 +297,11 @@ def test_a_preview_says_what_looks_like_degrees_and_millimetres(tmp_path: Path) 
 
 def test_an_orientation_becomes_points_on_the_axes(tmp_path: Path) -> None:
     path = write_bag(tmp_path, "mcap", [("/hand/pose", START, pose(START, (1.0, 2.0, 3.0)))])
-    (points,) = read_any(path, pose_axes=0.1).points
+    (points,) = read_any(path, pose_axis_point_distance=0.1).points
     assert points.names == ("hand", "hand_x", "hand_y", "hand_z")
     # the quarter turn about z takes x to y and y to -x
     assert np.allclose(points.position[0], [[1, 2, 3], [1, 2.1, 3], [0.9, 2, 3], [1, 2, 3.1]])
-    refused(path, "pose_axes = 0", pose_axes=0.0)
+    refused(path, "pose_axis_point_distance = 0", pose_axis_point_distance=0.0)
 
 
 def test_joints_are_renamed_and_currents_become_torques(tmp_path: Path) -> None:

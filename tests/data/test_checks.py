@@ -144,9 +144,9 @@ def test_a_fault_is_told_by_its_cause(fault):
 def test_commands_may_end_at_a_bound():
     recording, _ = FAULTS["clipped efforts"]
     assert causes(changed(recording, effort_kind="command")) == set()
-    assert causes(recording, joints_effort=SensorOptions(effort_kind="command")) == set()
+    assert causes(recording, joints_effort=SensorOptions(effort_sampling_kind="command")) == set()
     commands = changed(recording, effort_kind="command")
-    assert causes(commands, joints_effort=SensorOptions(effort_kind="sample")) == {"saturated"}
+    assert causes(commands, joints_effort=SensorOptions(effort_sampling_kind="sample")) == {"saturated"}
 
 
 def test_noise_that_settings_state_counts_instead_of_the_recorded():

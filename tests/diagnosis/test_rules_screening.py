@@ -99,7 +99,7 @@ def test_the_robust_covariance_is_that_of_bartlett(count):
 )
 def test_an_amplitude_is_detectable_by_its_noise(columns, noise, expected, size, seen):
     of = effect("friction@elbow", amplitude(lower=-math.inf, expected=expected))
-    [found] = candidate_detectable_amplitudes(point([0.0, 0.0], signature(of, columns, noise)), detection_z=2.0)
+    [found] = candidate_detectable_amplitudes(point([0.0, 0.0], signature(of, columns, noise)), z=2.0)
     assert found.detectable_amplitudes == {"friction@elbow.a": pytest.approx(size)}
     assert found.is_detectable is seen
 
@@ -113,7 +113,7 @@ def test_the_range_counts_from_the_neutral_value():
 @pytest.mark.parametrize("order", [(0.5, 4.0, 1.0), (4.0, 0.5, 1.0), (1.0, 0.5, 4.0)])
 def test_the_best_shape_tells_what_is_detectable(order):
     at = point([0.0], *(signature(SHAPED, [size], s=size) for size in order))
-    [found] = candidate_detectable_amplitudes(at, detection_z=2.0)
+    [found] = candidate_detectable_amplitudes(at, z=2.0)
     assert found.detectable_amplitudes["branch@T1.a"] == pytest.approx(0.5)
     assert found.is_detectable
 
@@ -128,7 +128,7 @@ def test_a_shape_that_is_seen_comes_before_one_that_is_detectable_but_never_so_s
         ((seen, weaker), "y", 0.5, True),
         ((hidden, larger), "x", 0.1, False),
     ):
-        [found] = candidate_detectable_amplitudes(point([0.0], *pair), detection_z=2.0)
+        [found] = candidate_detectable_amplitudes(point([0.0], *pair), z=2.0)
         assert (found.detectable_amplitudes[f"pair@x.{name}"], found.is_detectable) == (pytest.approx(size), is_seen)
 
 

@@ -85,12 +85,12 @@ def test_a_gap_is_sure_and_worth_a_name(before, held_out, gap):
 )
 def test_a_gap_along_a_candidate_needs_a_channel_above_noise(p_values, before, held_out, gap):
     tests = [outcome(channels=channels) for channels in (before, held_out)]
-    limits = Thresholds(min_channel_excess_chi2=0.03, candidate_significance_level=0.01)
+    limits = Thresholds(min_channel_excess_chi2=0.03, candidate_gap_significance_level=0.01)
     assert has_significant_gap(*tests, limits, scored(*p_values)) is gap
 
 
 def test_a_candidate_alone_has_to_be_surer_than_all_residuals():
-    sure = Thresholds(candidate_significance_level=1e-4, significance_level=0.05)
+    sure = Thresholds(candidate_gap_significance_level=1e-4, significance_level=0.05)
     assert [has_significant_gap(outcome(), outcome(chi2=1.2), sure, scored(p)) for p in (9e-5, 0.03)] == [True, False]
 
 

@@ -37,7 +37,7 @@ KINDS = {
 # what changes the momentum that the arm's motion has
 HEAVIER = {"rotor_inertia": {"left_b": {"armature": 0.05}}, "link_mass": {"left_c": {"scale": 1.1}}}
 KINDS |= HEAVIER
-OPEN = {"path_cutoff": float("inf"), "weak_prior_factor": 0.0}
+OPEN = {"path_cutoff": float("inf"), "weak_prior_std_as_factor": 0.0}
 
 
 def recording(bench, effort: bool = True, camera: bool = True) -> Recording:

@@ -213,7 +213,7 @@ def test_a_misfit_of_one_block_or_of_none_widens_nothing():
 def test_a_constant_misfit_of_every_channel_of_a_recording_counts_as_one_each(urdf_folder):
     """Zeros that move from recording to recording cancel in no block of time, and show in no other channel."""
     step = pendulum_step(urdf_folder, prescribed=PENDULUM)
-    options = ProblemOptions(path_cutoff=np.inf, weak_prior_factor=0.0)
+    options = ProblemOptions(path_cutoff=np.inf, weak_prior_std_as_factor=0.0)
     recordings = [taken(step, seed, camera=False, steps=200) for seed in range(3)]
     problem = EstimationProblem(step, recordings, ("elbow.mass",), options)
     found, series = problem.evaluate(problem.initial_unknowns), residual_channel_indices(problem)

@@ -82,7 +82,7 @@ def test_slopes_are_derivatives(moved, wanted, more):
 def test_the_point_arrives_and_stays_without_swinging(moved, wanted, found):
     assert found.is_successful, found.message
     assert found.max_position_error < 1e-4
-    assert found.max_residual_speed < wanted.rest_speed_tolerance
+    assert found.max_residual_speed < wanted.point_rest_speed_tolerance
     for values in (found.joint_velocities, found.joint_accelerations):
         np.testing.assert_allclose(values[[0, -1]], 0.0, atol=1e-9)
     assert found.joint_positions[0] == pytest.approx([START])
@@ -106,7 +106,7 @@ def test_what_hangs_below_the_point_comes_to_rest_as_well(moved, wanted):
     done = plan_motion_to_target(moved, replace(wanted, point="lower", target_position=goal))
     assert done.is_successful, done.message
     moves = np.diff(done.point_trajectories["tip"][done.simulator.standstill_node_indices], axis=0)
-    assert np.linalg.norm(moves, axis=1).max() / done.simulator.step.time_step < wanted.rest_speed_tolerance
+    assert np.linalg.norm(moves, axis=1).max() / done.simulator.step.time_step < wanted.point_rest_speed_tolerance
 
 
 def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
@@ -119,7 +119,9 @@ def test_a_plan_holds_where_time_is_stepped_more_finely(moved, wanted):
     tip = places(held, held.simulate_path(done.spline_coefficients).state)
     end = held.node_times >= wanted.duration - 1e-9
     assert np.linalg.norm(tip[end] - wanted.target_position, axis=1).max() < wanted.position_tolerance
-    assert np.linalg.norm(np.diff(tip[end], axis=0), axis=1).max() / fine.time_step < 2 * wanted.rest_speed_tolerance
+    assert (
+        np.linalg.norm(np.diff(tip[end], axis=0), axis=1).max() / fine.time_step < 2 * wanted.point_rest_speed_tolerance
+    )
 
 
 def test_limits_are_kept_at_the_price_of_the_goal_or_of_calm(moved, wanted, found):
@@ -181,7 +183,7 @@ def test_points_stay_in_the_box(moved, wanted, found):
 def test_the_shortest_duration_is_shorter_and_arrives(moved, wanted):
     quick = plan_motion_to_target(moved, replace(wanted, duration=0.8, hold_duration=0.15, minimize_duration=True))
     assert quick.is_successful
-    assert quick.max_residual_speed <= wanted.rest_speed_tolerance
+    assert quick.max_residual_speed <= wanted.point_rest_speed_tolerance
     assert quick.simulator.path.duration < 0.71
 
 

@@ -34,7 +34,7 @@ def test_a_plan_that_ships_arrives_within_its_limits(repository, tmp_path, name)
     run, outcome = planned(repository, tmp_path, name, *COARSE[name])
     assert outcome.is_successful, outcome.result["message"]
     assert outcome.result["error"] < run.plan.position_tolerance
-    assert outcome.result["swing"] < run.plan.rest_speed_tolerance
+    assert outcome.result["swing"] < run.plan.point_rest_speed_tolerance
     for joint, own in outcome.result["joints"].items():
         assert own["velocity"] <= run.plan.limits.velocity_fraction + 1e-3, joint
         assert own["effort"] <= run.plan.limits.effort_fraction + 1e-3, joint
@@ -80,7 +80,7 @@ def test_two_arms_bring_the_junction_to_a_place_and_keep_hold_of_it(repository, 
     way = "plan={point: w_T1, target_offset: [0.03, 0.03, 0.0], duration: 0.8, hold_duration: 0.3}"
     run, outcome = planned(repository, tmp_path, name, "model.object.links=2", STIFF, way)
     assert outcome.is_successful, outcome.result["message"]
-    assert outcome.result["swing"] < run.plan.rest_speed_tolerance
+    assert outcome.result["swing"] < run.plan.point_rest_speed_tolerance
     found = outcome.output
     # it begins where the recording does, and both arms take part
     recorded = read_recording(given_or_shipped_recording_path(run.recordings.estimate[0])).joints
@@ -118,7 +118,11 @@ def test_a_real_cable_in_two_clamps_is_at_rest_before_it_is_moved(repository, tm
     if not given_or_shipped_recording_path(run.recordings.estimate[0]).is_file():
         pytest.skip("its recordings are not here")
     way = "plan={point: p6, target_offset: [0.01, 0.01, 0.0], duration: 0.6, hold_duration: 0.2}"
-    fewer = ("child_branch_points={}", "branches={}", "parent_branch_points=[p0, p1, p4, p6, p8, p11, p12]")
+    fewer = (
+        "points_along_child_branches={}",
+        "branches={}",
+        "points_along_parent_branch=[p0, p1, p4, p6, p8, p11, p12]",
+    )
     coarse = [f"model.object.{entry}" for entry in fewer]
     coarse += ["model.object.branches={parent: {separate_twist_damping: true, linear_density: 0.05}}"]
     run, outcome = planned(repository, tmp_path, "deft_bdlo1", "problem.use_compiler=false", *coarse, way)

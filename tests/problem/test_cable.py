@@ -227,7 +227,7 @@ def test_a_real_cable_is_predicted_better_than_by_carrying_it_along(repository, 
     if not folder.is_dir():
         pytest.skip(f"the recordings are not there: {folder}")
     cable, recording = real.branched_cable(folder), read_recording(folder / "bdlo1_train_021.h5")
-    options = CableOptions(shape_memory=0.75)
+    options = CableOptions(shape_memory_fraction=0.75)
     step = compile_step(cable_system(typical_point_pair_distances(cable.edges, [recording]), cable, options), PERIOD)
     settings = replace(real.cable_options(cable, [recording], options), duration=1.0)
     problem = EstimationProblem(step, [recording], ("parent.bend", "a.bend"), settings)

@@ -25,7 +25,7 @@ OFFSETS = {f"effort_offset@{joint}.offset": std for joint, std in BIAS.items()}
 def options(bias=None, **more):
     # accelerations of an unsmoothed path would drown the constants, were the encoders any worse
     sensors = {"joints.effort": SensorOptions(bias_std=bias), "joints.position": SensorOptions(std=1e-4)}
-    return ProblemOptions(path_cutoff=math.inf, weak_prior_factor=0.0, sensors=sensors, **more)
+    return ProblemOptions(path_cutoff=math.inf, weak_prior_std_as_factor=0.0, sensors=sensors, **more)
 
 
 def arm(folder, bias, free, recordings=2, **how):
@@ -79,7 +79,7 @@ def test_beside_noise_that_drives_other_joints_too(urdf_folder):
     name = "effort_offset@elbow.offset"
     recorded = [taken(step, 4, camera=False)]
     sensors = {"joints.effort": SensorOptions(std=0.05, bias_std={"shoulder": 0.1, "elbow": 0.5})}
-    given = ProblemOptions(path_cutoff=math.inf, weak_prior_factor=0.0, sensors=sensors)
+    given = ProblemOptions(path_cutoff=math.inf, weak_prior_std_as_factor=0.0, sensors=sensors)
     stated = EstimationProblem(step, recorded, ("elbow.mass",), given)
     bare = replace(given, sensors={"joints.effort": SensorOptions(std=0.05, bias_std={"shoulder": 0.1, "elbow": 0.0})})
     spelt = EstimationProblem(step, recorded, ("elbow.mass", name), replace(bare, prior_stds={name: 0.5}))

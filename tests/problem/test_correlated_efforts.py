@@ -57,7 +57,7 @@ def arm(step, path, effort, angle=ANGLE, std=EFFORT, free=("shoulder.damping",),
     group = JointGroup(
         JOINTS, t, path, effort=effort, position_std=angle, effort_std=std, **{"effort_kind": "sample"} | joint
     )
-    options = ProblemOptions(path_cutoff=cutoff, weak_prior_factor=0.0)
+    options = ProblemOptions(path_cutoff=cutoff, weak_prior_std_as_factor=0.0)
     return EstimationProblem(step, [Recording(group, name="arm")], free, options, values)
 
 
@@ -94,7 +94,7 @@ def test_residuals_of_a_right_model_are_white_among_joints(urdf_folder):
 def correlated_problem(folder, cutoff=math.inf, **how):
     step = pendulum_step(folder, **how)
     names = ("shoulder.damping", "elbow.damping")
-    options = ProblemOptions(weak_prior_factor=0.0, path_cutoff=cutoff)
+    options = ProblemOptions(weak_prior_std_as_factor=0.0, path_cutoff=cutoff)
     made = EstimationProblem(step, [taken(step, 1, steps=40 if math.isinf(cutoff) else 90)], names, options)
     return made.with_episodes([correlated(episode) for episode in made.episodes], ())
 
@@ -244,7 +244,7 @@ def test_an_effort_that_stands_for_an_interval_belongs_to_its_middle(efforts_of,
 def test_settings_say_what_recorded_efforts_are(urdf_folder, kind):
     step = pendulum_step(urdf_folder, driven=PENDULUM)
     recorded, free = taken(step, 1), ["shoulder.damping"]
-    stated = ProblemOptions(sensors={JOINT_EFFORT_GROUP_NAME: SensorOptions(effort_kind=kind)})
+    stated = ProblemOptions(sensors={JOINT_EFFORT_GROUP_NAME: SensorOptions(effort_sampling_kind=kind)})
     [said] = EstimationProblem(step, [recorded], free, stated).episodes
     [held] = EstimationProblem(step, [recorded.with_effort_sampling_kind(kind)], free, ProblemOptions()).episodes
     assert said.recording.joints.effort_kind == kind

@@ -110,7 +110,7 @@ def test_an_estimated_start_has_a_prior_in_angles_and_momenta(make, momentum, fr
 
 
 def test_stated_priors_are_gaussian_about_the_start(make):
-    problem = make(prior_stds={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_factor=0.0)
+    problem = make(prior_stds={"elbow.stiffness": 0.5, "elbow.rest": 0.02}, weak_prior_std_as_factor=0.0)
     x = np.array([7.0, 4.0, 0.14])
     residual, rows = problem.prior_residual_and_jacobian(x)
     np.testing.assert_allclose(residual, [2.0, 2.0])
@@ -120,7 +120,7 @@ def test_stated_priors_are_gaussian_about_the_start(make):
 
 
 def test_weak_priors_are_log_normal_and_only_of_positive_unknowns_without_another(make):
-    problem = make(prior_stds={"shoulder.stiffness": 2.0}, weak_prior_factor=10.0)
+    problem = make(prior_stds={"shoulder.stiffness": 2.0}, weak_prior_std_as_factor=10.0)
     x = np.array([7.0, 30.0, 0.5])
     residual, rows = problem.prior_residual_and_jacobian(x)
     np.testing.assert_allclose(residual, [0.5, 1.0])
@@ -144,13 +144,15 @@ def test_the_weak_priors_logarithm_ends_smoothly_where_the_ratio_is_small():
     assert slope[3] == pytest.approx(slope[4], rel=3e-3)
 
 
-@pytest.mark.parametrize("options", [{"weak_prior_factor": 1.0}, {"weak_prior_factor": 0.0}, {"weighting": "paper"}])
+@pytest.mark.parametrize(
+    "options", [{"weak_prior_std_as_factor": 1.0}, {"weak_prior_std_as_factor": 0.0}, {"weighting": "paper"}]
+)
 def test_some_problems_have_no_weak_prior(make, options):
     problem = make(**options)
     residual, rows = problem.prior_residual_and_jacobian(problem.initial_unknowns)
     assert residual.shape == (0,)
     assert rows.shape == (0, 3)
-    assert make(weak_prior_factor=1.1).prior_residual_and_jacobian(problem.initial_unknowns)[0].shape == (2,)
+    assert make(weak_prior_std_as_factor=1.1).prior_residual_and_jacobian(problem.initial_unknowns)[0].shape == (2,)
 
 
 def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(make):
@@ -168,7 +170,7 @@ def test_an_unknown_is_as_large_as_its_start_its_prior_or_a_tenth_of_its_range(m
 
 
 def test_the_residual_is_made_of_measurements_then_priors(make):
-    problem = make(prior_stds={"elbow.stiffness": 1.0}, weak_prior_factor=5.0)
+    problem = make(prior_stds={"elbow.stiffness": 1.0}, weak_prior_std_as_factor=5.0)
     evaluation = problem.evaluate(problem.initial_unknowns + np.array([1.0, 2.0, 0.1]))
     rows = problem.residual_rows
     assert [[part.stop - part.start for part in group] for group in rows.measurements] == [[75, 39], [75, 39]]
@@ -355,8 +357,8 @@ def test_problems_prepared_anew_keep_what_is_not_changed(make, held):
     shorter = problem.truncated_to_duration(0.1)
     assert (shorter.episodes[0].grid.steps, shorter.held_out, shorter.free) == (10, (), FREE)
     assert shorter.theta[index("elbow.damping")] == 0.7
-    changed = problem.with_options(replace(problem.options, weak_prior_factor=3.0))
-    assert (changed.options.weak_prior_factor, len(changed.held_out), changed.free) == (3.0, 2, FREE)
+    changed = problem.with_options(replace(problem.options, weak_prior_std_as_factor=3.0))
+    assert (changed.options.weak_prior_std_as_factor, len(changed.held_out), changed.free) == (3.0, 2, FREE)
     fewer = problem.with_free_parameters(("elbow.stiffness",), {"elbow.stiffness": 5.0})
     assert (fewer.free, fewer.options.local_parameters, fewer.options.prior_stds) == (("elbow.stiffness",), (), {})
     assert fewer.initial_unknowns.tolist() == [5.0]

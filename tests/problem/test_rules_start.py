@@ -311,7 +311,7 @@ def rod_problem(step, state, first=0.1, std=1e-3, **options):
     place = np.tile(place.ravel(), (len(late), 1, 1))
     camera = seen([MIDDLE], late, place, "points_camera", std=np.full(place.shape, std))
     made = recording(joints(["shoulder", "elbow"], t, np.tile(POSTURE, (len(t), 1))), camera)
-    settings = ProblemOptions(weak_prior_factor=0.0, path_cutoff=np.inf, **options)
+    settings = ProblemOptions(weak_prior_std_as_factor=0.0, path_cutoff=np.inf, **options)
     return EstimationProblem(step, [made], ("T1.bend",), settings, held_out=[made])
 
 

@@ -51,7 +51,7 @@ def step(urdf_folder):
 
 
 def problem_of(step, made, options=KNOWN) -> EstimationProblem:
-    settings = ProblemOptions(path_cutoff=10.0, weak_prior_factor=0.0, sensors={"motors_left.current": options})
+    settings = ProblemOptions(path_cutoff=10.0, weak_prior_std_as_factor=0.0, sensors={"motors_left.current": options})
     return EstimationProblem(step, [made], tuple(TRUTH), settings)
 
 

@@ -150,7 +150,7 @@ def recorded(urdf: Path) -> Recording:
 
 
 def problem(system: System, recording: Recording, *free: str, step: float = 0.01, **more) -> EstimationProblem:
-    options = ProblemOptions(**{"path_cutoff": np.inf, "weak_prior_factor": 0.0, **more})
+    options = ProblemOptions(**{"path_cutoff": np.inf, "weak_prior_std_as_factor": 0.0, **more})
     return EstimationProblem(compile_step(system, step, use_compiler=False), [recording], free, options)
 
 

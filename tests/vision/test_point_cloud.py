@@ -63,7 +63,7 @@ def test_where_the_object_can_be(system, run):
     assert region(run.point_positions.reshape(-1, 3)).all()
     assert region((foot + np.array([0.0, 0.0, 0.1]))[None]).all()
     corners = {"box_lower": (0.5, -2.0, -2.0), "box_upper": (2.0, 2.0, 0.0)}
-    box = CloudFilterOptions(**corners, floor_height=-0.9, max_depth_behind_base=None)
+    box = CloudFilterOptions(**corners, floor_height=-0.9, max_depth_behind_robot_base=None)
     region = ReachableObjectRegion(system, box).membership_test_at(run.q[0], CAMERA)
     points = np.array([[0.85, 0.0, -0.1], [0.4, 0.0, -0.1], [0.85, 0.0, 0.1], [0.85, 0.0, -0.91]])
     assert region(points).tolist() == [True, False, False, False]

@@ -178,7 +178,7 @@ def test_more_links_scale_what_is_said_of_a_stiffness_per_joint(built):
 
 def test_link_lengths_as_parameters(built):
     assert "a.length" in built(SEGMENTED).parameters.names
-    names = built(SEGMENTED.replace("links: 2}", "links: 2, link_length_parameters: true}")).parameters.names
+    names = built(SEGMENTED.replace("links: 2}", "links: 2, has_link_length_parameters: true}")).parameters.names
     assert {"a.length_0", "a.length_1", "b.length"} <= set(names)
     assert "a.length" not in names
 
@@ -247,8 +247,8 @@ def test_their_encoders_are_measurements_and_the_points_of_the_arm_are_not(repos
 @pytest.mark.parametrize("name", PAPER_ESTIMATES)
 def test_the_papers_configurations_ask_for_its_answers(repository, cli, name):
     file = repository / "configs" / f"{name}.yaml"
-    assert load_config(file).compare.paper_experiment == name
-    refused = cli("compare", file, "--set", "compare.paper_experiment=triple")
+    assert load_config(file).compare.reference_paper_experiment == name
+    refused = cli("compare", file, "--set", "compare.reference_paper_experiment=triple")
     assert (refused.code, "no experiment 'triple'" in refused.err) == (2, True)
 
 

@@ -182,7 +182,12 @@ STATED = {
     "joints.position": SensorOptions(std=1e-3),
 }
 
-PRESCRIBED = {"path_cutoff": np.inf, "initial_state": "estimated", "weak_prior_factor": 7.0, "huber_threshold": 1.5}
+PRESCRIBED = {
+    "path_cutoff": np.inf,
+    "initial_state": "estimated",
+    "weak_prior_std_as_factor": 7.0,
+    "huber_threshold": 1.5,
+}
 
 
 @pytest.fixture(scope="module")
@@ -247,8 +252,8 @@ def test_every_row_is_so_many_times_larger_and_the_fit_the_same(problem_of):
 
 def test_no_weak_prior_stays_none_and_encoders_without_noise_need_none(problem_of):
     sensors = {"points": STATED["points"], "joints.effort": SensorOptions(std=0.3)}
-    shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, None, weak_prior_factor=0.0), SETTINGS)
-    assert shrunk.options.weak_prior_factor == 0.0
+    shrunk = _with_noise_only_stds(problem_of("prescribed", sensors, None, weak_prior_std_as_factor=0.0), SETTINGS)
+    assert shrunk.options.weak_prior_std_as_factor == 0.0
     assert shrunk.options.sensors["joints.effort"] == SensorOptions(std=0.3 * SHARE)
 
 

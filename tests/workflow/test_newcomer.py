@@ -205,7 +205,7 @@ def test_a_bag_becomes_a_problem_that_is_right_at_the_truth(desk: Path) -> None:
 def test_a_cable_on_a_ur5_and_a_cross_on_a_panda(desk: Path, user: Newcomer, duration: float, numbers: Any) -> None:
     bag = write_mcap(user.simulate(desk, 3, duration), desk)
     assert main(["import", str(bag), "--preview"]) == 0
-    carried_out("run.h5", "import", str(bag), "--sensor", "mocap")
+    carried_out("run.h5", "import", str(bag), "--sensor-description", "mocap")
     carried_out("run.yaml", "init", user.settings["robot"], "run.h5", *numbers)
     checked = carried_out("checked", "check", "run.yaml")
     assert not checked["warnings"] + checked["doubts"]
@@ -219,7 +219,9 @@ def test_a_rod_on_an_arm_of_servos(desk: Path) -> None:
     for seed in (3, 4):
         (desk / str(seed)).mkdir()
         bag = write_mcap(SERVO.simulate(desk, seed, 3.0, excitation), desk / str(seed))
-        carried_out(f"run_{seed}.h5", "import", str(bag), "--command-topic", "/joint_commands", "--sensor", "mocap")
+        carried_out(
+            f"run_{seed}.h5", "import", str(bag), "--command-topic", "/joint_commands", "--sensor-description", "mocap"
+        )
     carried_out("rod.yaml", "init", "default:servo_arm.urdf", "run_3.h5", "run_4.h5", *ROD_NUMBERS)
     assert load_config("rod.yaml").model.arms.mode == "servo"
     assert not carried_out("checked", "check", "rod.yaml")["doubts"]

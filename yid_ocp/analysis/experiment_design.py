@@ -266,7 +266,7 @@ class CandidateExperimentBuilder:
         step = compile_step_like(base.step, system, use_compiler=False) if other else base.step
         step, seen = add_observable_frames_to_step(step)
         wide = with_nuisance_unknowns(base, setting.initial_state_knowledge, setting.grasp_offset_prior_std)
-        plain = replace(wide.options, huber_threshold=math.inf, weak_prior_factor=0.0, weighting="whitened")
+        plain = replace(wide.options, huber_threshold=math.inf, weak_prior_std_as_factor=0.0, weighting="whitened")
         options = replace(plain, sensors=self._joint_sensors(mechanics), duration=None)
         dense = [self._dense(entry, i, seen, "torque" in mechanics) for i, entry in enumerate(recordings)]
         values = {name: v for name, v in setting.parameter_values.items() if name in step.system.parameters}

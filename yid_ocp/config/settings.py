@@ -224,7 +224,7 @@ class ImportSettings:
         _Texts,
         OptionInfo("topic, TOPIC:FRAME of /tf, marker or stem of columns, and the point that it is, such as cable:40%"),
     ] = None
-    pose_axes: Annotated[
+    pose_axis_point_distance: Annotated[
         float | None,
         Gt(0),
         Le(10),
@@ -255,7 +255,7 @@ class ImportSettings:
     ] = None
     episode: Annotated[int | None, Ge(0), OptionInfo("of a LeRobot dataset: which one; the first when absent")] = None
     clock: Annotated[RecordedOrNominalTimes | None, OptionInfo("of a table: whether its times were measured")] = None
-    sensor: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
+    sensor_description: Annotated[str | None, OptionInfo("what saw the points, in words")] = None
     frame: Annotated[str | None, OptionInfo("frame of reference of the points, of a table or C3D file")] = None
 
 
@@ -329,9 +329,9 @@ class CompareSettings:
     methods: Annotated[
         Mapping[str, Annotated[Solver, RegistryChoice(SOLVERS)]], OptionInfo("settings of each method, by name")
     ] = field(default_factory=_compared)
-    paper_experiment: Annotated[str | None, OptionInfo("experiment of the source paper whose answer stands beside")] = (
-        None
-    )
+    reference_paper_experiment: Annotated[
+        str | None, OptionInfo("experiment of the source paper whose answer stands beside")
+    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)

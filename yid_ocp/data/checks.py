@@ -108,7 +108,7 @@ def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, 
     `choice` says how a group is used, its stated noise above all; `driving`, whether joints drive the model, so that
     what lies between their samples matters.
     """
-    recording = recording.with_effort_sampling_kind(choice("joints.effort").effort_kind)
+    recording = recording.with_effort_sampling_kind(choice("joints.effort").effort_sampling_kind)
     # nothing else can be said in times that are not seconds
     found = list(_units_of_time(recording)) or chain(
         _common_clock(recording),

@@ -362,10 +362,11 @@ class BlindCaseGenerator:
         if seen <= 0:
             return None
         reach = np.min(np.where(way > 0, high, low)[way != 0] / way[way != 0])
-        times = min(wanted * self._limits.detection_z / seen, float(reach))
+        times = min(wanted * self._limits.detectable_amplitude_z / seen, float(reach))
         values = {**dict(zip(names, neutral + times * way, strict=True)), **shape}
         reported = {name: told.value for name, told in effect.reported_parameters(values).items()}
-        return InjectedEffect(effect.kind, effect.location, reported), times * seen / self._limits.detection_z
+        relative_size = times * seen / self._limits.detectable_amplitude_z
+        return InjectedEffect(effect.kind, effect.location, reported), relative_size
 
     def _outside(self, rng: np.random.Generator) -> InjectedEffect:
         system = self.simulated_system

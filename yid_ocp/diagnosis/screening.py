@@ -128,16 +128,16 @@ def _basis(matrix: Array) -> Array:
 
 
 def candidate_detectable_amplitudes(
-    point: AllCandidatesLinearization, detection_z: float = DEFAULT_THRESHOLDS.detection_z
+    point: AllCandidatesLinearization, z: float = DEFAULT_THRESHOLDS.detectable_amplitude_z
 ) -> tuple[DetectableAmplitudes, ...]:
-    """Return the smallest detectable amplitudes of every candidate: of `detection_z` standard deviations."""
+    """Return the smallest detectable amplitudes of every candidate: of `z` standard deviations."""
     found: dict[str, DetectableAmplitudes] = {}
     for signature in point.signatures:
         effect, neutral = signature.effect, signature.effect.neutral_values
         information = signature.projected_sensitivity.T @ signature.projected_sensitivity
         inverse = _pinv(information)
         variance = np.diag(inverse @ signature.score_noise_covariance @ inverse)
-        sizes = np.where(np.diag(information) > 1e-16, detection_z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
+        sizes = np.where(np.diag(information) > 1e-16, z * np.sqrt(np.maximum(variance, 0.0)), np.inf)
         detectable = dict(zip(effect.amplitude_names, map(float, sizes), strict=True))
         widths = {n: max(abs(bound - neutral[n]) for bound in effect.prior_ranges[n]) for n in effect.amplitude_names}
         visible = any(size < widths[name] for name, size in detectable.items())
@@ -352,7 +352,7 @@ def screen_candidates(
 ) -> ScreeningResult:
     """Screen all candidates except those of `base`: detectability, score and confusability."""
     point = linearize_candidates(problem, base, values, limits.shape_grid_size)
-    visible = candidate_detectable_amplitudes(point, limits.detection_z)
+    visible = candidate_detectable_amplitudes(point, limits.detectable_amplitude_z)
     ranked = score_candidates(point, residual_channel_indices(problem.problem), visible)
     everything = make_joint_score_model(point, ranked)
     return ScreeningResult(visible, ranked, confusability_matrix(everything), everything)

@@ -152,10 +152,10 @@ def _likely(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
 
 
 def _is_shape_outside_prior(effect: EffectBase, fit: RefittedModel, limits: Thresholds) -> bool:
-    """Whether a shape parameter lies outside its prior range by `shape_range_factor` or `prior_range_margin` widths."""
+    """Whether a shape is outside its prior range by `max_shape_out_of_range_factor` or `prior_range_margin` widths."""
     for name in effect.shape_parameter_names:
         low, high = effect.prior_ranges[name]
-        room, factor = limits.prior_range_margin * (high - low), limits.shape_range_factor
+        room, factor = limits.prior_range_margin * (high - low), limits.max_shape_out_of_range_factor
         near, far = (low / factor, high * factor) if low > 0 else (low - room, high + room)
         unsure = limits.min_z * fit.std.get(name, 0.0)
         if not near - unsure <= fit.values[name] <= far + unsure:
@@ -266,7 +266,7 @@ def select_effects(
             screened = screen_candidates(search.problem, base, current.values, limits)
             # a rest that the residual as a whole does not show may show along a candidate, as a gap does
             p_value = bonferroni_min_p_value(screened.candidate_scores)
-            if _little_is_left(current, limits) and p_value >= limits.candidate_significance_level:
+            if _little_is_left(current, limits) and p_value >= limits.candidate_gap_significance_level:
                 break
         shortlist = _refit_shortlist(screened, limits, base, places)
         fits = refit_with_each_effect(search, base, shortlist, current.values)

@@ -33,7 +33,7 @@ class Thresholds(SmootherThresholds):
     min_channel_excess_chi2: Annotated[
         float, Ge(0), OptionInfo("the same of the worst channel, where a candidate mends it")
     ] = 0.02
-    candidate_significance_level: Annotated[
+    candidate_gap_significance_level: Annotated[
         float, Gt(0), Lt(1), OptionInfo("significance from which a candidate alone shows a gap")
     ] = 1e-4
     unexplained_p_factor: Annotated[
@@ -44,7 +44,9 @@ class Thresholds(SmootherThresholds):
         RESIDUAL_WINDOW_SECONDS
     )
     # which candidates are worth a refit
-    detection_z: Annotated[float, Gt(0), OptionInfo("standard deviations of a detectable amplitude")] = 2.576 + 1.282
+    detectable_amplitude_z: Annotated[float, Gt(0), OptionInfo("amplitude over std at which it is detectable")] = (
+        2.576 + 1.282
+    )
     shape_grid_size: Annotated[int, Ge(1), OptionInfo("values tried of every shape parameter")] = 4
     n_refit_per_round: Annotated[int, Ge(1), OptionInfo("candidates refitted in a round")] = 6
     n_refit_lowest_p: Annotated[int, Ge(0), OptionInfo("candidates of the smallest p-values refitted in any case")] = 2
@@ -73,9 +75,9 @@ class Thresholds(SmootherThresholds):
     implausible_shape_margin: Annotated[
         float, Ge(0), OptionInfo("part of chi2/n by which an unlikely shape must be better")
     ] = 0.05
-    shape_range_factor: Annotated[float, Ge(1), OptionInfo("factor by which a shape parameter may leave its range")] = (
-        2.0
-    )
+    max_shape_out_of_range_factor: Annotated[
+        float, Ge(1), OptionInfo("factor by which a shape parameter may leave its range")
+    ] = 2.0
     prior_range_margin: Annotated[float, Ge(0), OptionInfo("widths of its range by which a value may leave it")] = 1.0
     transfer_rtol: Annotated[
         float, Ge(0), OptionInfo("part of an effect by which it may differ on held-out recordings")

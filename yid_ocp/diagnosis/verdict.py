@@ -128,11 +128,11 @@ def has_significant_gap(
     if residuals_exceed_noise((before, held_out), limits.null_test_limits):
         return True
     stated = [score.p_value for score in ranked if score.effect.kind == "effort_offset"] if offsets else []
-    if stated and min(stated) * len(ranked) < limits.candidate_significance_level:
+    if stated and min(stated) * len(ranked) < limits.candidate_gap_significance_level:
         return True
     best = bonferroni_min_p_value(ranked)
     largest = max((*before.channel_chi2.values(), *held_out.channel_chi2.values()), default=1.0)
-    return best < limits.candidate_significance_level and largest > 1 + limits.min_channel_excess_chi2
+    return best < limits.candidate_gap_significance_level and largest > 1 + limits.min_channel_excess_chi2
 
 
 def is_barely_significant_and_unexplained(

@@ -59,7 +59,7 @@ class Segment:
     """Axes of the turns at each joint, base to tip; about those left out the segment is rigid."""
     cross_section_size: tuple[float, float] | None = None
     """Extents of a rectangular section along the links' x and y axes [m]."""
-    link_length_parameters: bool = False
+    has_link_length_parameters: bool = False
     """Whether every link has a length parameter of its own (`SEGMENT.length_0`, ...) in place of `SEGMENT.length`, for
     markers that sit elsewhere in every recording; masses do not follow them."""
     clamped_edge_length: float | None = None
@@ -162,7 +162,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
     parts.parameters.extend(own.values())
     mass, shares = own["mass"].symbol, _length_shares(segment)
     square_x, square_y, radius = _cross_section(own)
-    if segment.link_length_parameters:
+    if segment.has_link_length_parameters:
         lengths = tuple(own[f"length_{i}"].symbol for i in range(len(shares)))
     else:
         lengths = tuple(own["length"].symbol * share for share in shares)
@@ -254,7 +254,7 @@ def _segment_parameters(segment: Segment) -> dict[str, Parameter]:
     length = segment.length if segment.link_lengths is None else float(np.sum(segment.link_lengths))
     small, shares = 1e-9, enumerate(_length_shares(segment))
     rows = [("length", length, "m", small, "length of the segment")]
-    if segment.link_length_parameters:
+    if segment.has_link_length_parameters:
         rows = [(f"length_{i}", length * share, "m", small, f"length of link {i}") for i, share in shares]
     rows.append(("mass", segment.mass, "kg", small, "mass of the segment"))
     if segment.radius is not None:

@@ -84,7 +84,7 @@ class PlanOptions:
         bool, OptionInfo("whether the shortest duration is sought with which the goal is reached")
     ] = False
     position_tolerance: Annotated[float, Gt(0), OptionInfo("distance that counts as reached", "m")] = 1e-3
-    rest_speed_tolerance: Annotated[float, Gt(0), OptionInfo("speed of the point that counts as rest", "m/s")] = 0.01
+    point_rest_speed_tolerance: Annotated[float, Gt(0), OptionInfo("point's speed that counts as rest", "m/s")] = 0.01
     effort_weight: Annotated[
         float, Ge(0), OptionInfo("weight of the mean squared effort in parts of its limit; raise it for calm motions")
     ] = 0.0

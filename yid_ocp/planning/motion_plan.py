@@ -201,7 +201,7 @@ def _steady(rows: PlanResidualsAndLimits, finer: PathSimulator, w: Array) -> boo
     change = (other - own)[rows.simulator.standstill_node_indices]
     place = np.linalg.norm(change[:, 0], axis=1).max()
     speed = np.linalg.norm(np.diff(change, axis=0), axis=2).max() / rows.simulator.step.time_step
-    reached, rest = rows.options.position_tolerance, rows.options.rest_speed_tolerance
+    reached, rest = rows.options.position_tolerance, rows.options.point_rest_speed_tolerance
     return bool(np.all(np.array([place / reached, speed / rest]) <= _CONVERGED_TOLERANCE_FRACTION))
 
 
@@ -278,7 +278,7 @@ def _shortest(
     """Halve the gap between a duration with which the goal is reached and one with which it is not, in steps of h."""
 
     def good(one: TargetMotionPlan) -> bool:
-        return one.is_successful and one.max_residual_speed <= options.rest_speed_tolerance
+        return one.is_successful and one.max_residual_speed <= options.point_rest_speed_tolerance
 
     if not good(found):
         return found

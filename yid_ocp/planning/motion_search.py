@@ -93,7 +93,7 @@ class PlanResidualsAndLimits:
         after, before, reached = end[1:], end[1:] - 1, options.position_tolerance
         by_speed = (by_w[after] - by_w[before]) / h
         parts = [_rows(at[end, :3] - self.target, by_w[end, :3], reached)]
-        parts.append(_rows((at[after] - at[before]) / h, by_speed, options.rest_speed_tolerance))
+        parts.append(_rows((at[after] - at[before]) / h, by_speed, options.point_rest_speed_tolerance))
         if course is not None:
             parts.append(_rows(at[:, :3] - course, by_w[:, :3], reached))
         bend = mover.path.coefficients_to_control_points_matrix(2) / options.limits.max_acceleration

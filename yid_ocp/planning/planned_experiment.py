@@ -213,7 +213,9 @@ class PlannedExperiment:
             # how wrong the motion may be is said by `_blur`
             joints = replace(joints, position_std=None)
             sensors.pop(JOINT_POSITION_GROUP_NAME, None)
-        options = self._options(huber_threshold=np.inf, weak_prior_factor=0.0, weighting="whitened", sensors=sensors)
+        options = self._options(
+            huber_threshold=np.inf, weak_prior_std_as_factor=0.0, weighting="whitened", sensors=sensors
+        )
         return self._problem(self.simulator.step, replace(recording, joints=joints), options)
 
     @cached_property

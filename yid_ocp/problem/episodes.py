@@ -225,7 +225,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
     """
     step, system = functions.step, functions.step.system
     recording = recording.with_effort_sampling_kind(
-        options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_kind
+        options.sensors.get(JOINT_EFFORT_GROUP_NAME, SensorOptions()).effort_sampling_kind
     )
     grid = make_time_grid(recording, step.time_step, options.duration)
     if system.driven and recording.joints is None:

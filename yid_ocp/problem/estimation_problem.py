@@ -146,7 +146,7 @@ class EstimationProblem(ReprMixin):
         self.predictor = EpisodePredictor(model_functions, options, self.unknowns)
         inertia = partial(mass_matrix_diagonal_at_zero, model_functions.step, theta)
         self._prior_std = stated_prior_std(self.unknowns, options, model_functions.step.system, inertia)
-        has_weak_priors = options.weighting != "paper" and options.weak_prior_factor > 1
+        has_weak_priors = options.weighting != "paper" and options.weak_prior_std_as_factor > 1
         weak = self.positive_unknowns_mask & ~np.isfinite(self._prior_std) & has_weak_priors
         self._weak: IntArray = np.flatnonzero(weak)
         self._stated = stated_prior_jacobian(self.unknowns, options, self._prior_std)
@@ -307,7 +307,7 @@ class EstimationProblem(ReprMixin):
         """Return the residual of the stated and weak priors, and its Jacobian by the unknowns."""
         stated, weak, start = self._stated, self._weak, self.initial_unknowns
         rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
-        spread = np.log(max(self.options.weak_prior_factor, 1.0 + 1e-9))
+        spread = np.log(max(self.options.weak_prior_std_as_factor, 1.0 + 1e-9))
         value, slope = soft_logarithm_and_slope(x[weak] / start[weak])
         rows[len(stated) + np.arange(len(weak)), weak] = slope / (spread * start[weak])
         return np.concatenate([stated @ (x - start), value / spread]), rows

@@ -89,7 +89,7 @@ class ProblemOptions:
     local_parameters: tuple[str, ...] = ()
     prior_stds: Mapping[str, float] = field(default_factory=dict)
     multivariate_prior: MultivariateGaussianPrior = field(default_factory=MultivariateGaussianPrior)
-    weak_prior_factor: Annotated[
+    weak_prior_std_as_factor: Annotated[
         float,
         Ge(0),
         OptionInfo(

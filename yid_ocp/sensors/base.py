@@ -60,7 +60,7 @@ class SensorOptions:
             "N m, ...",
         ),
     ] = None
-    effort_kind: Annotated[
+    effort_sampling_kind: Annotated[
         EffortSamplingKind | None,
         OptionInfo(
             "what recorded efforts are of the torque that acts, instead of what the recording says (joints.effort only)"

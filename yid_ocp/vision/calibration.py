@@ -68,7 +68,7 @@ class CameraClockOptions:
     max_offset_std: Annotated[PositiveFloat, OptionInfo("an offset of larger standard deviation is not used", "s")] = (
         0.02
     )
-    max_stamp_delay: Annotated[
+    max_frame_offset_deviation: Annotated[
         PositiveFloat,
         OptionInfo(
             "a frame whose own offset differs from the common one by more, and by more than four "
@@ -156,7 +156,7 @@ def _find_on_time_frames(own: Sequence[_StampDelay | None]) -> tuple[list[int], 
 
 def is_stamp_delay_significant(own: _StampDelay, options: CameraClockOptions) -> bool:
     """Whether a frame's time stamp is significantly late or early, beyond the offset common to all frames."""
-    return abs(own.delay) > max(options.max_stamp_delay, _STAMP_ERROR_STDS * own.std)
+    return abs(own.delay) > max(options.max_frame_offset_deviation, _STAMP_ERROR_STDS * own.std)
 
 
 _MIN_FRAMES, _MAX_START_FRAMES = 3, 6  # of a calibration, and in which starts are tried

@@ -90,7 +90,7 @@ class ShapeFitOptions:
         UnitIntervalFloat,
         OptionInfo("a link with points along a smaller fraction of its length is hidden, or not where the fit has it"),
     ] = 0.5
-    min_tube_coverage: Annotated[
+    min_tube_length_coverage: Annotated[
         UnitIntervalFloat,
         OptionInfo("a tube with points on a smaller share of its visible length is not where the fit has it"),
     ] = 0.75
@@ -246,7 +246,7 @@ class ShapeFitter:
             name
             for name, mine in own.items()
             if mine @ evidence.visibly_empty_fraction > 0
-            and evidence.length_weighted_coverage(mine) < self.options.min_tube_coverage
+            and evidence.length_weighted_coverage(mine) < self.options.min_tube_length_coverage
         }
 
     def _without(

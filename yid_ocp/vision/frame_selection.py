@@ -85,7 +85,7 @@ class TrackOptions:
         UnitIntervalFloat,
         OptionInfo("a frame with points on a smaller share of the object's visible length is dropped"),
     ] = 0.6
-    max_point_std: Annotated[
+    max_seen_point_std: Annotated[
         PositiveFloat, OptionInfo("a point that is known less well in a frame counts as not seen there", "m")
     ] = 0.02
     min_point_std: Annotated[
@@ -200,12 +200,12 @@ def tracked_states_and_points(
     flat = position.reshape(-1, 3), velocity.reshape(-1, 3), np.repeat([frames[k].stamp for k in good], len(of))
     shared = calibration.point_std_from_calibration(*flat).reshape(std.shape)
     std = np.hypot(std, shared)
-    unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.max_point_std
+    unseen = np.linalg.norm(std, axis=2) > math.sqrt(3.0) * options.max_seen_point_std
     unseen |= ~np.array([fit.is_point_seen[of] for fit in fits])
     if unseen.all():
         best = 1e3 * float(np.sqrt((std**2).mean(axis=2)).min())
-        wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_point_std).all())
-        limit = f"the best within {best:.0f} mm, max_point_std is {1e3 * options.max_point_std:g} mm"
+        wrong_sizes = bool((np.linalg.norm(by_sizes, axis=2) > math.sqrt(3.0) * options.max_seen_point_std).all())
+        limit = f"the best within {best:.0f} mm, max_seen_point_std is {1e3 * options.max_seen_point_std:g} mm"
         what = f"{_because(sizes, wrong_sizes)}no point is known well enough in any frame: {limit}"
         check = f"check the camera's pose and clock ({calibration.message}), or look at the pictures of a frame"
         raise DataError(what, where=source, hint=_hint(sizes, things, check))
@@ -313,7 +313,7 @@ def _fixed(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameRe
     if options.root_placement == "fixed" and good:
         roots = _ends(good.values())[0]
         for k, away in zip(good, np.linalg.norm(roots - np.median(roots, axis=0), axis=1), strict=True):
-            if away > options.max_grasp_gap_change + 2 * options.max_point_std:
+            if away > options.max_grasp_gap_change + 2 * options.max_seen_point_std:
                 reason = f"its root is not where it is in other frames: {1e3 * away:.0f} mm away"
                 made[k] = replace(frames[k], drop_reason=reason)
     return made

@@ -62,19 +62,19 @@ class CloudFilterOptions:
     floor_height: Annotated[
         float | None,
         OptionInfo(
-            "points below this height are left out; when absent, those below floor_margin above "
+            "points below this height are left out; when absent, those below floor_margin_above_object_foot above "
             "the foot of an object that stands on one",
             "m",
         ),
     ] = None
-    floor_margin: Annotated[float, OptionInfo("height above the foot of an object", "m")] = 0.05
+    floor_margin_above_object_foot: Annotated[float, OptionInfo("height above the foot of an object", "m")] = 0.05
     reach_margin: Annotated[
         PositiveFloat,
         OptionInfo(
             "points further from the object's root than its longest branch reaches, plus this, are left out", "m"
         ),
     ] = 0.1
-    max_depth_behind_base: Annotated[
+    max_depth_behind_robot_base: Annotated[
         float | None,
         OptionInfo(
             "points that are further from the camera than the robot's base by more than this, "
@@ -143,11 +143,11 @@ class ReachableObjectRegion:
             rest = np.zeros(system.n_coordinates)
             root = float(self._root(rest)[2])
             if np.array(ca.Function("tips", [q], [ca.horzcat(*tips)])(rest))[2].min() > root:
-                low = root + options.floor_margin
+                low = root + options.floor_margin_above_object_foot
         self._lower = np.full(3, -np.inf) if options.box_lower is None else np.array(options.box_lower, float)
         self._upper = np.full(3, np.inf) if options.box_upper is None else np.array(options.box_upper, float)
         self._lower[2] = max(self._lower[2], low)
-        self._behind = options.max_depth_behind_base
+        self._behind = options.max_depth_behind_robot_base
         elastic = {entry.joint_name for entry in system.elastic_joints}
         roots = [j for j in tree.joints if j.parent_index < 0 and j.name not in elastic and not anywhere]
         bases = [np.array(ca.DM(joint.placement.translation)).ravel() for joint in roots]

@@ -166,9 +166,9 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
         if name not in known:
             what, details = f"no recording has a group '{name}'", unknown_name_details(name, sorted(known))
             raise run.config_error(what, "sensors", name, **details)
-        if said.effort_kind is not None and name != JOINT_EFFORT_GROUP_NAME:
+        if said.effort_sampling_kind is not None and name != JOINT_EFFORT_GROUP_NAME:
             hint = f"say it of {JOINT_EFFORT_GROUP_NAME}, or leave it out"
-            raise run.config_error(f"'{name}' holds no efforts", "sensors", name, "effort_kind", hint=hint)
+            raise run.config_error(f"'{name}' holds no efforts", "sensors", name, "effort_sampling_kind", hint=hint)
         group, _, quantity = name.rpartition(".")
         constants = next((c.constants for c in channel_kinds_for_group_name(group) if c.quantity == quantity), {})
         for constant in said.constants:
@@ -260,7 +260,7 @@ def _beside_the_model(
     run: RunSettings, system: System, arm: RecordedJointsModel | None, cable: CableTopology | None, recording: Recording
 ) -> list[Issue]:
     gravity = np.array(run.model.gravity, float)
-    recording = recording.with_effort_sampling_kind(_choice(run)(JOINT_EFFORT_GROUP_NAME).effort_kind)
+    recording = recording.with_effort_sampling_kind(_choice(run)(JOINT_EFFORT_GROUP_NAME).effort_sampling_kind)
     if cable is not None:
         return list(point_checks.check_cable_point_geometry(cable, recording, gravity))
     found: list[Issue] = []

@@ -20,12 +20,12 @@ from yid_ocp.workflow.solve import solution_and_fit_issues, solve_result
 
 def _run_compare(run: RunSettings, out: str | Path | None, progress: Progress) -> CommandResultAndOutput[None]:
     """Run every method, compare, and write the run folder; successful where any method converged."""
-    solvers, experiment = list(run.compare.methods.values()), run.compare.paper_experiment
+    solvers, experiment = list(run.compare.methods.values()), run.compare.reference_paper_experiment
     if not solvers:
         raise run.config_error("there is no method to compare", "compare", "methods", allowed=", ".join(SOLVERS))
     if experiment is not None and experiment not in PAPER_ESTIMATES:
         what = f"the paper has no experiment '{experiment}'"
-        raise run.config_error(what, "compare", "paper_experiment", allowed=", ".join(PAPER_ESTIMATES))
+        raise run.config_error(what, "compare", "reference_paper_experiment", allowed=", ".join(PAPER_ESTIMATES))
     with atomic_run_folder(run, out, "compare") as folder:
         folder.record_run_start(run, "compare")
         progress.begin_stage("building the model and its compiled step")

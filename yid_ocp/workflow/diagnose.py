@@ -165,7 +165,9 @@ def _with_noise_only_stds(problem: EstimationProblem, run: RunSettings) -> Estim
             prior_stds={name: share * std for name, std in options.prior_stds.items()},
             multivariate_prior=prior.with_parameters_scaled_by(dict.fromkeys(prior.parameter_names, share)),
             huber_threshold=options.huber_threshold / share,
-            weak_prior_factor=options.weak_prior_factor**share if options.weak_prior_factor > 0 else 0.0,
+            weak_prior_std_as_factor=options.weak_prior_std_as_factor**share
+            if options.weak_prior_std_as_factor > 0
+            else 0.0,
             start_configuration_std=share * options.start_configuration_std,
             start_velocity_std=share * options.start_velocity_std,
         )

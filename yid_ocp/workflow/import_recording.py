@@ -22,7 +22,17 @@ from yid_ocp.workflow.command_runner import EXIT_DONE, print_json, print_result,
 _RESULT_FORMAT = "yid-import/1"
 _LISTS = ("joint_topics", "joints")
 _MAPPINGS: Mapping[str, type] = {"points": str, "columns": str, "torque_constants": float, "gears": float}
-_SINGLE = ("command_topic", "pose_axes", "header", "skip_bad_lines", "delimiter", "episode", "clock", "sensor", "frame")
+_SINGLE = (
+    "command_topic",
+    "pose_axis_point_distance",
+    "header",
+    "skip_bad_lines",
+    "delimiter",
+    "episode",
+    "clock",
+    "sensor_description",
+    "frame",
+)
 _FLAGS = {"joint_topics": "--joint-topic"}  # of options whose flag is not their name
 _SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip-bad-lines"}
 

@@ -128,7 +128,7 @@ def _baselines(episode: Episode, samples: Measurements, cable: CableTopology | N
         recording, held, points = episode.recording, cable.clamped_vertex_names, sensor.point_names
         group = next(group for group in recording.points if group.name == sensor.group_name)
         inside = (group.t >= episode.grid.start_time - 1e-9) & (group.t <= episode.grid.node_times[-1] + 1e-9)
-        parents, children = cable.parent_branch_points, cable.child_branch_points
+        parents, children = cable.points_along_parent_branch, cable.points_along_child_branches
         carried = predictions.interpolated_displacement_baseline
         arrays = {
             "stays": predictions.constant_position_baseline(recording, points, _START_FRAMES),

@@ -150,8 +150,8 @@ class BagOptions(base.SelectionAndUnitOptions):
     # topic of joint states whose positions are what the controller asked for: `position_command`, held in between
     command_topic: str | None = None
     # distance from a pose's origin at which NAME_x, NAME_y and NAME_z on its axes become points too [m]
-    pose_axes: float | None = None
-    sensor: str = "unknown"  # what saw the points
+    pose_axis_point_distance: float | None = None
+    sensor_description: str = "unknown"  # what saw the points
     description: str = ""  # what was recorded
 
 
@@ -172,10 +172,11 @@ def read_bag(
     `DataError` where `rosbags` is not installed, the bag cannot be read, holds no such topic or leaves a choice open,
     and as `validate_recording`.
     """
-    path, pose_axes = Path(path), options.pose_axes
+    path, distance = Path(path), options.pose_axis_point_distance
     digest = file_sha256(path)
-    if pose_axes is not None and not 0 < pose_axes < float("inf"):
-        raise DataError(f"pose_axes = {pose_axes:g}", where=str(path), allowed="a distance above 0 [m]")
+    if distance is not None and not 0 < distance < float("inf"):
+        what, allowed = f"pose_axis_point_distance = {distance:g}", "a distance above 0 [m]"
+        raise DataError(what, where=str(path), allowed=allowed)
     bag = _contents(path, tuple(source for source in options.points or () if ":" in source), progress)
     groups, notes = _joints(bag, options, str(path))
     seen = _named_places(bag, options.points, str(path))
@@ -188,15 +189,15 @@ def read_bag(
     joint_group, more = _on_one_clock(groups, seconds, str(path))
     points = []
     for frame, entries in seen.items():
-        position = _positions(_with_axes(entries, pose_axes), seconds, str(path))
+        position = _positions(_with_axes(entries, distance), seconds, str(path))
         name = "points" if len(seen) == 1 else "points_" + frame.replace("/", "_")
-        points.append(PointGroup(name, *position, None, options.sensor, frame))
+        points.append(PointGroup(name, *position, None, options.sensor_description, frame))
     used = {entry.topic for entry in groups} | {message.source.partition(":")[0] for message in places}
     channels = _mounted_sensors(bag, seconds)
     used |= {message.source for message in bag.mounted}
     turned = {message.source for message in places if message.content.axes is not None}
-    if turned and pose_axes is None:
-        more = (*more, f"orientations of {', '.join(sorted(turned))} were left out (pose_axes keeps them)")
+    if turned and distance is None:
+        more = (*more, f"pose_axis_point_distance keeps orientations of {', '.join(sorted(turned))}, left out here")
     left = [f"{t.name} was left out ({t.kind}, {t.n_messages})" for t in bag.file.topics if t.name not in used]
     own = options.description, path.name, path.stem, digest
     raw = Recording(joint_group, tuple(points), *own, notes=(*notes, *more, *left), channel_groups=channels)
@@ -222,7 +223,7 @@ def _preview_bag(path: str | os.PathLike[str], progress: Progress = NULL_PROGRES
     elif len(states) > 1:
         options["joint_topics"] = states
     if any(message.content.axes is not None for message in bag.places if ":" not in message.source):
-        notes.append("poses have orientations: --pose-axes 0.1 keeps them as points 0.1 m along the axes")
+        notes.append("poses have orientations: --pose-axis-point-distance 0.1 keeps them as points 0.1 m along axes")
     units, why = base.guess_units(_for_guess(bag))
     options |= {key: found for key, found in (("points", names), ("units", units)) if found}
     return base.FilePreview(tuple(sources), options, (*notes, *why))

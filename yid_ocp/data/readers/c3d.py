@@ -40,7 +40,7 @@ def read_c3d(
     *,
     points: Mapping[str, str] | None = None,
     units: Mapping[str, str] | None = None,
-    sensor: str = "motion capture",
+    sensor_description: str = "motion capture",
     frame: str = "world",
     description: str = "",
 ) -> Recording:
@@ -58,7 +58,7 @@ def read_c3d(
     digest = file_sha256(path)
     found = _markers(path)
     own = {"points": found.unit} if found.unit else {}
-    group = PointGroup("points", found.names, found.t, found.position, None, sensor, frame, None, "nominal")
+    group = PointGroup("points", found.names, found.t, found.position, None, sensor_description, frame, None, "nominal")
     notes = tuple(f"{entry.name} was left out ({entry.note})" for entry in found.others)
     raw = Recording(None, (group,), description, path.name, path.stem, digest, notes=notes)
     options = base.SelectionAndUnitOptions(points=points, units={**own, **(units or {})})

@@ -60,7 +60,7 @@ class CsvOptions(base.SelectionAndUnitOptions):
     skip_bad_lines: bool = False  # leave out lines that are no rows of numbers, and count them in `notes`
     delimiter: str = ","  # one character between cells
     clock: RecordedOrNominalTimes = "recorded"  # whether the times were measured
-    sensor: str = "unknown"  # what saw the points
+    sensor_description: str = "unknown"  # what saw the points
     frame: str = "world"  # their frame of reference
     description: str = ""  # what was recorded
 
@@ -115,7 +115,7 @@ def _raw(meanings: Sequence[tuple[str, str]], table: Array, where: str, options:
         own: dict[str, Any] = {name: values[rows] for name, values in channels.items()}
         joints = JointGroup(joint_names, t[rows], clock=options.clock, **own)
     if point_names:
-        rows, said = measured([position]), (options.sensor, options.frame, None, options.clock)
+        rows, said = measured([position]), (options.sensor_description, options.frame, None, options.clock)
         points.append(PointGroup("points", point_names, t[rows], position[rows], None, *said))
     for name, (names, parts) in mounted.items():
         rows = measured(list(parts.values()))

@@ -64,20 +64,20 @@ class ClampPoseDefinition:
 class CableTopology:
     """Vertices and branches of a cable with their undeformed positions; branches by the name of their segment."""
 
-    parent_branch_points: tuple[str, ...]  # from one clamp to the other; the first two and the last two are held
-    child_branch_points: Mapping[str, tuple[str, ...]]  # the first one is that of the parent at which the child leaves
+    points_along_parent_branch: tuple[str, ...]  # from one clamp to the other; the first two and the last two are held
+    points_along_child_branches: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
     undeformed_positions: Mapping[str, ArrayLike]  # of every vertex at rest without load, in any frame, shape (3,) [m]
     parent_segment: str = "parent"
 
     def __post_init__(self) -> None:
-        free = self.parent_branch_points[2:-2]
+        free = self.points_along_parent_branch[2:-2]
         if not free:
             what, allowed = (
-                f"the parent has {len(self.parent_branch_points)} vertices",
+                f"the parent has {len(self.points_along_parent_branch)} vertices",
                 "5 or more: two held at each end",
             )
             raise ModelError(what, where="cable", allowed=allowed)
-        for name, vertices in self.child_branch_points.items():
+        for name, vertices in self.points_along_child_branches.items():
             if len(vertices) < 2 or vertices[0] not in free:
                 what = f"child '{name}' does not leave the parent at one of its free vertices"
                 raise ModelError(what, where="cable", allowed=", ".join(free))
@@ -92,14 +92,14 @@ class CableTopology:
     def vertices(self) -> tuple[str, ...]:
         """Names of all vertices, the parent's first."""
         return (
-            *self.parent_branch_points,
-            *(vertex for chain in self.child_branch_points.values() for vertex in chain[1:]),
+            *self.points_along_parent_branch,
+            *(vertex for chain in self.points_along_child_branches.values() for vertex in chain[1:]),
         )
 
     @property
     def clamped_vertex_names(self) -> tuple[str, ...]:
         """Names of the four vertices held by the clamps."""
-        return (*self.parent_branch_points[:2], *self.parent_branch_points[-2:])
+        return (*self.points_along_parent_branch[:2], *self.points_along_parent_branch[-2:])
 
     @property
     def free_vertex_names(self) -> tuple[str, ...]:
@@ -109,7 +109,7 @@ class CableTopology:
     @property
     def vertex_names_by_branch(self) -> dict[str, tuple[str, ...]]:
         """Names of the vertices of every branch, by segment, the parent first."""
-        return {self.parent_segment: self.parent_branch_points, **self.child_branch_points}
+        return {self.parent_segment: self.points_along_parent_branch, **self.points_along_child_branches}
 
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
@@ -119,7 +119,7 @@ class CableTopology:
     @property
     def clamp_pose_definitions(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
         """Points that define the poses of the two clamps, start and end."""
-        a, b, *_, y, z = self.parent_branch_points
+        a, b, *_, y, z = self.points_along_parent_branch
         start = ClampPoseDefinition(START_CLAMP, a, b, "transported")
         return start, ClampPoseDefinition(END_CLAMP, y, z, "transported")
 

@@ -69,8 +69,8 @@ class CableBranchOptions:
 class CableOptions:
     """Options of a cable's model.
 
-    With a `shape_memory` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness), the
-    load being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
+    By `shape_memory_fraction` each joint rests at (1 - memory) x undeformed + memory x (start angle - load/stiffness),
+    the load being what the joint bears at the recording's start if the cable is at rest there. It becomes the parameter
     `SEGMENT.memory` and counts less for a recording that starts in motion, by the factor
     1/(1 + (start speed/`start.speed_scale`)^2). Branches that are not named have the `default_branch`; `gravity` is in
     [m/s^2].
@@ -97,7 +97,7 @@ class CableOptions:
     lengths_per_recording: Annotated[
         bool, OptionInfo("whether every recording has edge lengths of its own; every edge then has a length parameter")
     ] = True
-    shape_memory: Annotated[
+    shape_memory_fraction: Annotated[
         float | None,
         Ge(0),
         Le(1),
@@ -121,7 +121,9 @@ def read_vertex_positions(path: str | Path) -> dict[str, Array]:
 
 def edge_length_parameter_values(cable: CableTopology, lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
     """Values of the edge length parameters by name, from the edges' lengths [m]."""
-    values = {f"{START_CLAMP}.length": lengths[cable.parent_branch_points[0], cable.parent_branch_points[1]]}
+    values = {
+        f"{START_CLAMP}.length": lengths[cable.points_along_parent_branch[0], cable.points_along_parent_branch[1]]
+    }
     for name, chain in cable.vertex_names_by_branch.items():
         first = 1 if name == cable.parent_segment else 0
         for i, edge in enumerate(pairwise(chain[first:])):
@@ -142,9 +144,9 @@ def cable_system(
     item = flexible_object(_segments(cable, lengths, options), name="cable")
     if options.has_rest_angle_parameters:
         item = _with_rest_angles(item)
-    if options.shape_memory is not None:
-        item = _with_memory(item, options.shape_memory)
-    clamps = _start_clamp(lengths[cable.parent_branch_points[0], cable.parent_branch_points[1]], cable)
+    if options.shape_memory_fraction is not None:
+        item = _with_memory(item, options.shape_memory_fraction)
+    clamps = _start_clamp(lengths[cable.points_along_parent_branch[0], cable.points_along_parent_branch[1]], cable)
     clamps = clamps.with_attached_mechanism(floating_clamp(END_CLAMP))
     rotation = ca.SX(ca.DM.eye(3))
     if options.end_clamp_kind == "weld":
@@ -211,8 +213,10 @@ def _with_vertices(
     last = tree.joint_index(item.segment_layouts[0].link_joints[-1][-1])
     frames[_LAST_EDGE_FRAME] = Frame(last, Placement.identity())
     parent = tree.link_chains[cable.parent_segment]
-    edges = np.array([lengths[edge] for edge in pairwise(cable.parent_branch_points)])
-    whole = ArcLengthChain((cable.parent_branch_points[1], *parent.tip_frames), tuple(map(float, edges / edges.sum())))
+    edges = np.array([lengths[edge] for edge in pairwise(cable.points_along_parent_branch)])
+    whole = ArcLengthChain(
+        (cable.points_along_parent_branch[1], *parent.tip_frames), tuple(map(float, edges / edges.sum()))
+    )
     lines = {**tree.link_chains, cable.parent_segment: whole}
     return replace(item, mechanism=replace(tree, frames=frames, link_chains=lines))
 
@@ -227,15 +231,15 @@ def _start_clamp(length: float, cable: CableTopology) -> Mechanism:
     tip = Frame(carrier.joint_index, Placement(turn, ca.vertcat(0, 0, edge.symbol)))
     frames = {
         **clamp.frames,
-        cable.parent_branch_points[0]: carrier,
-        cable.parent_branch_points[1]: tip,
+        cable.points_along_parent_branch[0]: carrier,
+        cable.points_along_parent_branch[1]: tip,
         _START_EDGE_FRAME: tip,
     }
     return Mechanism(START_CLAMP, clamp.joints, frames, Parameters([roll, edge]))
 
 
 def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], options: CableOptions) -> list[Segment]:
-    parent = cable.parent_branch_points
+    parent = cable.points_along_parent_branch
     turns = relative_parallel_transport_rotations(cable.undeformed_polyline(parent))
     # rest frame of every parent edge, from which children's directions are measured
     carried = [turns[0]]
@@ -267,7 +271,7 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
             damping=branch.bend_damping,
             twist_damping=branch.bend_damping if branch.separate_twist_damping else None,
             stiffness_per_curvature=True,
-            link_length_parameters=options.lengths_per_recording,
+            has_link_length_parameters=options.lengths_per_recording,
         )
         segment = replace(segment, parent=None if at is None else cable.parent_segment, parent_link_index=at)
         segment = replace(segment, rest_rotation=own[0], link_rest_rotations=own[1:], clamped_edge_length=before)
@@ -285,8 +289,8 @@ class Cable(CableOptions, ObjectKind):
 model:
   object:
     kind: cable
-    parent_branch_points: [p0, p1, p2, p3, p4, p5]
-    child_branch_points: {side: [p2, s1, s2]}
+    points_along_parent_branch: [p0, p1, p2, p3, p4, p5]
+    points_along_child_branches: {side: [p2, s1, s2]}
     undeformed_shape_file: undeformed.csv
     end_clamp_kind: axis
 """,
@@ -294,19 +298,19 @@ model:
 model:
   object:
     kind: cable
-    parent_branch_points: [p0, p1, p2, p3, p4, p5]
+    points_along_parent_branch: [p0, p1, p2, p3, p4, p5]
     undeformed_shape_file: undeformed.csv
-    child_branch_points: {side: [p2, s1, s2]}
+    points_along_child_branches: {side: [p2, s1, s2]}
     branches:
       side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
 """,
     }
 
     kind: Annotated[Literal["cable"], OptionInfo("what the object is")] = "cable"
-    parent_branch_points: Annotated[
+    points_along_parent_branch: Annotated[
         tuple[str, ...], Len(5), OptionInfo("points from clamp to clamp, two held at each end")
     ]
-    child_branch_points: Annotated[
+    points_along_child_branches: Annotated[
         Mapping[str, tuple[str, ...]],
         OptionInfo("points of every branch, the first one the parent's at which it leaves"),
     ] = field(default_factory=dict)
@@ -318,7 +322,7 @@ model:
 
     def topology(self) -> CableTopology:
         undeformed = read_vertex_positions(self.undeformed_shape_file)
-        found = CableTopology(self.parent_branch_points, dict(self.child_branch_points), undeformed)
+        found = CableTopology(self.points_along_parent_branch, dict(self.points_along_child_branches), undeformed)
         for name in self.branches:
             if name not in found.vertex_names_by_branch:
                 hint = nearest_name_hint(name, found.vertex_names_by_branch)

@@ -47,7 +47,9 @@ class FlexibleSegmentSettings:
     stiffness_per_curvature: Annotated[bool, OptionInfo("whether stiffness and damping are per curvature")] = False
     clamped_at_base: Annotated[bool, OptionInfo("whether it starts at a rigid wall or gripper")] = False
     joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
-    link_length_parameters: Annotated[bool, OptionInfo("whether every link has a length parameter of its own")] = False
+    has_link_length_parameters: Annotated[bool, OptionInfo("whether every link has a length parameter of its own")] = (
+        False
+    )
 
     def segment(self, name: str, damping: float, link_division: int) -> Segment:
         """The `Segment` of a given name; `link_division` divides each link at unchanged stiffness of the segment."""
@@ -67,7 +69,7 @@ class FlexibleSegmentSettings:
             "joint_axes",
             "cross_section_size",
         )
-        options: dict[str, Any] = {key: getattr(self, key) for key in (*same, "link_length_parameters")}
+        options: dict[str, Any] = {key: getattr(self, key) for key in (*same, "has_link_length_parameters")}
         return Segment(
             name,
             self.length if self.length is not None else float(sum(lengths or ())),
