@@ -364,8 +364,18 @@ def drawn_motion(monkeypatch):
     for _ in range(STEPS):
         turned, by_torque = np.linalg.qr(rng.standard_normal((NX, NX)))[0], rng.standard_normal((NX, NU))
         steps.append(SimpleNamespace(state_by_state=0.9 * turned, state_by_torque=by_torque))
-    monkeypatch.setattr(propagation, "linearized_steps", lambda *_: steps)
-    monkeypatch.setattr(propagation, "applied_torque_by_torque_error", lambda gain, momentum: np.eye(NU))
+
+    def maps(step, theta, rollout, inputs, feedback):
+        pairs = zip(steps, feedback.gain, inputs, strict=True)
+        rows = [np.hstack([s.state_by_state, s.state_by_torque @ given]) for s, _, given in pairs]
+        for row, s, gain in zip(rows, steps, feedback.gain, strict=True):
+            row[:, feedback.state_indices] -= s.state_by_torque @ gain
+        return [(np.stack(rows), None)]
+
+    monkeypatch.setattr(propagation, "step_maps", maps)
+    monkeypatch.setattr(
+        propagation, "applied_torque_by_torque_error", lambda gain, _: np.tile(np.eye(NU), (STEPS, 1, 1))
+    )
     monkeypatch.setattr(propagation, "_INITIAL_RANDOM_SAMPLES", 8)
     shift = SimpleNamespace(momentum_derivative_by_previous_torque=lambda theta: None)
     functions = SimpleNamespace(step=None, reference_momentum_shift=shift)

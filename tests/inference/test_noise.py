@@ -7,6 +7,7 @@ import pytest
 from held_rod import held_rod
 from small_problems import PENDULUM, H, correlated, joints, pendulum_step, recording, seen, taken
 
+from yid_ocp.inference import kalman
 from yid_ocp.inference.smoother_model import recording_models_with_unknown_forces
 from yid_ocp.inference.whitening import (
     estimate_episode_torque_bias,
@@ -21,10 +22,12 @@ TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
 TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
 
 
-def problem_of(folder, *, encoders, period=1, feedback=TRACKED, effects=(), size=1.0, angle=ANGLE, **more):
+def problem_of(
+    folder, *, encoders, period=1, feedback=TRACKED, effects=(), size=1.0, angle=ANGLE, prescribed=(), **more
+):
     """A pendulum whose shoulder is driven by wrong torques, `period` steps a sample, errors `size` times as large."""
-    step = pendulum_step(folder, effects, driven=("shoulder",))
-    made = taken(step, 3, steps=24)
+    step = pendulum_step(folder, effects, driven=("shoulder",), prescribed=prescribed)
+    made = taken(step, 3, steps=120 if prescribed else 24)
     group = made.joints
     assert group is not None
     group = replace(group, effort_std=size * TORQUE, effort_bias_std=size * BIAS, effort_kind="command")
@@ -34,7 +37,8 @@ def problem_of(folder, *, encoders, period=1, feedback=TRACKED, effects=(), size
     points = tuple(g for g in made.points if not encoders or g.name == "points_camera")
     recording = replace(made, joints=group, points=points)
     options = ProblemOptions(**feedback, **more)
-    names = ("elbow.damping", "elbow.stiffness", *(n for e in step.system.effects for n in e.parameters.names))
+    first = ("elbow.mass",) if prescribed else ("elbow.damping", "elbow.stiffness")
+    names = (*first, *(n for e in step.system.effects for n in e.parameters.names))
     return EstimationProblem(step, [recording], names, options)
 
 
@@ -103,6 +107,32 @@ def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, 
     mine = np.column_stack([weighted.residual[rows], weighted.jacobian[rows]])
     np.testing.assert_allclose(mine.T @ mine, left, rtol=2e-5, atol=1e-6 * np.abs(left).max())
     np.testing.assert_array_equal(weighted.residual[rows.stop :], plain.residual[rows.stop :])
+
+
+@pytest.mark.skipif(kalman._library() is None, reason="no compiler")
+@pytest.mark.parametrize(
+    "how",
+    [
+        {"encoders": False},
+        {"encoders": True, "period": 2},
+        {"encoders": False, "period": 3, "effects": (("camera_latency", "camera", {"delay": 0.0137}),)},
+        {"encoders": False, "prescribed": ("elbow",)},
+        {"encoders": True, "feedback": {"feedback": "none"}, "prescribed": ("elbow",), "period": 2},
+        {"encoders": False, "size": 1e4, "angle": 1e-9},
+    ],
+    ids=["tracked", "encoders", "late", "prescribed", "open_loop", "ill_conditioned"],
+)
+def test_compiled_filters_do_what_plain_ones_do(urdf_folder, monkeypatch, how):
+    problem = problem_of(urdf_folder, **how)
+    x, rows = problem.initial_unknowns * 1.1, problem.residual_rows.data
+    found = []
+    for library in (kalman._library(), None):
+        monkeypatch.setattr(kalman, "_library", lambda library=library: library)
+        weighted = problem_whitened_at(problem, x, rounds=2)
+        own = weighted.evaluate(x)
+        found.append((own.residual[rows], own.jacobian[rows], *torque_biases_and_stds_by_recording(weighted, x)[0]))
+    for compiled, plain in zip(*found, strict=True):
+        np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
 
 
 @pytest.mark.parametrize("gain", [0.0, 20.0])

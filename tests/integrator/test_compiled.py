@@ -52,6 +52,9 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
     assert poor.grants_needed(lambda: kernel.adjoint_gradient(*back)) == 1
     trajectory = (case.theta, plain.state, plain.multipliers, plain.torque, names, True)
     assert poor.grants_needed(lambda: kernel.linearize(*trajectory)) == 1
+    loads = np.zeros((sum(step.sizes[key] for key in ("n", "nz", "m")), 0)), np.zeros((step.sizes["n"], 0))
+    mapped = case.theta, plain, case.feedback, np.zeros((*plain.torque.shape, 1)), loads
+    assert poor.grants_needed(lambda: kernel.step_maps(*mapped)) == 1
     poor.grants.value = 100
     again = kernel.rollout(differentiated)
     np.testing.assert_array_equal(again.state, plain.state)
@@ -62,7 +65,7 @@ def test_no_memory_is_said_by_every_entry_point(poor, step, parts, urdf_folder):
 def test_structs_are_laid_out_as_in_the_kernel(step):
     """A field at another place would be read as another array."""
     structs = compiled._Struct.__subclasses__()
-    assert len(structs) == 9
+    assert len(structs) == 10
     fields = [(kind, field) for kind in structs for field, _ in kind._fields_]
     sizes = [f"sizeof({kind.__name__})" for kind in structs]
     places = [f"offsetof({kind.__name__}, {field})" for kind, field in fields]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from yid_ocp.integrator.step import StepDerivativesByLoad, compile_step_like, linearized_steps
+from yid_ocp.integrator.step import compile_step_like, step_maps
 from yid_ocp.integrator.step_model import RolloutInputs, SensitivityDirections
 
 
@@ -139,21 +139,26 @@ def test_single_steps_are_those_of_a_rollout_by_both_kernels(case):
     rollout, rng = case.rollout(), np.random.default_rng(3)
     assert rollout.status.is_converged, rollout.status.message
     rows, momentum = rng.normal(size=(sizes["n"] + sizes["nz"] + sizes["m"], 2)), rng.normal(size=(sizes["n"], 2))
-    loads = StepDerivativesByLoad(rows, momentum)
-    made, expected = (list(linearized_steps(s, case.theta, rollout, loads)) for s in (case.step, slow))
-    for name in vars(made[0]):
-        one, other = (np.stack([getattr(step, name) for step in steps]) for steps in (made, expected))
-        # large terms cancel in efforts
-        scale = np.maximum(np.max(np.abs(other), axis=(0, 1), initial=0.0), 1e-4 * np.max(np.abs(other), initial=1.0))
-        assert np.max(np.abs(one - other) / scale, initial=0.0) < 1e-9
+    inputs = rng.normal(size=(len(rollout.torque), sizes["nu"], 3))
+    for feedback in (None, case.feedback):
+        maps = (step_maps(s, case.theta, rollout, inputs, feedback, (rows, momentum)) for s in (case.step, slow))
+        both = ([np.concatenate(parts) for parts in zip(*some, strict=True)] for some in maps)
+        made, expected = ((state, *np.split(effort, [sizes["nc"]], axis=1)) for state, effort in both)
+        for one, other in zip(made, expected, strict=True):
+            # large terms cancel in efforts
+            least = 1e-4 * np.max(np.abs(other), initial=1.0)
+            scale = np.maximum(np.max(np.abs(other), axis=(0, 1), initial=0.0), least)
+            assert np.max(np.abs(one - other) / scale, initial=0.0) < 1e-9
+    each = np.tile(np.eye(sizes["nu"]), (len(rollout.torque), 1, 1))
+    by_all, effort = next(step_maps(case.step, case.theta, rollout, each))
     n, q0 = sizes["n"], rollout.state[0]
     prescribed = (case.path[0], case.path[1]) if sizes["nc"] else None
     A, B_u, _ = case.step.jacobians(q0[:n], q0[n : 2 * n], case.torque[0], case.theta, prescribed, q0[2 * n :], ())
     free = np.delete(np.arange(sizes["nx"]), list(case.step.system.prescribed_coordinate_indices))
-    np.testing.assert_allclose(made[0].state_by_state[free], A[free], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(made[0].state_by_torque[free], B_u[free], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(by_all[0, free, : sizes["nx"]], A[free], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(by_all[0, free, sizes["nx"] :], B_u[free], rtol=1e-9, atol=1e-9)
     # implicit differentiation of a rollout: the efforts are those of its sensitivities
     directions = SensitivityDirections((), np.eye(sizes["nx"]))
     forward = case.rollout(directions=directions).effort_sensitivity
     scale = scale_of(forward[0])
-    np.testing.assert_allclose(made[0].effort_by_state[:, free], forward[0][:, free], rtol=0, atol=1e-9 * scale)
+    np.testing.assert_allclose(effort[0][: sizes["nc"], free], forward[0][:, free], rtol=0, atol=1e-9 * scale)

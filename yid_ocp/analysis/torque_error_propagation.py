@@ -17,7 +17,7 @@ import scipy.linalg
 from yid_ocp.arrays import Array
 from yid_ocp.errors import SolverError
 from yid_ocp.inference.whitening import NominalTrajectory, nominal_trajectory_from_prediction
-from yid_ocp.integrator.step import linearized_steps
+from yid_ocp.integrator.step import step_maps
 from yid_ocp.integrator.tracking_feedback import applied_torque_by_torque_error
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import InputErrorModel
@@ -141,17 +141,16 @@ class _Motion:
         step, feedback = course.model_functions.step, course.tracking_feedback
         momentum = course.model_functions.reference_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
         self.by_state, self.by_torque, self.by_angles = list[Array](), list[Array](), list[Array]()
-        for k, here in enumerate(linearized_steps(step, course.theta, course.rollout)):
-            state, by_error = here.state_by_state.copy(), here.state_by_torque.copy()
-            angles = np.zeros_like(by_error)
-            if feedback is not None:
-                by_error = here.state_by_torque @ applied_torque_by_torque_error(feedback.gain[k], momentum)
-                pulled = here.state_by_torque @ feedback.gain[k]
-                state[:, feedback.state_indices] -= pulled
-                angles = pulled[:, : angles.shape[1]] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
-            self.by_state.append(state)
-            self.by_torque.append(by_error)
-            self.by_angles.append(angles)
+        nu, count = len(errors.torque_std), len(errors.sample_of_step)
+        known, pulled = np.tile(np.eye(nu), (count, 1, 1)), np.zeros((count, nu, nu))
+        if feedback is not None:
+            known = applied_torque_by_torque_error(feedback.gain, momentum)
+            pulled = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
+        inputs = np.concatenate([known, pulled], axis=2)
+        for state, _ in step_maps(step, course.theta, course.rollout, inputs, feedback):
+            self.by_state += [*state[:, :, : -2 * nu]]
+            self.by_torque += [*state[:, :, -2 * nu : -nu]]
+            self.by_angles += [*state[:, :, -nu:]]
         self.start_by_angles = course.initial_state_by_angles * errors.angle_std
         self.start_by_torque = course.initial_state_by_torque
         self.torque_std, self.bias_std = errors.torque_std[:, None], errors.torque_bias_std[:, None]

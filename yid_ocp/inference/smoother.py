@@ -25,6 +25,7 @@ import scipy.optimize
 import threadpoolctl
 
 from yid_ocp.arrays import Array, IntArray
+from yid_ocp.inference.kalman import FilterStateTransition, KalmanStep, kalman_step_and_covariance
 from yid_ocp.inference.smoother_model import (
     DEFAULT_SMOOTHER_THRESHOLDS,
     LinearResidualModel,
@@ -32,7 +33,6 @@ from yid_ocp.inference.smoother_model import (
     SmootherThresholds,
     recording_models_with_unknown_forces,
 )
-from yid_ocp.inference.whitening import FilterStateTransition, KalmanStep, kalman_step_and_covariance
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.evaluation import Evaluation
@@ -284,7 +284,7 @@ def _responses(base: _Filtered, chosen: IntArray) -> Array:
         unknown[:, :k] *= model.interval_correlation
         unknown[:, k] = math.sqrt(1 - model.interval_correlation**2) if k else 1.0
         left = behind.reshape(len(kept), u * count)
-        shaped, move = update.step.normalized_observation_matrix, update.step.transition
+        shaped, move = update.step.whitening @ update.step.observation, update.step.transition
         rows = shaped[:, kept] @ left
         rows += (shaped[:, ns + chosen][:, :, None] * unknown).reshape(rows.shape)
         found.append(rows)

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated, Literal, NamedTuple
 
 import casadi as ca
@@ -32,10 +31,9 @@ from yid_ocp.inference.linearized_residual import (
     nominal_trajectory_from_prediction,
 )
 from yid_ocp.integrator.step import (
-    StepDerivativesByLoad,
     applied_joint_torque,
-    linearized_steps,
     moving_observable_state_mask,
+    step_maps,
 )
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
@@ -295,8 +293,8 @@ def recording_models_with_unknown_forces(
     return (replace(found[0], intervals=(first, *later)), *found[1:])
 
 
-def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> StepDerivativesByLoad:
-    """What unknown forces and grasp offsets of their reference size add to every step."""
+def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> tuple[Array, Array]:
+    """What unknown forces and grasp offsets of their reference size add to every step's equations and momentum."""
     step = course.problem.step
     n, nz, m = (step.sizes[key] for key in ("n", "nz", "m"))
     forces, loading = len(unknowns.forced), unknowns.loading
@@ -307,12 +305,12 @@ def _loads_of(course: _LinearizedEpisode, unknowns: _SmootherUnknowns) -> StepDe
     rows[unknowns.forced, np.arange(forces)] = first_share * impulse
     momentum[unknowns.forced, np.arange(forces)] = (1 - first_share) * impulse
     rows[n + nz + unknowns.grasped, np.arange(forces, loading)] = unknowns.reference[forces:loading]
-    return StepDerivativesByLoad(rows, momentum)
+    return rows, momentum
 
 
 def _steps(
     course: _LinearizedEpisode,
-    loads: StepDerivativesByLoad,
+    loads: tuple[Array, Array],
     pushes: Array,
     moving: IntArray,
     span: slice,
@@ -323,26 +321,22 @@ def _steps(
     With constraint forces efforts are followed by these.
     """
     a, e, effort = [], [], []
-    feedback, nominal, forces = course.episode.tracking_feedback, course.nominal, pushes.shape[1]
-    about = course.problem.step, nominal.theta, nominal.rollout, loads, span
-    found = linearized_steps(*about, with_constraint_forces=with_forces)
-    for k, one in enumerate(found, span.start):
-        by_state, effort_by_state = one.state_by_state, one.effort_by_state
-        by_load, effort_by_load = one.state_by_load, one.effort_by_load
-        if feedback is not None:
-            by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
-            by_state[:, feedback.state_indices] -= one.state_by_torque @ feedback.gain[k]
-            effort_by_state[:, feedback.state_indices] -= one.effort_by_torque @ feedback.gain[k]
-            # the momentum of the motion that was measured has half the impulse of an unknown force in it (of the step
-            # before; this step's stands for it)
-            followed = np.vstack([0 * loads.next_momentum, loads.next_momentum])[feedback.state_indices]
-            unknown = feedback.gain[k] @ followed
-            by_load = by_load + one.state_by_torque @ unknown
-            effort_by_load = effort_by_load + one.effort_by_torque @ unknown
-        a.append(by_state[np.ix_(moving, moving)])
-        e.append(np.hstack([by_load[moving], by_load[moving, :forces] @ pushes[k]]))
-        pushed = effort_by_load[:, :forces] @ pushes[k]
-        effort.append(np.hstack([effort_by_state[:, moving], effort_by_load, pushed]))
+    feedback, nominal, step = course.episode.tracking_feedback, course.nominal, course.problem.step
+    nx, width, forces = step.sizes["nx"], loads[1].shape[1], pushes.shape[1]
+    inputs = np.zeros((len(pushes), step.sizes["nu"], width))
+    if feedback is not None:
+        # the momentum of the motion that was measured has half the impulse of an unknown force in it (of the step
+        # before; this step's stands for it)
+        followed = np.vstack([0 * loads[1], loads[1]])[feedback.state_indices]
+        inputs = feedback.gain @ followed
+    found = step_maps(step, nominal.theta, nominal.rollout, inputs, feedback, loads, span)
+    for k, pair in enumerate((pair for some in found for pair in zip(*some, strict=True)), span.start):
+        state, own = (np.hstack([one[:, moving], one[:, nx : nx + width] + one[:, nx + width :]]) for one in pair)
+        loaded = slice(len(moving), len(moving) + forces)
+        a.append(state[moving][:, : len(moving)])
+        e.append(np.hstack([state[moving][:, len(moving) :], state[moving][:, loaded] @ pushes[k]]))
+        own = own if with_forces else own[: step.sizes["nc"]]
+        effort.append(np.hstack([own, own[:, loaded] @ pushes[k]]))
     return np.stack(a), np.stack(e), np.stack(effort)
 
 
@@ -359,9 +353,8 @@ def _recording(
     pushes = _generalized_forces_per_newton(course.system, course.nominal.theta, nodes, unknowns.pushed)
     pushes = pushes[:, unknowns.forced]
     pushes *= unknowns.reference[unknowns.loading : unknowns.driving] / unknowns.reference[:forces, None]
-    linear = partial(linearized_steps, course.problem.step, course.nominal.theta, course.nominal.rollout, loads)
-    ends = [*linear(slice(0, 1)), *linear(slice(steps - 1, steps))]
-    moving = np.flatnonzero(moving_observable_state_mask(course.problem.step, ends))
+    about = course.problem.step, course.nominal.theta, course.nominal.rollout
+    moving = np.flatnonzero(moving_observable_state_mask(*about, loads))
     slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course.nominal, with_neighbours=True)
     slopes = slopes.select_states(moving)
     beyond = len(slopes.by_state) - 2  # steps that samples at an interval's end depend on

@@ -30,23 +30,27 @@ Anderson and Moore (1979), Optimal Filtering, chapters 3 and 5. Ljung (1999), Sy
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg.lapack
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array, BoolArray, IntArray
+from yid_ocp.inference.kalman import (
+    FilterStateTransition,
+    KalmanStep,
+    kalman_step_and_covariance,
+    kalman_steps_and_covariance,
+)
 from yid_ocp.inference.linearized_residual import (
     NominalTrajectory,
     ResidualDerivativesAtNodes,
     nominal_trajectory_from_prediction,
 )
-from yid_ocp.integrator.step import LinearizedStep, linearized_steps, moving_observable_state_mask
+from yid_ocp.integrator.step import moving_observable_state_mask, step_maps
 from yid_ocp.integrator.tracking_feedback import applied_torque_by_torque_error
 from yid_ocp.parallel import map_in_threads
 from yid_ocp.problem import EquilibriumGuesses, EstimationProblem
@@ -58,88 +62,6 @@ from yid_ocp.problem.measurements import subtract_estimated_biases
 _MIN_TORQUE_GAIN = 0.1  # acting over recorded torque at which errors of one are converted into those of the other
 _MAX_ROLLOUTS = 6  # each about the torque offset estimated from the one before
 _TORQUE_BIAS_TOLERANCE = 0.05  # change of the torque offset, in stated standard deviations, below which these end
-
-
-@dataclass(frozen=True)
-class FilterStateTransition:
-    """Transition x' = (M x, f p) of the state x = (s, p)."""
-
-    state_rows: Array  # M, shape (ns, nx)
-    decay: Array  # f, shape (nx - ns,)
-
-    def propagate_state(self, columns: Array) -> Array:
-        """States after the step, from those before it, as columns (nx, c)."""
-        return np.vstack([self.state_rows @ columns, self.decay[:, None] * columns[len(self.state_rows) :]])
-
-    def _propagate_costate_back(self, costate: Array) -> Array:
-        """Costates before the step, from those after it, by the transposed map, as columns (nx, c)."""
-        ns = len(self.state_rows)
-        earlier = self.state_rows.T @ costate[:ns]
-        earlier[ns:] += self.decay[:, None] * costate[ns:]
-        return earlier
-
-
-@dataclass(frozen=True)
-class KalmanStep:
-    """Measurement update with fixed gains, and transition, of one step of a linear Kalman filter.
-
-    A state x = (s, p) of s and parameters p is measured by y = H x + e with noise e of unit covariance, and goes on by
-    x' = (M x, f p) + process noise. With the covariance P before the measurement and S = I + H P H', the normalized
-    innovations S^(-1/2) (y - H mean) of all steps are independent, of unit variance.
-    """
-
-    observation: Array  # H, shape (r, nx)
-    whitening: Array  # S^(-1/2), shape (r, r)
-    projected_covariance: Array  # S^(-1/2) H P, shape (r, nx)
-    transition: FilterStateTransition
-
-    @property
-    def normalized_observation_matrix(self) -> Array:
-        """S^(-1/2) H, shape (r, nx)."""
-        return self.whitening @ self.observation
-
-    def update_and_propagate(self, mean: Array, measured: Array) -> tuple[Array, Array]:
-        """Normalized innovations (r, c) of measured columns (r, c), and the mean (nx, c) after the step."""
-        white = self.whitening @ (measured - self.observation @ mean)
-        return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
-
-    def smooth_backward(self, white: Array, costate: Array) -> tuple[Array, Array]:
-        """Smoothed noise (r, c), and the costate (nx, c) before the step from that after it.
-
-        The smoothed state is the filter's prediction + P costate.
-        """
-        pulled = self.transition._propagate_costate_back(costate)
-        noise = self.whitening.T @ (white - self.projected_covariance @ pulled)
-        return noise, pulled + self.observation.T @ noise
-
-    def costate_covariance_before_step(self, information: Array) -> Array:
-        """Covariance (nx, nx) of the costate before the step, from that after it."""
-        shaped, projected = self.normalized_observation_matrix, self.projected_covariance
-        pulled = self.transition._propagate_costate_back(self.transition._propagate_costate_back(information).T)
-        pulled -= (pulled @ projected.T) @ shaped
-        found = shaped.T @ shaped + pulled - shaped.T @ (projected @ pulled)
-        return (found + found.T) / 2
-
-
-def kalman_step_and_covariance(
-    covariance: Array, observation: Array, transition: FilterStateTransition
-) -> tuple[KalmanStep, Array, float]:
-    """One filter step with fixed gains, the covariance after it (without process noise), and log det S.
-
-    `covariance` is P (nx, nx) before the measurement by H (r, nx). The determinant is infinite, and S counts by its
-    diagonal alone, where covariances differ by so many decades that rounding shows.
-    """
-    cross = observation @ covariance
-    whitening, log_determinant = np.zeros((0, 0)), 0.0
-    if len(observation):
-        factor, failed = scipy.linalg.lapack.dpotrf(cross @ observation.T + np.eye(len(observation)), lower=1)
-        if failed:
-            factor = np.diag(np.sqrt(1.0 + np.maximum(np.sum(cross * observation, axis=1), 0.0)))
-        whitening = scipy.linalg.lapack.dtrtri(factor, lower=1)[0]
-        log_determinant = math.inf if failed else 2 * float(np.sum(np.log(np.diag(factor))))
-    projected = whitening @ cross
-    later = transition.propagate_state(transition.propagate_state(covariance - projected.T @ projected).T)
-    return KalmanStep(observation, whitening, projected, transition), later, log_determinant
 
 
 class _FilterStep(NamedTuple):
@@ -237,66 +159,68 @@ class WhiteningFilter:
 def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) -> WhiteningFilter:
     """The whitening Kalman filter along a trajectory."""
     step, nu, count = course.model_functions.step, len(errors.torque_bias_std), len(course.rollout.torque)
-    linear = partial(linearized_steps, step, course.theta, course.rollout)
     slopes = ResidualDerivativesAtNodes.from_nominal_trajectory(course)
-    ends = [*linear(chosen=slice(0, 1)), *linear(chosen=slice(count - 1, count))]
-    live = moving_observable_state_mask(step, ends, slopes.visible_state_mask)
+    live = moving_observable_state_mask(step, course.theta, course.rollout, seen=slopes.visible_state_mask)
     kept = np.flatnonzero(live)
     rows_of_node, slopes = slopes.residual_rows_by_node(count), slopes.select_states(kept)
     start = np.hstack([course.initial_state_by_angles, *[course.initial_state_by_torque] * 2])
     unit = np.vstack([start[kept], np.eye(2 * nu, 3 * nu, nu)])
     unit *= np.concatenate([errors.angle_std, errors.torque_std, errors.torque_bias_std])
-    covariance = first = unit @ unit.T
-    made, steps = [], linear()
-    # what torques of the step before add to the momenta that the filter follows, shape (nu, nu)
-    momentum = course.model_functions.reference_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
-    for k in range(count + 1):
-        fresh = k + 1 < count and errors.sample_of_step[k + 1] != errors.sample_of_step[k]
-        here, rows = next(steps, None), rows_of_node[k]
-        move, effort, shaken = np.eye(len(kept), len(kept) + 2 * nu), None, None
-        if here is not None:
-            move, effort, shaken = _error_step(here, kept, course, momentum, errors, k)
-        observe = slopes.by_state[1, rows] @ move
-        by_torque = observe[:, len(kept) : len(kept) + nu].copy()
-        observe[:, : len(kept)] += slopes.by_state[0, rows]
-        if effort is not None:
-            observe += slopes.by_effort[:, rows].sum(axis=0) @ effort
-        # another w where it is fresh, and the same b
-        transition = FilterStateTransition(move, np.repeat([0.0 if fresh else 1.0, 1.0], nu))
-        kalman, covariance, _ = kalman_step_and_covariance(covariance, observe, transition)
-        made.append(_FilterStep(rows, kalman, by_torque))
-        if shaken is not None:
-            covariance[: len(kept), : len(kept)] += shaken @ shaken.T
-        if fresh:
-            torque = np.arange(len(kept), len(kept) + nu)
-            covariance[torque, torque] += errors.torque_std**2
-        covariance = 0.5 * (covariance + covariance.T)
+    first = unit @ unit.T
+    made, covariance = _filter_steps(course, errors, kept, slopes, rows_of_node[:-1], first)
+    # behind the last node nothing moves
+    rows, none = rows_of_node[-1], np.zeros((len(rows_of_node[-1]), nu))
+    observe = np.hstack([slopes.by_state[:, rows].sum(axis=0), none, none])
+    transition = FilterStateTransition(np.eye(len(kept), len(first)), np.ones(2 * nu))
+    kalman, covariance, _ = kalman_step_and_covariance(covariance, observe, transition)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
-    return WhiteningFilter(tuple(made), errors, first, live, spread)
+    return WhiteningFilter((*made, _FilterStep(rows, kalman, none)), errors, first, live, spread)
 
 
-def _error_step(
-    here: LinearizedStep, kept: IntArray, course: NominalTrajectory, momentum: Array, errors: InputErrorModel, k: int
-) -> tuple[Array, Array | None, Array | None]:
-    """How (d, w, b) comes through step k: d after it (ns, na), prescribed efforts at the node before it, noise of d.
-
-    The efforts (nc, na) are None where there are none, as is what unit noises of their own add to d (ns, s).
-    """
-    by_state, effort_by_state, shaken = here.state_by_state, here.effort_by_state, None
-    by_error, effort_by_error = here.state_by_torque[kept], here.effort_by_torque
-    feedback = course.tracking_feedback
-    if feedback is not None and not errors.has_encoder_measurements:
-        by_state, effort_by_state = by_state.copy(), effort_by_state.copy()
-        by_state[:, feedback.state_indices] -= here.state_by_torque @ feedback.gain[k]
-        effort_by_state[:, feedback.state_indices] -= here.effort_by_torque @ feedback.gain[k]
-        nu = by_error.shape[1]
+def _filter_steps(
+    course: NominalTrajectory,
+    errors: InputErrorModel,
+    kept: IntArray,
+    slopes: ResidualDerivativesAtNodes,
+    rows_of_node: Sequence[IntArray],
+    covariance: Array,
+) -> tuple[list[_FilterStep], Array]:
+    """The filter of the kept states' slopes over all steps, from the covariance before them to that after them."""
+    (count, nu), ns, made = course.rollout.torque.shape, len(kept), list[_FilterStep]()
+    # another w where it is fresh, and the same b
+    fresh = np.append(np.diff(errors.sample_of_step) != 0, False)[:, None]
+    decay = np.hstack([np.repeat(1.0 - fresh, nu, axis=1), np.ones((count, nu))])
+    variance = np.hstack([fresh * errors.torque_std**2, np.zeros((count, nu))])
+    inputs, feedback = np.tile(np.eye(nu), (count, 1, 2)), course.tracking_feedback
+    if errors.has_encoder_measurements:
+        feedback = None
+    elif feedback is not None:
+        # what torques of the step before add to the momenta that the filter follows
+        momentum = course.model_functions.reference_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
+        known = applied_torque_by_torque_error(feedback.gain, momentum)
         # an error of the angles that the filter follows; that of the momenta as their slope averages out
-        shaken = by_error @ feedback.gain[k][:, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
-        # that as half the impulse of the step before does not
-        known = applied_torque_by_torque_error(feedback.gain[k], momentum)
-        by_error, effort_by_error = by_error @ known, effort_by_error @ known
-    effort = np.hstack([effort_by_state[:, kept], effort_by_error, effort_by_error]) if len(effort_by_state) else None
-    return np.hstack([by_state[np.ix_(kept, kept)], by_error, by_error]), effort, shaken
+        shaken = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
+        inputs = np.concatenate([known, known, shaken], axis=2)
+    na, nx = len(covariance), course.rollout.state.shape[1]
+    columns = np.concatenate([kept, np.arange(nx, nx + inputs.shape[2])])
+    ordered = slopes.select_residual_rows(np.concatenate(rows_of_node))
+    (before, after), by_effort = ordered.by_state, ordered.by_effort.sum(axis=0)
+    ends = np.cumsum([0, *map(len, rows_of_node)])
+    for state, effort in step_maps(course.model_functions.step, course.theta, course.rollout, inputs, feedback):
+        span = slice(len(made), len(made) + len(state))
+        move = state if ns == nx else state[:, kept[:, None], columns]
+        starts, own = ends[span.start : span.stop + 1], slice(ends[span.start], ends[span.stop])
+        starts = (starts - starts[0]).tolist()
+        observe, by_torque = np.zeros((starts[-1], na)), np.zeros((starts[-1], nu))
+        for k, rows in enumerate(slice(*pair) for pair in pairwise(starts)):
+            observe[rows] = after[own][rows] @ move[k, :, :na]
+            by_torque[rows] = observe[rows, ns : ns + nu]
+            if by_effort.shape[1]:
+                observe[rows] += by_effort[own][rows] @ effort[k, : by_effort.shape[1]][:, columns[:na]]
+        observe[:, :ns] += before[own]
+        steps, covariance = kalman_steps_and_covariance(covariance, observe, starts, move, decay[span], variance[span])
+        made += map(_FilterStep, rows_of_node[span], steps, np.split(by_torque, starts[1:-1]))
+    return made, covariance
 
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ResidualWhitener) -> Array:

@@ -70,6 +70,7 @@ _Gradient = _struct("Gradient", "pointer theta start torque path")
 _Linearization = _struct(
     "Linearization", "pointer rows p1 rows_new rows_old rows_input p1_new p1_old p1_input rows_theta p1_theta"
 )
+_StepMaps = _struct("StepMaps", "int inputs loads", "pointer torque on_rows on_p1 after effort")
 _Outcome = _struct("Outcome", "int step status", "double error", "long iterations factorisations memory")
 
 
@@ -223,6 +224,19 @@ class CompiledKernel:
         made = _filled(_Linearization, out.residual, out.p1, *(matrices if derivatives else [None] * len(matrices)))
         self._call("yid_linearize", motion, _along(state, multipliers, torque), made)
         return out
+
+    def step_maps(
+        self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
+        """Derivatives of a rollout's steps, evaluated in C, as `step.step_maps` says."""
+        count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
+        rows = sizes["nx"], sizes["nc"] + sizes["m"]
+        after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)
+        made = _filled(_StepMaps, *widths, _doubles(inputs), *map(_doubles, loads), after, effort)
+        motion, given = self._motion(count, theta, None, None, feedback, None), (along.multipliers, along.torque)
+        if self._call("yid_step_maps", motion, _along(along.state, *given), made) != NewtonStatus.OK:
+            raise np.linalg.LinAlgError("the equations of a step are singular")
+        return after, effort
 
     def _call(self, function: str, *structs: _Struct) -> int:
         """Status of a function of the library, which takes structs by address."""

@@ -139,13 +139,16 @@ def _machine() -> str:
     return f"{version}|{platform.system()}|{processor}"
 
 
-def compiled_shared_library(source: str, make: Callable[[], str] | None = None) -> ctypes.CDLL | None:
+def compiled_shared_library(
+    source: str, make: Callable[[], str] | None = None, level: str | None = None
+) -> ctypes.CDLL | None:
     """Load the shared library of a C source, compiled or from the cache; None if no compiler works.
 
     The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version. With `make`,
     which returns the C text and is called only if the library is not in the cache, `source` is what determines it.
+    `level` is another flag of optimisation than the step's.
     """
-    target = _library_file(source, _optimization_flag(), make)
+    target = _library_file(source, level or _optimization_flag(), make)
     if target is None:
         return None
     try:

@@ -163,9 +163,18 @@ class InterpretedKernel:
         return attach_step_status(out, self._model.sizes, code, done, error, (total, total))
 
     def _moved(
-        self, slopes: Array, wanted: SensitivityDirections, feedback: TrackingFeedback | None, before: Array, k: int
+        self,
+        slopes: Array,
+        wanted: SensitivityDirections,
+        feedback: TrackingFeedback | None,
+        before: Array,
+        k: int,
+        loads: tuple[Array, Array] | None = None,
     ) -> tuple[Array, Array, Array] | None:
-        """Derivatives of state, multipliers and effort after step k by the implicit function theorem."""
+        """Derivatives of state, multipliers and effort after step k by the implicit function theorem.
+
+        Loads, the last directions, add to the equations (nt, e) and to the next momentum (n, e).
+        """
         n, at, names = self._model.sizes["n"], self._at, wanted.parameter_names
         moved = np.zeros((slopes.shape[1], wanted.count))
         moved[at["q0"]], moved[at["p0"]], moved[at["z0"]] = before[:n], before[n : 2 * n], before[2 * n :]
@@ -177,6 +186,12 @@ class InterpretedKernel:
         if wanted.prescribed_tangents is not None:
             moved[self._fixed] = wanted.prescribed_tangents[k + 1]
         change = slopes @ moved
+        if loads is not None:
+            last, fixed = slice(wanted.count - loads[0].shape[1], None), self._fixed - at["q1"][0]
+            change[: self._rows, last] += loads[0]
+            change[self._p1, last] += loads[1]
+            # in the balance they stand beside the momentum
+            change[self._effort, last] += slopes[self._effort, at["p0"][fixed]] @ loads[0][fixed]
         try:
             solution = np.linalg.solve(slopes[np.ix_(self._residual, self._unknown)], change[self._residual])
         except np.linalg.LinAlgError:
@@ -185,6 +200,22 @@ class InterpretedKernel:
         change += slopes[:, self._unknown] @ moved[self._unknown]
         after = np.concatenate([moved[at["q1"]], change[self._p1], moved[at["z1"]]])
         return after, moved[at["lam"]], change[self._effort]
+
+    def step_maps(
+        self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
+    ) -> tuple[Array, Array]:
+        """Derivatives of the next states and efforts of a rollout's steps, as `step.step_maps` says."""
+        slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
+        before = np.eye(nx, nx + inputs.shape[2] + extra)
+        wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
+        found = []
+        for k, u in enumerate(along.torque):
+            point = self._point(theta, along.state[k], along.state[k + 1], along.multipliers[k], u)
+            moved = self._moved(slopes(point), wanted, feedback, before, k, loads)
+            if moved is None:
+                raise np.linalg.LinAlgError("the equations of a step are singular")
+            found.append((moved[0], np.vstack([moved[2], moved[1] / self._model.time_step])))
+        return np.array([one[0] for one in found]), np.array([one[1] for one in found])
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
         """Simulate all members, one after another."""

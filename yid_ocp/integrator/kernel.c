@@ -583,6 +583,15 @@ typedef struct {
     double *rows, *p1, *rows_new, *rows_old, *rows_input, *p1_new, *p1_old, *p1_input, *rows_theta, *p1_theta;
 } Linearization;
 
+/* Steps as maps of the state before them, under the motion's feedback, of `inputs` columns of torque (steps, NU, inputs), and
+ * of loads on rows (NT, loads) and p1 (N, loads): to the state after (steps, NX, d), and to the effort and the constraint
+ * forces (steps, NC + M, d), with d = NX + inputs + loads. */
+typedef struct {
+    int inputs, loads;
+    const double *torque, *on_rows, *on_p1;
+    double *after, *effort;
+} StepMaps;
+
 /* The step reached and how it ended, Newton's last correction, totals, and the memory that was asked for [bytes]. */
 typedef struct {
     int step, status;
@@ -1088,5 +1097,70 @@ int yid_linearize(const Motion *motion, const Trajectory *along, const Lineariza
     }
     YID_FREE(k->block);
     return OK;
+}
+
+/* A row of step maps from its slopes by old (q, z), torque and loads. */
+static void map_row(const Feedback *feedback, const StepMaps *maps, int step, const double *old, const double *torque,
+                    const double *load, double *row) {
+    memset(row, 0, sizeof(double) * (NX + maps->inputs));
+    memcpy(row, old, sizeof(double) * N);
+    memcpy(row + 2 * N, old + N, sizeof(double) * NZ);
+    memcpy(row + NX + maps->inputs, load, sizeof(double) * maps->loads);
+    for (int u = 0; u < NU; u++) {
+        if (torque[u] == 0) continue;
+        const size_t at = (size_t)step * NU + u;
+        for (int c = 0; c < maps->inputs; c++) row[NX + c] += torque[u] * maps->torque[at * maps->inputs + c];
+        for (int c = 0; feedback && c < feedback->count; c++)
+            row[feedback->index[c]] -= torque[u] * feedback->gain[at * feedback->count + c];
+    }
+}
+
+/* Steps of a trajectory as linear maps, by the implicit function theorem, prescribed coordinates unchanged; a status. */
+int yid_step_maps(const Motion *motion, const Trajectory *along, const StepMaps *out, Outcome *outcome) {
+    const int loads = out->loads, d = NX + out->inputs + loads;
+    const Feedback *feedback = motion->feedback;
+    Work *k = work_new((size_t)(NT + NY) * d + BLOCK, outcome);
+    if (!k) return OUT_OF_MEMORY;
+    prepare(k, motion->theta, &motion->time_step);
+    double *Y = k->room, *joined = Y + (size_t)NY * d;
+    Ends ends = {0};
+    int status = OK;
+    for (int step = 0; step < motion->steps; step++) {
+        const Point a = recorded_step(k, motion, along, step, &ends, MIDDLE);
+        linearise(k, &a, 1);
+        if (NY && !factorise(k, EVERY, EVERY)) {
+            status = SINGULAR;
+            break;
+        }
+        for (int b = 0; b < NY; b++) {
+            const int r = unknown_row[order[b]];
+            double *row = Y + (size_t)b * d;
+            map_row(feedback, out, step, k->R0[r], k->Ru[r], out->on_rows + (size_t)r * loads, row);
+            if (r < N) row[N + r] += 1.0;
+        }
+        solve_many(k, Y, d);
+        memset(joined, 0, sizeof(double) * NT * d);
+        for (int b = 0; b < NY; b++)
+            for (int c = 0; c < d; c++) joined[(size_t)unknown_row[order[b]] * d + c] = -Y[(size_t)b * d + c];
+        double *after = out->after + (size_t)step * NX * d, *effort = out->effort + (size_t)step * (NC + M) * d;
+        memcpy(after, joined, sizeof(double) * N * d);
+        memcpy(after + (size_t)2 * N * d, joined + (size_t)N * d, sizeof(double) * NZ * d);
+        after += (size_t)N * d;
+        for (int r = 0; r < N; r++)
+            map_row(feedback, out, step, k->P0[r], k->Pu[r], out->on_p1 + (size_t)r * loads, after + (size_t)r * d);
+        multiply_rows(&k->P1[0][0], ONE(NT), p1_new_start, p1_new_col, N, joined, d, after);
+        for (int j = 0; j < NC; j++, effort += d) {
+            const int at = prescribed_index[j];
+            map_row(feedback, out, step, k->R0[at], k->Ru[at], out->on_rows + (size_t)at * loads, effort);
+            effort[N + at] += 1.0;
+            for (int i = 0; i < NT; i++)
+                for (int c = 0; c < d; c++) effort[c] += k->R1[at][i] * joined[(size_t)i * d + c];
+            for (int c = 0; c < d; c++) effort[c] /= -k->h;
+        }
+        for (int i = 0; i < M * d; i++) effort[i] = joined[(size_t)(N + NZ) * d + i] / motion->time_step;
+    }
+    outcome->status = status;
+    YID_FREE(k->block);
+    return status;
 }
 #endif

@@ -30,7 +30,7 @@ from yid_ocp.integrator.step_model import (
 from yid_ocp.model.system import System
 from yid_ocp.parallel import CASADI_LOCK
 
-_STEPS_PER_CHUNK = 50  # linearised at once, few because their matrices are dense
+_STEPS_PER_CHUNK = 16  # linearised at once, few because their matrices are dense
 _MIN_SLOPE = 1e-12  # derivatives by an internal state up to here are rounding
 _ALL_STEPS = slice(None)
 
@@ -331,101 +331,60 @@ def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLik
     return np.array(ca.densify(rows)).T.reshape(np.shape(q))
 
 
-@dataclass(frozen=True)
-class LinearizedStep:
-    """Derivatives of a step's next state and prescribed effort by state, torque and loads, at the applied torque.
-
-    A_k = dx_{k+1}/dx_k (nx, nx), B_k = dx_{k+1}/du_k (nx, nu), E_k = dx_{k+1}/d(additional loads) (nx, e), and the same
-    of the effort that the prescribed coordinates need at node k (nc, ...).
-    """
-
-    state_by_state: Array
-    state_by_torque: Array
-    state_by_load: Array
-    effort_by_state: Array
-    effort_by_torque: Array
-    effort_by_load: Array
-
-
-@dataclass(frozen=True)
-class StepDerivativesByLoad:
-    """Derivatives of a step's equations (nt, e) and next momentum (n, e) by e loads, equal in all steps."""
-
-    residual: Array
-    next_momentum: Array
-
-
 def moving_observable_state_mask(
-    step: Step, steps: Sequence[LinearizedStep], seen: BoolArray | None = None
+    step: Step,
+    theta: Array,
+    rollout: Rollout,
+    loads: tuple[Array, Array] | None = None,
+    seen: BoolArray | None = None,
 ) -> BoolArray:
     """Mask of the states that move and that affect others, efforts or sensors, shape (nx,).
 
-    Internal states of a neutral effect are excluded. `steps` are a representative sample, `seen` (nx,) says which
-    states sensors depend on.
+    Internal states of a neutral effect are excluded. The first and the last step of the rollout stand for all, `seen`
+    (nx,) says which states sensors depend on.
     """
-    by_state = np.max([np.abs(one.state_by_state) for one in steps], axis=0)
-    by_input = np.max([np.abs(np.hstack([one.state_by_torque, one.state_by_load])) for one in steps], axis=0)
-    moved = np.any(by_state > 0, axis=1) | np.any(by_input > 0, axis=1)
+    count, nx, inputs = len(rollout.torque), step.sizes["nx"], np.eye(step.sizes["nu"])[None]
+    chosen = (slice(0, 1), slice(count - 1, count))
+    ends = [next(step_maps(step, theta, rollout, np.repeat(inputs, count, 0), None, loads, one)) for one in chosen]
+    by_all = np.max([np.abs(state[0]) for state, _ in ends], axis=0)
+    by_state, moved = by_all[:, :nx], np.any(by_all > 0, axis=1)
     moved[list(step.system.prescribed_coordinate_indices)] = False
     felt = np.arange(len(moved)) < 2 * step.sizes["n"]
     felt |= False if seen is None else seen
-    felt |= np.any([np.any(np.abs(one.effort_by_state) > _MIN_SLOPE, axis=0) for one in steps], axis=0)
+    efforts = [effort[0, : step.sizes["nc"], :nx] for _, effort in ends]
+    felt |= np.any([np.any(np.abs(effort) > _MIN_SLOPE, axis=0) for effort in efforts], axis=0)
     while np.any(more := ~felt & np.any(by_state[felt] > _MIN_SLOPE, axis=0)):
         felt |= more
     return moved & felt
 
 
-def linearized_steps(
+def step_maps(
     step: Step,
     theta: Array,
     rollout: Rollout,
-    loads: StepDerivativesByLoad | None = None,
+    inputs: Array,
+    feedback: TrackingFeedback | None = None,
+    loads: tuple[Array, Array] | None = None,
     chosen: slice = _ALL_STEPS,
-    *,
-    with_constraint_forces: bool = False,
-) -> Iterator[LinearizedStep]:
-    """Iterate over the linearized steps of a finished rollout, with prescribed coordinates unchanged.
+) -> Iterator[tuple[Array, Array]]:
+    """Iterate over the derivatives of a finished rollout's steps, some at a time, prescribed coordinates unchanged.
 
-    `chosen` is a slice of steps in a row; all by default. Where asked for, efforts are followed by constraint forces.
+    Derivatives of the next state (k, nx, d), and of prescribed coordinates' effort followed by constraint forces
+    (k, nc + m, d), are by the state, under the feedback where one is given, by c columns of torque that are `inputs`
+    (N, nu, c), and by e loads, d = nx + c + e. What `loads` add to the equations (nt, e) and to the next momentum
+    (n, e) is equal in all steps. `chosen` is a slice of steps in a row; all by default.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The equations of a step are singular.
     """
     if loads is None:
         rows = sum(step.sizes[key] for key in ("n", "nz", "m"))
-        loads = StepDerivativesByLoad(np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0)))
+        loads = np.zeros((rows, 0)), np.zeros((step.sizes["n"], 0))
     begin, end, _ = chosen.indices(len(rollout.torque))
     for first in range(begin, end, _STEPS_PER_CHUNK):
         span = slice(first, min(first + _STEPS_PER_CHUNK, end))
-        yield from _chunk(step, theta, rollout, loads, span, with_constraint_forces)
-
-
-def _chunk(
-    step: Step, theta: Array, rollout: Rollout, loads: StepDerivativesByLoad, span: slice, with_forces: bool
-) -> list[LinearizedStep]:
-    """Some steps by the implicit function theorem; `numpy.linalg.LinAlgError` where their equations are singular."""
-    n, nz, nx, nu = (step.sizes[key] for key in ("n", "nz", "nx", "nu"))
-    system, state = step.system, rollout.state[span.start : span.stop + 1]
-    free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
-    found = step.kernel.linearize(theta, state, rollout.multipliers[span], rollout.torque[span], (), True)
-    loaded, count = loads.residual.shape[1], len(found.p1)
-    top, bottom = (np.zeros((count, rows, nx + nu + loaded)) for rows in (found.residual.shape[1], n))
-    for target, old, push, load in (
-        (top, found.residual_by_old, found.residual_by_input, loads.residual),
-        (bottom, found.p1_by_old, found.p1_by_input, loads.next_momentum),
-    ):
-        target[:, :, :n], target[:, :, 2 * n : nx] = old[:, :, :n], old[:, :, n:]
-        target[:, :, nx : nx + nu], target[:, :, nx + nu :] = push, load
-    top[:, np.arange(n), n + np.arange(n)] += 1.0
-    solved = step.model.index_tables.unknown_rows
-    moved = -np.linalg.solve(found.residual_by_new[:, solved[:, None], solved], top[:, solved])
-    after = np.zeros((count, nx, top.shape[2]))
-    after[:, free] = moved[:, : len(free)]
-    after[:, n : 2 * n] = bottom + found.p1_by_new[:, :, solved] @ moved
-    after[:, 2 * n :] = moved[:, len(free) : len(free) + nz]
-    effort = top[:, fixed] + found.residual_by_new[:, np.array(fixed, int)[:, None], solved] @ moved
-    effort /= -step.clock_scaled_time_step(theta)
-    if with_forces:
-        effort = np.concatenate([effort, moved[:, len(free) + nz :] / step.time_step], axis=1)
-    parts = (slice(0, nx), slice(nx, nx + nu), slice(nx + nu, None))
-    return [
-        LinearizedStep(*(a[:, part] for part in parts), *(e[:, part] for part in parts))
-        for a, e in zip(after, effort, strict=True)
-    ]
+        nodes, own = rollout.state[first : span.stop + 1], feedback and replace(feedback, gain=feedback.gain[span])
+        along = replace(rollout, state=nodes, multipliers=rollout.multipliers[span], torque=rollout.torque[span])
+        yield step.kernel.step_maps(theta, along, own, inputs[span], loads)

@@ -287,13 +287,13 @@ class EffectMomentumShift:
 
 
 def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
-    """Derivative of the applied torque by an error of the recorded torque, feedback included, (nu, nu).
+    """Derivative of the applied torque by an error of the recorded torque, feedback included, (..., nu, nu).
 
     The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
-    `gain` (nu, nb) is that of one step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_previous_torque`.
+    `gain` (..., nu, nb) is that of a step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_previous_torque`.
     """
     nu = len(by_torque)
-    return np.eye(nu) + gain[:, nu:] @ by_torque if gain.shape[1] > nu else np.eye(nu)
+    return np.eye(nu) + gain[..., nu:] @ by_torque[: gain.shape[-1] - nu]
 
 
 class _Memory:
