@@ -275,13 +275,26 @@ def unseen(function, start=None, **more):
         (lambda a, b: 1 / a + 1.1 / b, ("N/m", "N/m"), "1/a + 1/b, as springs in series are"),
         (lambda a, b: 1 / a + 1.3 / b, ("N/m", "N/m"), None),
         (lambda a, b: a + b, ("N/m", "N/m"), "a + b, as springs side by side are"),
+        (lambda a, b: a + b, ("N/m", "kg"), None),
         (lambda a, b: a / b, ("N/m", "kg"), "the ratio a / b"),
         (lambda a, b: a * b, ("N/m", "kg"), "the product a x b"),
         (lambda a, b: a * b * b, ("N/m", "kg"), None),
         (lambda a, b: ca.log(a * b) + 0.1 * (a - 2.0) ** 2, ("N/m", "kg"), None),
         (lambda a, b: ca.log(a * b) + 0.05 * (a - 2.0) ** 2, ("N/m", "kg"), "the product a x b"),
     ],
-    ids=["series", "units", "nearly", "too far", "sum", "ratio", "product", "another", "at first", "within a tenth"],
+    ids=[
+        "series",
+        "units",
+        "nearly",
+        "too far",
+        "sum",
+        "sum of units",
+        "ratio",
+        "product",
+        "another",
+        "at first",
+        "within a tenth",
+    ],
 )
 def test_a_plain_combination_has_its_direction_and_holds_at_a_finite_change(function, units, words):
     said = unseen(function, units=dict(zip("ab", units, strict=True)))

@@ -471,6 +471,15 @@ def test_a_cable_keeps_its_lengths_and_hangs(change, cause, words, ratio):
         assert (doubt.recording, doubt.group, doubt.evidence_ratio) == ("c", "points", pytest.approx(ratio, rel=5e-3))
 
 
+def test_a_cable_of_which_a_point_is_missing_is_judged_by_the_others():
+    (group,) = with_points(hanging(), "points", lambda p: 10 * p).points
+    fewer = Recording(None, (replace(group, names=group.names[:-1], position=group.position[:, :-1]),), name="c")
+    (doubt,) = check_cable_point_geometry(CABLE, fewer, GRAVITY)
+    assert (doubt.cause, "9.98 times as long" in doubt.what) == ("point_scale", True)
+    two = Recording(None, (replace(group, names=group.names[:3], position=group.position[:, :3]),), name="c")
+    assert list(check_cable_point_geometry(CABLE, two, GRAVITY)) == []
+
+
 def test_joints_of_another_name_leave_nothing_to_compare(arms, runs):
     joints = runs[1].joints
     other = JointGroup(tuple(name.replace("left", "right") for name in joints.names), joints.t, joints.position)
