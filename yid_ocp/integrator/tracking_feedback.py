@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-import scipy.linalg
 from numpy.typing import ArrayLike
 
 from yid_ocp.arrays import Array
@@ -71,10 +70,10 @@ def lqr_feedback(
     cost: Array | None = None
     states = np.hstack([reference, momenta])[:-1]
     by_state, by_torque = _one_step_each(arm_step, states, torques, reference[1:], arm_theta)
+    rate, stages = by_state[:, :nu, nu:] / step.time_step, np.zeros((steps, 2 * nu, 2 * nu))
+    stages[:, :nu, :nu], stages[:, nu:, nu:] = weight_q, rate.transpose(0, 2, 1) @ rate / _RATE_STD**2
     for k in reversed(range(steps)):
-        a, b = by_state[k], by_torque[k]
-        rate = a[:nu, nu:] / step.time_step
-        stage = scipy.linalg.block_diag(weight_q, rate.T @ rate / _RATE_STD**2)
+        a, b, stage = by_state[k], by_torque[k], stages[k]
         cost = stage if cost is None else cost
         inner = weight_u + b.T @ cost @ b
         gain[k] = np.linalg.solve(inner, b.T @ cost @ a)

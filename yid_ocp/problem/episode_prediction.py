@@ -499,9 +499,9 @@ def _at_rest(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Epi
     if not error > _POOR_EQUILIBRIUM_RMSE:
         return episode
     try:
-        shape = predictor.model_functions.initial_state_fitter.fit_to_points(
-            episode.initial_known_coordinates, seen, own, _MAX_FIRST_SAMPLE_TIME, episode.prescribed_path
-        ).state[:n]
+        fit, at = predictor.model_functions.initial_state_fitter.fit_to_points, episode.initial_known_coordinates
+        # an equilibrium near there has the details
+        shape = fit(at, seen, own, _MAX_FIRST_SAMPLE_TIME, episode.prescribed_path, roughly=True).state[:n]
     except DataError:
         return episode
     other = predictor.initial_state(episode, own, offset, (), shape)

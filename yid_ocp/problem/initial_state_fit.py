@@ -102,13 +102,20 @@ class InitialStateFitter:
         self._load = ca.Function("load", e.arguments, loads)
 
     def fit_to_points(
-        self, configuration: Array, samples: Sequence[Measurements], theta: Array, window: float, path: Array
+        self,
+        configuration: Array,
+        samples: Sequence[Measurements],
+        theta: Array,
+        window: float,
+        path: Array,
+        *,
+        roughly: bool = False,
     ) -> FixedInitialState:
         """Fit the configuration to the points of the first frame and the momentum to their change within the window.
 
         Given are driven, then prescribed coordinates at node 0 (nk,), samples, of which only points are used, how far
-        from the start frames may be used [s], and the prescribed coordinates at all nodes (N + 1, nc). `DataError`
-        where no point is seen within the window.
+        from the start frames may be used [s], and the prescribed coordinates at all nodes (N + 1, nc). `roughly` finds
+        the place of the object without its details. `DataError` where no point is seen within the window.
         """
         step, system = self.step, self.step.system
         last = max(round(window / step.time_step), 1)
@@ -136,6 +143,8 @@ class InitialStateFitter:
         for stage, softness in enumerate(_NOISE_FACTORS):
             if stage == _SELECTION_STAGE:
                 found = [min(found, key=lambda entry: entry[2])]
+                if roughly:
+                    break
             task = _Task(frames[first], theta, rest, weight, len(index), softness)
             found = [self._fit(q, v, task) for q, v, _ in found]
         q, values, _ = found[0]
