@@ -241,10 +241,12 @@ def _whitened_episode(
     at: tuple[Array, Array],
     guess: Array | None,
     before: WhiteningFilter | None,
+    keep_weights: bool = False,
 ) -> tuple[Episode, WhiteningFilter | None]:
     """The episode with its estimated input errors, and the filter that whitens its residual at (theta, offset).
 
-    The filter is None without process noise, or where the rollout fails; it is about the motion that `before` smooths.
+    The filter is None without process noise, or where the rollout fails; it is about the motion that `before` smooths,
+    with weights of its own or those of `before`.
     """
     if episode.input_errors is None:
         return episode, None
@@ -254,6 +256,8 @@ def _whitened_episode(
         result = predictor.predict_episode(episode, *at, False, guess)
     if isinstance(result, str) or episode.input_errors is None:
         return episode, None
+    if before is not None and keep_weights:
+        return episode, replace(before, input_errors=episode.input_errors)
     course = nominal_trajectory_from_prediction(predictor, episode, result, at[0])
     return episode, _build_whitening_filter(course, episode.input_errors)
 
@@ -322,12 +326,17 @@ def problem_whitened_at(
     return found if rounds < 2 else problem_whitened_at(found, x, equilibrium_guesses, rounds - 1)
 
 
-def problem_with_whitened_held_out(problem: EstimationProblem, x: ArrayLike) -> EstimationProblem:
-    """Whiten held-out residuals by all noise at `x` as well; by sensor noise alone where a rollout fails."""
+def problem_with_whitened_held_out(
+    problem: EstimationProblem, x: ArrayLike, *, keep_weights: bool = False
+) -> EstimationProblem:
+    """Whiten held-out residuals by all noise at `x` as well; by sensor noise alone where a rollout fails.
+
+    Filters are relinearized about the smoothed motion; `keep_weights` weighs once, which is enough for torque offsets.
+    """
     x, episodes, made = np.asarray(x, float), [], []
     for held, (episode, theta, offset) in zip(problem.held_out, problem.held_out_prediction_inputs(x), strict=True):
         own, whitening = _whitened_episode(problem.predictor, episode, (theta, offset), None, None)
-        own, whitening = _whitened_episode(problem.predictor, own, (theta, offset), None, whitening)
+        own, whitening = _whitened_episode(problem.predictor, own, (theta, offset), None, whitening, keep_weights)
         episodes.append(replace(held, input_errors=own.input_errors))
         made.append(whitening)
     return problem.with_episodes(problem.episodes, episodes, problem.whitening_filters, made)

@@ -154,7 +154,8 @@ def estimated_torque_offsets(problem: EstimationProblem, x: Array) -> dict[str, 
     apart = [e for e in problem.held_out if e.initial_state_shared_with is None and _has_torque_bias(e)]
     if apart:
         is_whitened = any(problem.held_out_whitening_filters)
-        held = problem if is_whitened else whitening.problem_with_whitened_held_out(problem, x)
+        weigh = whitening.problem_with_whitened_held_out
+        held = problem if is_whitened else weigh(problem, x, keep_weights=True)
         for (episode, result), own in zip(held.predict_held_out(x), held.held_out_whitening_filters, strict=True):
             is_apart = episode.initial_state_shared_with is None
             if is_apart and isinstance(own, whitening.WhiteningFilter) and not isinstance(result, str):
