@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import logging
 import math
 import site
@@ -13,6 +12,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import casadi as ca
@@ -28,6 +28,7 @@ from yid_ocp.model.rotations import (
     rotation_from_axis_sin_cos,
     rpy_from_rotation,
     snap_near_integer_entries,
+    transform_from_xyz_rpy,
 )
 
 _UNLIMITED_VALUE = 1e9  # stands for no limit where URDF asks for a number
@@ -36,6 +37,8 @@ _MAX_NUMBER = 1e12  # of m, rad, kg and kg m^2; squares of more would not be fin
 _PRINCIPAL_MOMENT_RTOL = 1e-2  # how far, for want of digits in the file, they may miss what they have to be
 _MOVABLE_JOINT_TYPES = {"revolute", "continuous", "prismatic"}
 _TENSOR_KEYS = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+
+_LIMITS = ("lower", "upper", "effort", "velocity")
 
 _Carrier = str | None
 log = logging.getLogger(__name__)
@@ -169,26 +172,71 @@ def _proximal_links(link: str, frames: Mapping[str, tuple[_Carrier, Array, str]]
     return {name: None for name, (own, *_) in frames.items() if own == carrier and name not in beyond}
 
 
-def _parsed(file: Path) -> Any:
-    import yourdfpy
-
+def _parsed(file: Path) -> SimpleNamespace:
+    """Name, links and joints of a URDF file, as far as a mechanism needs them."""
     try:
-        tree = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES))
-        _check_numbers(tree.getroot(), str(file))  # yourdfpy reads what it can and says nothing
-        with contextlib.redirect_stderr(io.StringIO()):
-            options = dict.fromkeys(("build_scene_graph", "load_meshes", "load_collision_meshes"), False)
-            return yourdfpy.URDF.load(str(file), **options).robot
+        robot = ElementTree.parse(check_input_file(file, MAX_TEXT_BYTES)).getroot()
+        _check_numbers(robot, str(file))
+        links = [
+            SimpleNamespace(name=link.attrib["name"], inertial=_read_inertial(link.find("inertial")))
+            for link in robot.findall("link")
+        ]
+        joints = [_read_joint(joint) for joint in robot.findall("joint")]
+        return SimpleNamespace(name=robot.attrib["name"], links=links, joints=joints)
     except ModelError:
         raise
-    except Exception as error:  # yourdfpy and lxml raise many kinds for a malformed file
+    except Exception as error:  # a malformed file raises many kinds
         reason = f"{error} is missing" if isinstance(error, KeyError) else getattr(error, "what", error)
         what = f"the URDF cannot be read: {reason}"
         allowed, hint = "a file of URDF with links and joints", "look at it with check_urdf, or export it again"
         raise ModelError(what, where=str(file), allowed=allowed, hint=hint) from error
 
 
+def _read_inertial(element: ElementTree.Element | None) -> SimpleNamespace | None:
+    if element is None:
+        return None
+    moments, tensor = element.find("inertia"), np.zeros((3, 3))
+    if moments is not None:
+        for key, (i, j) in _TENSOR_KEYS.items():
+            tensor[i, j] = tensor[j, i] = float(moments.attrib[key])
+    mass = float(_part(element, "mass").attrib["value"])
+    return SimpleNamespace(mass=mass, inertia=tensor, origin=_read_origin(element))
+
+
+def _read_joint(element: ElementTree.Element) -> SimpleNamespace:
+    axis, limit, mimic = element.find("axis"), element.find("limit"), element.find("mimic")
+    names = {tag: _part(element, tag).attrib["link"] for tag in ("parent", "child")}
+    said = {} if limit is None else limit.attrib
+    bounds = {key: float(said[key]) if key in said else None for key in _LIMITS}
+    follows = None
+    if mimic is not None:
+        law = {key: float(mimic.get(key, value)) for key, value in (("multiplier", 1.0), ("offset", 0.0))}
+        follows = SimpleNamespace(joint=mimic.get("joint"), **law)
+    return SimpleNamespace(
+        name=element.attrib["name"],
+        type=element.get("type"),
+        origin=_read_origin(element),
+        axis=np.array((axis.get("xyz", "1 0 0") if axis is not None else "1 0 0").split(), float),
+        limit=SimpleNamespace(**bounds),
+        mimic=follows,
+        **names,
+    )
+
+
+def _read_origin(element: ElementTree.Element) -> Array:
+    origin = element.find("origin")
+    given = {} if origin is None else origin.attrib
+    return transform_from_xyz_rpy(*([float(x) for x in given.get(key, "0 0 0").split()] for key in ("xyz", "rpy")))
+
+
+def _part(element: ElementTree.Element, tag: str) -> ElementTree.Element:
+    if (part := element.find(tag)) is None:
+        raise KeyError(tag)
+    return part
+
+
 def _check_numbers(robot: ElementTree.Element, where: str) -> None:
-    """Refuse missing, surplus or invalid numbers, which the URDF reader would silently replace."""
+    """Refuse missing, surplus or invalid numbers."""
     for owner in robot:
         if owner.tag not in ("link", "joint"):
             continue
@@ -258,9 +306,7 @@ def _mimicked(robot: Any, wanted: Collection[str] | None, locked: dict[str, floa
         if wanted is None or mimic.joint in wanted:
             what = "%s: joint '%s' follows '%s'; couplings are not modelled, so it is locked"
             log.warning(what, where, name, mimic.joint)
-        factor = 1.0 if mimic.multiplier is None else float(mimic.multiplier)
-        offset = 0.0 if mimic.offset is None else float(mimic.offset)
-        locked[name] = factor * _locked_value(joints[mimic.joint], locked) + offset
+        locked[name] = mimic.multiplier * _locked_value(joints[mimic.joint], locked) + mimic.offset
     return set(following)
 
 
@@ -270,7 +316,7 @@ def _check_tree(robot: Any, where: str, wanted: Sequence[str]) -> str:
         if joint.type not in _MOVABLE_JOINT_TYPES | {"fixed"}:
             allowed = "revolute, continuous, prismatic, fixed"
             raise ModelError(f"joint '{joint.name}' has type '{joint.type}'", where=where, allowed=allowed)
-        if joint.type in _MOVABLE_JOINT_TYPES and joint.axis is not None and np.linalg.norm(joint.axis) < 1e-9:
+        if joint.type in _MOVABLE_JOINT_TYPES and np.linalg.norm(joint.axis) < 1e-9:
             allowed, hint = "an axis other than 0 0 0", "leave the axis out where it is x, or make the joint fixed"
             raise ModelError(f"joint '{joint.name}' has a zero axis", where=where, allowed=allowed, hint=hint)
     known = [joint.name for joint in robot.joints if joint.type in _MOVABLE_JOINT_TYPES]
@@ -310,35 +356,29 @@ def _walk(
         frames[link] = (carrier, at, parent)
         inertial = links[link]
         if inertial is not None and inertial.mass:
-            tensor = np.zeros((3, 3)) if inertial.inertia is None else np.asarray(inertial.inertia, float)
             if carrier is not None:
-                _check_bodies(link, tensor, where)
-            body = Inertia.from_values(float(inertial.mass), np.zeros(3), tensor)
-            place = Placement.from_matrix(at @ _origin(inertial))
-            bodies[link] = body.transformed_by(place)
+                _check_bodies(link, inertial.inertia, where)
+            body = Inertia.from_values(inertial.mass, np.zeros(3), inertial.inertia)
+            bodies[link] = body.transformed_by(Placement.from_matrix(at @ inertial.origin))
         for joint in robot.joints:
             if joint.parent != link or joint.child in dropped:
                 continue
             if joint.name in kept:
-                joints[joint.name] = (carrier, at @ _origin(joint), joint)
+                joints[joint.name] = (carrier, at @ joint.origin, joint)
                 stack.append((joint.child, joint.name, np.eye(4), ""))
             else:
-                stack.append((joint.child, carrier, at @ _origin(joint) @ _locked_motion(joint, locked), link))
+                stack.append((joint.child, carrier, at @ joint.origin @ _locked_motion(joint, locked), link))
     loose = sorted(set(links) - set(frames) - dropped)
     if loose:
         raise ModelError(f"link '{loose[0]}' does not hang on '{root}'", where=where, allowed="one tree")
     return joints, bodies, frames
 
 
-def _origin(element: Any) -> Array:
-    return np.eye(4) if element.origin is None else np.asarray(element.origin, float)
-
-
 def _joint(source: Any, parent: int, placement: Placement, bodies: tuple[Inertia, ...]) -> Joint:
     x, y, z = map(float, snap_near_integer_entries(_unit_axis(source)))
 
     def bound(key: str, otherwise: float) -> float:
-        value = getattr(source.limit, key, None)
+        value = getattr(source.limit, key)
         return otherwise if value is None or abs(value) >= _UNLIMITED_VALUE else float(value)
 
     limits = bound("lower", -math.inf), bound("upper", math.inf)
@@ -360,9 +400,8 @@ def _locked_motion(joint: Any, locked: Mapping[str, float]) -> Array:
 
 def _locked_value(joint: Any, locked: Mapping[str, float]) -> float:
     """Coordinate at which a joint is locked: as given, else zero or the nearest bound."""
-    limit = joint.limit
-    low = -math.inf if limit is None or limit.lower is None else float(limit.lower)
-    high = math.inf if limit is None or limit.upper is None else float(limit.upper)
+    low = -math.inf if joint.limit.lower is None else joint.limit.lower
+    high = math.inf if joint.limit.upper is None else joint.limit.upper
     if joint.type == "continuous" or low > high:
         low, high = -math.inf, math.inf
     return locked.get(joint.name, min(max(0.0, low), high))
@@ -381,8 +420,7 @@ def _with_all_below(excluded: Sequence[str], robot: Any, where: str) -> set[str]
 
 
 def _unit_axis(joint: Any) -> Array:
-    axis = np.asarray([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, float)
-    return axis / np.linalg.norm(axis)
+    return np.asarray(joint.axis / np.linalg.norm(joint.axis))
 
 
 def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
@@ -432,7 +470,7 @@ def _write_link(robot: ElementTree.Element, name: str, joint: Joint) -> None:
 
 
 def _write_joint(robot: ElementTree.Element, joint: Joint, parent: str, child: str) -> None:
-    values = {key: getattr(joint, f"{key}_limit") for key in ("lower", "upper", "effort", "velocity")}
+    values = {key: getattr(joint, f"{key}_limit") for key in _LIMITS}
     limits = {key: _digits([max(-_UNLIMITED_VALUE, min(value, _UNLIMITED_VALUE))]) for key, value in values.items()}
     kind: str = joint.kind
     if kind == "revolute" and math.isinf(joint.lower_limit) and math.isinf(joint.upper_limit):

@@ -92,7 +92,7 @@ def _is_plotly_script(path: Path) -> bool:
 @functools.cache
 def _packed_script() -> str:
     """Plotly's script as text that the page unpacks: a third of its size."""
-    small = gzip.compress(_plotly_script()[1].encode(), compresslevel=6, mtime=0)
+    small = gzip.compress(_plotly_script()[1].encode(), compresslevel=4, mtime=0)
     return base64.b64encode(small).decode("ascii")
 
 
