@@ -131,5 +131,5 @@ def test_every_flag_is_a_key_of_the_section() -> None:
 
     known: Callable[..., object] = build_argument_parser().parse_args
     given = vars(known(["import", "x"]))
-    others = {"command", "run", "file", "out", "preview", "config", "quiet", "json"}
+    others = {"command", "run", "file", "out", "preview", "config", "quiet", "verbose", "json"}
     assert set(given) - others == set(dataclass_options(ImportSettings))
