@@ -54,10 +54,11 @@ static void add_row(double factor, const double *restrict source, int count, dou
     for (int c = 0; c < count; c++) target[c] += factor * source[c];
 }
 
-/* Sizes are steps, NS states, width of a move and NA states and parameters. Of each step the move (NS, width), which is the
- * transition and, behind its NA columns, noise of the states; decay and new variance of the parameters (NA - NS); and of its
- * rows, from row_start on, the observation (rows, NA). Written are the inverse roots of the innovations' covariances, one
- * after another, and the projected covariances (rows, NA); the covariance (NA, NA) is given and renewed. */
+/* Sizes are steps, NS states, width of a move, NA states and parameters, and NK. Of each step the move (NS, width), which is
+ * the state rows of the transition and, behind their NK columns, noise of the states; decay and new variance of the
+ * parameters (NA - NS); and of its rows, from row_start on, the observation (rows, NA). Written are the inverse roots of the
+ * innovations' covariances, one after another, and the projected covariances (rows, NA); the covariance (NA, NA) is given
+ * and renewed. */
 typedef struct {
     const int *size, *row_start;
     const double *move, *decay, *variance, *observation;
@@ -95,38 +96,40 @@ static void measure(const double *H, int r, int na, double *whitening, double *p
     add_product(-1.0, (Matrix){projected, 1, na}, (Matrix){projected, na, 1}, na, r, na, 0, P, na, panel);
 }
 
-/* The transition of step s, P renewed; room for 2 NS NA + NA NA numbers. */
+/* The transition of step s, P renewed; room for NS NA + NA NA numbers. */
 static void predict(const Filter *f, int s, double *P, double *room, double *panel) {
-    const int ns = f->size[1], width = f->size[2], na = f->size[3], np = na - ns, nv = width - na;
+    const int ns = f->size[1], width = f->size[2], na = f->size[3], nk = f->size[4], np = na - ns, m = nk - ns;
     const double *M = f->move + (size_t)s * ns * width, *decay = f->decay + s * np, *variance = f->variance + s * np;
-    double *X = room, *own = X + (size_t)ns * na, *all = own + (size_t)ns * na;
+    double *X = room, *all = X + (size_t)ns * na;
     int used[na + 1], count = 0; /* states, and parameters that anything else is correlated with */
     for (int i = 0; i < na; i++) {
         int known = i < ns;
         for (int j = 0; j < na; j++) known |= i != j && P[(size_t)i * na + j] != 0;
         if (known) used[count++] = i;
     }
-    for (int i = 0; i < ns; i++)
-        for (int j = 0; j < count; j++) own[i * count + j] = M[(size_t)i * width + used[j]];
-    for (int i = 0; i < count; i++)
-        for (int j = 0; j < count; j++) all[i * count + j] = P[(size_t)used[i] * na + used[j]];
-    /* X = M P, then P = X M' */
+    /* X = M P, then P = X M'; parameters of the same slopes are added up */
+    memset(all, 0, sizeof(double) * nk * count);
+    for (int i = 0; i < na; i++) {
+        double *own = all + (size_t)(i < ns ? i : ns + (i - ns) % m) * count;
+        for (int j = 0; j < count; j++) own[j] += P[(size_t)i * na + used[j]];
+    }
     memset(X, 0, sizeof(double) * ns * na);
-    add_product(1.0, (Matrix){own, count, 1}, (Matrix){all, count, 1}, ns, count, count, 0, X, na, panel);
+    add_product(1.0, (Matrix){M, width, 1}, (Matrix){all, count, 1}, ns, nk, count, 0, X, na, panel);
     for (int i = 0; i < ns; i++) {
         double *row = X + (size_t)i * na;
         for (int p = na - 1, j = count - 1; p >= ns; p--)
-            row[p] = used[j] == p ? row[j--] : M[(size_t)i * width + p] * P[(size_t)p * na + p];
+            row[p] = used[j] == p ? row[j--] : M[(size_t)i * width + ns + (p - ns) % m] * P[(size_t)p * na + p];
         memset(P + (size_t)i * na, 0, sizeof(double) * ns);
         for (int p = ns; p < na; p++) P[(size_t)i * na + p] = P[(size_t)p * na + i] = row[p] * decay[p - ns];
+        for (int p = nk; p < na; p++) row[ns + (p - ns) % m] += row[p];
     }
     for (int p = 0; p < np; p++) {
         double *row = P + (size_t)(ns + p) * na + ns;
         for (int q = 0; q < np; q++) row[q] *= decay[p] * decay[q];
         row[p] += variance[p];
     }
-    add_product(1.0, (Matrix){X, na, 1}, (Matrix){M, 1, width}, ns, na, ns, 1, P, na, panel);
-    add_product(1.0, (Matrix){M + na, width, 1}, (Matrix){M + na, 1, width}, ns, nv, ns, 1, P, na, panel);
+    add_product(1.0, (Matrix){X, na, 1}, (Matrix){M, 1, width}, ns, nk, ns, 1, P, na, panel);
+    add_product(1.0, (Matrix){M + nk, width, 1}, (Matrix){M + nk, 1, width}, ns, width - nk, ns, 1, P, na, panel);
     for (int i = 0; i < ns; i++)
         for (int j = 0; j < i; j++) P[(size_t)j * na + i] = P[(size_t)i * na + j];
 }
@@ -134,7 +137,7 @@ static void predict(const Filter *f, int s, double *P, double *room, double *pan
 /* Whether the steps were taken; not where there is too little memory. */
 int yid_kalman_steps(const Filter *f) {
     const int na = f->size[3];
-    int most = f->size[2];
+    int most = f->size[2] > na ? f->size[2] : na;
     for (int s = 0; s < f->size[0]; s++)
         if (f->row_start[s + 1] - f->row_start[s] > most) most = f->row_start[s + 1] - f->row_start[s];
     double *room = malloc(sizeof(double) * most * (3 * (size_t)most + COLUMNS)), *whitening = f->whitening;

@@ -28,21 +28,28 @@ from yid_ocp.integrator.step_model import out_of_memory_error
 
 @dataclass(frozen=True)
 class FilterStateTransition:
-    """Transition x' = (M x, f p) of the state x = (s, p)."""
+    """Transition x' = (M (s, p1 + ... + pg), f p) of the state x = (s, p), p being g groups of equal slopes."""
 
-    state_rows: Array  # M, shape (ns, nx)
-    decay: Array  # f, shape (nx - ns,)
+    state_rows: Array  # M, shape (ns, ns + m)
+    decay: Array  # f, shape (nx - ns,), nx - ns = g m
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        m = self.state_rows.shape[1] - len(self.state_rows)
+        return len(self.decay) // m if m else 0, m
 
     def propagate_state(self, columns: Array) -> Array:
         """States after the step, from those before it, as columns (nx, c)."""
-        return np.vstack([self.state_rows @ columns, self.decay[:, None] * columns[len(self.state_rows) :]])
+        ns, rows, own = len(self.state_rows), self.state_rows, columns[len(self.state_rows) :]
+        together = own.reshape(*self._shape, own.shape[1]).sum(axis=0)
+        return np.vstack([rows[:, :ns] @ columns[:ns] + rows[:, ns:] @ together, self.decay[:, None] * own])
 
     def _propagate_costate_back(self, costate: Array) -> Array:
         """Costates before the step, from those after it, by the transposed map, as columns (nx, c)."""
         ns = len(self.state_rows)
         earlier = self.state_rows.T @ costate[:ns]
-        earlier[ns:] += self.decay[:, None] * costate[ns:]
-        return earlier
+        apart = np.tile(earlier[ns:], (self._shape[0], 1)) + self.decay[:, None] * costate[ns:]
+        return np.vstack([earlier[:ns], apart])
 
 
 @dataclass(frozen=True)
@@ -110,27 +117,33 @@ def _library() -> ctypes.CDLL | None:
 
 
 def kalman_steps_and_covariance(
-    covariance: Array, observation: Array, row_start: Sequence[int], moves: Array, decay: Array, variance: Array
+    covariance: Array,
+    observation: Array,
+    row_start: Sequence[int],
+    moves: Array,
+    noises: int,
+    decay: Array,
+    variance: Array,
 ) -> tuple[list[KalmanStep], Array]:
     """Filter steps with fixed gains one after another, and the covariance after them; in compiled code where possible.
 
-    `moves` (k, ns, nx + c) are the state rows of k steps' transitions and, beside them, what c unit noises add to the
-    states; `decay` (k, nx - ns) is that of the parameters, `variance` (k, nx - ns) that of their process noise. Rows of
-    the observation (r, nx) stand in the order of the steps, those of step j between `row_start[j]` and the next.
+    `moves` (k, ns, ns + m + c) are the state rows of k steps' transitions and, beside them, what c unit `noises` add to
+    the states; `decay` (k, nx - ns) is that of the parameters, `variance` (k, nx - ns) that of their process noise.
+    Rows of the observation (r, nx) stand in the order of the steps, those of step j from `row_start[j]` to the next.
     """
     na, ns, library, steps = len(covariance), moves.shape[1], _library(), list[KalmanStep]()
-    spans = [slice(*ends) for ends in pairwise(row_start)]
-    transitions = [FilterStateTransition(move[:, :na], own) for move, own in zip(moves, decay, strict=True)]
+    spans, known = [slice(*ends) for ends in pairwise(row_start)], moves.shape[2] - noises
+    transitions = [FilterStateTransition(move[:, :known], own) for move, own in zip(moves, decay, strict=True)]
     if library is None:
         parameters = np.arange(ns, na)
         for k, (span, transition) in enumerate(zip(spans, transitions, strict=True)):
             step, covariance, _ = kalman_step_and_covariance(covariance, observation[span], transition)
             steps.append(step)
             covariance[parameters, parameters] += variance[k]
-            covariance[:ns, :ns] += moves[k, :, na:] @ moves[k, :, na:].T
+            covariance[:ns, :ns] += moves[k, :, known:] @ moves[k, :, known:].T
             covariance = 0.5 * (covariance + covariance.T)
         return steps, covariance
-    size, squares = np.array([*moves.shape, na], np.int32), [(span.stop - span.start) ** 2 for span in spans]
+    size, squares = np.array([*moves.shape, na, known], np.int32), [(span.stop - span.start) ** 2 for span in spans]
     white, projected, covariance = np.empty(sum(squares)), np.empty_like(observation), covariance.copy()
     arrays: list[NDArray[Any]] = [size, np.array(row_start, np.int32)]
     arrays += [*map(np.ascontiguousarray, (moves, decay, variance, observation)), white, projected, covariance]

@@ -171,7 +171,7 @@ def _build_whitening_filter(course: NominalTrajectory, errors: InputErrorModel) 
     # behind the last node nothing moves
     rows, none = rows_of_node[-1], np.zeros((len(rows_of_node[-1]), nu))
     observe = np.hstack([slopes.by_state[:, rows].sum(axis=0), none, none])
-    transition = FilterStateTransition(np.eye(len(kept), len(first)), np.ones(2 * nu))
+    transition = FilterStateTransition(np.eye(len(kept), len(kept) + nu), np.ones(2 * nu))
     kalman, covariance, _ = kalman_step_and_covariance(covariance, observe, transition)
     spread = np.sqrt(np.maximum(np.diag(covariance)[len(kept) + nu :], 0.0))
     return WhiteningFilter((*made, _FilterStep(rows, kalman, none)), errors, first, live, spread)
@@ -191,17 +191,17 @@ def _filter_steps(
     fresh = np.append(np.diff(errors.sample_of_step) != 0, False)[:, None]
     decay = np.hstack([np.repeat(1.0 - fresh, nu, axis=1), np.ones((count, nu))])
     variance = np.hstack([fresh * errors.torque_std**2, np.zeros((count, nu))])
-    inputs, feedback = np.tile(np.eye(nu), (count, 1, 2)), course.tracking_feedback
+    inputs, feedback = np.tile(np.eye(nu), (count, 1, 1)), course.tracking_feedback
     if errors.has_encoder_measurements:
         feedback = None
     elif feedback is not None:
         # what torques of the step before add to the momenta that the filter follows
         momentum = course.model_functions.reference_momentum_shift.momentum_derivative_by_previous_torque(course.theta)
-        known = applied_torque_by_torque_error(feedback.gain, momentum)
+        driving = applied_torque_by_torque_error(feedback.gain, momentum)
         # an error of the angles that the filter follows; that of the momenta as their slope averages out
         shaken = feedback.gain[:, :, :nu] * errors.angle_std * np.sqrt(errors.encoder_noise_steps)
-        inputs = np.concatenate([known, known, shaken], axis=2)
-    na, nx = len(covariance), course.rollout.state.shape[1]
+        inputs = np.concatenate([driving, shaken], axis=2)
+    na, nx, known = len(covariance), course.rollout.state.shape[1], ns + nu
     columns = np.concatenate([kept, np.arange(nx, nx + inputs.shape[2])])
     ordered = slopes.select_residual_rows(np.concatenate(rows_of_node))
     (before, after), by_effort = ordered.by_state, ordered.by_effort.sum(axis=0)
@@ -213,12 +213,14 @@ def _filter_steps(
         starts = (starts - starts[0]).tolist()
         observe, by_torque = np.zeros((starts[-1], na)), np.zeros((starts[-1], nu))
         for k, rows in enumerate(slice(*pair) for pair in pairwise(starts)):
-            observe[rows] = after[own][rows] @ move[k, :, :na]
-            by_torque[rows] = observe[rows, ns : ns + nu]
+            observe[rows, :known] = after[own][rows] @ move[k, :, :known]
+            by_torque[rows] = observe[rows, ns:known]
             if by_effort.shape[1]:
-                observe[rows] += by_effort[own][rows] @ effort[k, : by_effort.shape[1]][:, columns[:na]]
+                observe[rows, :known] += by_effort[own][rows] @ effort[k, : by_effort.shape[1]][:, columns[:known]]
+        observe[:, known:] = observe[:, ns:known]
         observe[:, :ns] += before[own]
-        steps, covariance = kalman_steps_and_covariance(covariance, observe, starts, move, decay[span], variance[span])
+        noise = (inputs.shape[2] - nu, decay[span], variance[span])
+        steps, covariance = kalman_steps_and_covariance(covariance, observe, starts, move, *noise)
         made += map(_FilterStep, rows_of_node[span], steps, np.split(by_torque, starts[1:-1]))
     return made, covariance
 
