@@ -405,11 +405,13 @@ def _by_joint(data: _Data) -> Iterator[Issue]:
             words = f"efforts are about {scale:.2g} times what gravity and motion need"
             advice = f"divide efforts by {1 / common:g}, if their unit is another"
             yield _issue("effort_gain", words, max(scale, 1 / scale) / factor, advice)
+            common = 1.0  # said; each joint is compared with the others
     turned = sound & (fit.inverse < -_MIN_Z * fit.std / 2) & (fit.inverse < -0.3)
     yield from _signs(arm, fit, turned, told & (fit.inverse > _MIN_Z * fit.std / 2) & (fit.inverse > 0.3))
     for j in np.flatnonzero(sound & ~turned):
-        inverse, off = float(fit.inverse[j]), abs(float(fit.inverse[j]) - 1) / float(fit.std[j])
-        strong = 0 < inverse < 1 / factor and fit.direct[j] > factor and not loaded[j]
+        inverse = common * float(fit.inverse[j])
+        off = abs(inverse - 1) / (common * float(fit.std[j]))
+        strong = 0 < inverse < 1 / factor and fit.direct[j] / common > factor and not loaded[j]
         if off > _MIN_Z and (inverse > factor or strong):
             words = f"the effort of {names[j]} is {1 / inverse:.2g} times what gravity and motion need"
             yield _issue("effort_gain", words, off / _MIN_Z, "find out what the number stands for", names[j])
