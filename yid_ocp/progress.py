@@ -15,9 +15,8 @@ class Progress:
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Report that a new stage of the work begins.
 
-        `work` is the time that it usually takes and `ahead` that of all stages after it, on one scale [s]; `work` is
-        zero where the time that it takes says nothing of those after it, as where it may compile, and is then a part
-        of `ahead`. What was ahead becomes less by `work` where `ahead` is absent.
+        `work` is the time that it usually takes, `ahead` that of all stages after it, on one scale [s]. A stage whose
+        time says nothing of those after it (it may compile) is a part of `ahead`; absent, that falls by `work`.
         """
 
     def report_iterate(self, entry: Any) -> None:

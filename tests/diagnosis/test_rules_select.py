@@ -282,7 +282,7 @@ class Rounds:
 
     def __init__(self, monkeypatch, losses, p_values=(1e-9,) * 3, **how):
         self.losses, self.refits, self.screens, self.heard = losses, [], [], Heard()
-        usual = {"fails": (), "absent": (), "before": None, "pairs": (), "left": None}
+        usual = {"fails": (), "absent": (), "before": None, "pairs": (), "left": None, "cost": 1.0, "noisy": False}
         vars(self).update(usual | how)
         self.scores = tuple(map(lambda of, p, best: score(of, p=p, decrease=best), EFFECTS, p_values, (9.0, 8.0, 7.0)))
         monkeypatch.setattr(select, "refit_with_each_effect", self.refit_all)
@@ -292,7 +292,7 @@ class Rounds:
     def fit(self, effects):
         known = "".join(sorted(of.kind for of in effects))
         values = {f"{of.label}.a": 0.0 if of.kind in self.absent else 1.0 for of in effects}
-        return fit(effects, loss(*self.losses[known]), values={"k": float(len(effects)), **values})
+        return fit(effects, loss(*self.losses[known]), self.cost, {"k": float(len(effects)), **values})
 
     def screened(self, base=()):
         labels = {of.label for of in base}
@@ -334,7 +334,8 @@ class Rounds:
 
     def compose(self, moved=False, deadline=math.inf, **limits):
         search = self.search = RefitContext(SimpleNamespace(), Thresholds(**limits), self.heard, deadline=deadline)
-        nominal = fit((), loss(*self.losses[""]), values={"k": 0.0})
+        problem = SimpleNamespace(has_process_noise=self.noisy)
+        nominal = fit((), loss(*self.losses[""]), self.cost, {"k": 0.0}, problem=problem)
         first, added = select_effects(search, nominal, self.screened(), moved=moved)
         return [f.effects[0].kind for f in first], [entry.effect.kind for entry in added], added
 
@@ -372,6 +373,27 @@ def test_what_looks_alike_and_was_not_tried_stays_beside_what_was_added(monkeypa
     monkeypatch.setattr(select, "refit_with_each_effect", first_alone)
     [entry] = rounds.compose(deadline=0.0)[2]
     assert [of.kind for of in entry.equivalent_effects] == ["a", "b"]
+
+
+@cases(
+    "cost, left_by_a, noisy, goes_on",
+    {
+        "less than three quarters": (5.9, 2.2, False, False),
+        "three quarters": (5.8, 2.2, False, True),
+        "half of the gap is closed": (5.9, 2.0, False, True),
+        "noise of torques": (5.9, 2.2, True, True),
+    },
+)
+def test_where_neither_one_effect_nor_two_promise_to_explain_a_gap_no_pair_is_refitted(
+    monkeypatch, cost, left_by_a, noisy, goes_on
+):
+    """The best second one promises 8 of r'r, a pair 7; the excess over the one residual there is is 2 cost - 1."""
+    losses = {"": (3.0, 3.2), "a": (left_by_a, left_by_a), "b": (2.9, 3.1), "c": (2.9, 3.1), "bc": (2.9, 3.1)}
+    rounds = Rounds(monkeypatch, losses, cost=cost, noisy=noisy, pairs=[("b", "c")])
+    _, chosen, _ = rounds.compose()
+    assert chosen == ["a"]
+    assert [kinds for kinds, *_ in rounds.screens] == [["a"]]
+    assert (len(rounds.refits) > 1) is goes_on
 
 
 def test_where_a_fit_has_left_an_earlier_run_candidates_are_tried_from_there_too(monkeypatch):

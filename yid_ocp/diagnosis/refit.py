@@ -335,8 +335,7 @@ def refit_with_each_effect(
     """Refit the model with each of several effects or pairs added to those of `base`; return the refits that succeed.
 
     Each of those `tried` stands beside the parameters at which it begins, `values` is where all other unknowns begin,
-    and `where` says so in the store if the same effects are refitted from elsewhere too. What the context's deadline
-    leaves no time for is noted there.
+    and `where` says so in the store if the same effects are refitted from elsewhere too.
     """
     if not tried:
         return []

@@ -268,6 +268,8 @@ def select_effects(
             p_value = bonferroni_min_p_value(screened.candidate_scores)
             if _little_is_left(current, limits) and p_value >= limits.candidate_gap_significance_level:
                 break
+            if len(base) == 1 and _futile([nominal, current, *first], alone, screened, limits):
+                break
         shortlist = _refit_shortlist(screened, limits, base, places)
         fits = refit_with_each_effect(search, base, shortlist, current.values)
         if moved and not base and not search.skip_if_late("candidates from the earlier run's parameters"):
@@ -308,6 +310,20 @@ def select_effects(
         [own] = kept
         first = (own.refitted_model, *(fit for fit in first if fit.effects[0].label != own.effect.label))
     return first, kept
+
+
+def _futile(fits: Sequence[RefittedModel], alone: ScreeningResult, rest: ScreeningResult, limits: Thresholds) -> bool:
+    """Whether no refit closes half of the gap and no two effects promise to explain it; never beside torque noise."""
+    nominal, current, *tried = fits
+    best = held_out_gap_closure(nominal.held_out_loss, min(tried, key=_chi2).held_out_loss)
+    if nominal.problem.has_process_noise or not best.fraction < 0.5:
+        return False
+    *_, pair = next(
+        iter(alone.joint_score_model.ranked_pairs([s.effect.label for s in alone.candidate_scores])), (0.0,)
+    )
+    second = max((score.predicted_chi2_decrease for score in rest.candidate_scores), default=0.0)
+    promised = max(pair, 2 * (nominal.cost - current.cost) + second)
+    return promised < limits.min_explained_fraction * (2 * nominal.cost - len(nominal.evaluation.residual))
 
 
 def _pairs_to_refit(screened: ScreeningResult, limits: Thresholds, without: EffectBase) -> list[_Start]:

@@ -58,9 +58,7 @@ class Thresholds(SmootherThresholds):
     restart_gain: Annotated[float, Gt(0), Lt(1), OptionInfo("part of the excess explained by a refit tried again")] = (
         0.2
     )
-    budget: Annotated[
-        float | None, Gt(0), OptionInfo("time after which no refit begins; no limit when absent", "s")
-    ] = None
+    budget: Annotated[float | None, Gt(0), OptionInfo("time from which on no refit begins", "s")] = None
     # which effects are added
     max_effects: Annotated[int, Ge(1), Le(10), OptionInfo("how many effects may be added")] = 3
     min_z: Annotated[float, Ge(0), OptionInfo("standard deviations from neutral below which no effect is kept")] = 2.0

@@ -105,29 +105,25 @@ _MAX_TABLE_ROWS = 10  # results that are shown beside the bar on a terminal
 _MIN_ESTIMATE_TIME = 2.0  # time that a stage has to last before the rest of it is guessed [s]
 _USUAL_IMPORT_TIME = 1.6  # of a command at the pace in which stages say what they take [s]
 _USUAL_ITERATIONS = 20  # of a search, from its start to its end
-_MIN_REST_RATIO = 1.25  # what is left at least over what a stage has lasted whose length says nothing
-_MAX_PACE_RATIO = 4.0  # how much a stage that is done may differ in pace from those before it
 
 
 class _RemainingTime:
     """Time left: of a command whose stages say what they usually take, else of a stage whose parts are counted.
 
-    The pace, time spent over time usually spent, is that of the command's imports and of the stages so far, each
-    counting half as much as the one after it; one that is not done counts where it lasts longer than expected.
+    The pace, time spent over usual time, is that of imports and stages so far, each counting half as much as the next.
     """
 
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
         self._spent = min(max(import_time, _USUAL_IMPORT_TIME / 4), _USUAL_IMPORT_TIME * 32)
         self._usual, self._work, self._ahead = _USUAL_IMPORT_TIME, 0.0, math.nan
-        self._begun, self._n_iterates = time.monotonic(), 0
+        self._begun, self.n_iterates = time.monotonic(), 0
         self._first: tuple[int, float] | None = None
 
     def begin_stage(self, work: float, ahead: float | None) -> None:
         now = time.monotonic()
         if self._work > 0:
             as_before = self._work * self._spent / self._usual
-            most, least = as_before * _MAX_PACE_RATIO, as_before / _MAX_PACE_RATIO
-            self._spent = self._spent / 2 + min(max(now - self._begun, least), most)
+            self._spent = self._spent / 2 + min(max(now - self._begun, as_before / 4), 4 * as_before)
             self._usual = self._usual / 2 + self._work
         # only a stage that is a part of what is ahead says that those after it are planned
         if ahead is not None and (work == 0 or not math.isnan(self._ahead)):
@@ -136,10 +132,7 @@ class _RemainingTime:
             self._ahead = max(self._ahead - work, 0.0)
         if work > 0 or self._work > 0:
             self._begun = now
-        self._work, self._n_iterates, self._first = work, 0, None
-
-    def count_iterate(self) -> None:
-        self._n_iterates += 1
+        self._work, self.n_iterates, self._first = work, 0, None
 
     def of_command(self) -> str:
         """Text of the time left until the command's end; empty where its stages do not say what they take."""
@@ -149,11 +142,11 @@ class _RemainingTime:
     def seconds_left(self) -> float:
         spent, pace = time.monotonic() - self._begun, self._spent / self._usual
         if self._work == 0:
-            return max(self._ahead * pace, _MIN_REST_RATIO * spent)
+            return max(self._ahead * pace, 1.25 * spent)  # longer than expected: as long again, and more
         expected = self._work * pace
-        if self._n_iterates:
-            expected = spent * (_USUAL_ITERATIONS + 1) / (self._n_iterates + 1)
-        if self._n_iterates or spent > expected:
+        if self.n_iterates:
+            expected = spent * (_USUAL_ITERATIONS + 1) / (self.n_iterates + 1)
+        if self.n_iterates or spent > expected:
             pace = (self._spent / 2 + max(spent, expected)) / (self._usual / 2 + self._work)
         # what has lasted longer than expected goes on for as long again as it is beyond that
         return abs(expected - spent) + self._ahead * pace
@@ -194,7 +187,7 @@ class StderrLogLinesProgress(Progress):
 
     def report_iterate(self, entry: Iterate) -> None:
         """Print a line for the accepted point."""
-        self._left.count_iterate()
+        self._left.n_iterates += 1
         print(f"  {_format_iterate(entry)}", file=sys.stderr, flush=True)
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
@@ -222,7 +215,7 @@ class _BarProgress(Progress):
         self._task = self._bars.add_task(text, total=None)
 
     def report_iterate(self, entry: Iterate) -> None:
-        self._left.count_iterate()
+        self._left.n_iterates += 1
         if self._task is not None:
             self._bars.update(self._task, description=f"{_format_iterate(entry)} ({self._text})")
             if self._is_verbose:
@@ -253,32 +246,27 @@ def stderr_progress_display(arguments: argparse.Namespace) -> Iterator[Progress]
     elif not terminal:
         yield StderrLogLinesProgress(import_time)
     else:
-        with _terminal_bars(import_time, arguments.verbose) as progress:
+        from rich.console import Console, RenderableType
+        from rich.progress import BarColumn, ProgressColumn
+        from rich.progress import Progress as Bars
+        from rich.text import Text
+
+        console, left, table = Console(stderr=True), _RemainingTime(import_time), list[str]()
+
+        class TimesAndStage(ProgressColumn):
+            def render(self, task: rich.progress.Task) -> Text:
+                text = Text(
+                    f"{_format_duration(task.elapsed or 0.0)}{left.of_command()}: {task.description}", no_wrap=True
+                )
+                text.truncate(max(console.width - _BAR_WIDTH - 2, 1), overflow="ellipsis")
+                return text
+
+        class BarsBelowTable(Bars):
+            def get_renderables(self) -> Iterator[RenderableType]:
+                yield from (*map(Text, table), *super().get_renderables())
+
+        columns = (BarColumn(_BAR_WIDTH), TimesAndStage())
+        with BarsBelowTable(*columns, console=console, transient=True) as bars:
+            progress = _BarProgress(bars, left, table, arguments.verbose)
             yield progress
-
-
-@contextlib.contextmanager
-def _terminal_bars(import_time: float, is_verbose: bool) -> Iterator[Progress]:
-    """Context manager for bars, of which nothing but the lines of finished stages stays on the terminal."""
-    from rich.console import Console, RenderableType
-    from rich.progress import BarColumn, ProgressColumn
-    from rich.progress import Progress as Bars
-    from rich.text import Text
-
-    console, left, table = Console(stderr=True), _RemainingTime(import_time), list[str]()
-
-    class TimesAndStage(ProgressColumn):
-        def render(self, task: rich.progress.Task) -> Text:
-            text = Text(f"{_format_duration(task.elapsed or 0.0)}{left.of_command()}: {task.description}", no_wrap=True)
-            text.truncate(max(console.width - _BAR_WIDTH - 2, 1), overflow="ellipsis")
-            return text
-
-    class BarsBelowTable(Bars):
-        def get_renderables(self) -> Iterator[RenderableType]:
-            yield from (*map(Text, table), *super().get_renderables())
-
-    columns = (BarColumn(_BAR_WIDTH), TimesAndStage())
-    with BarsBelowTable(*columns, console=console, transient=True) as bars:
-        progress = _BarProgress(bars, left, table, is_verbose)
-        yield progress
-        progress.finish_stage()
+            progress.finish_stage()
