@@ -74,7 +74,7 @@ def identifiable_cable_parameter_names(cable: CableTopology, options: CableOptio
     names: list[str] = []
     for name in cable.vertex_names_by_branch:
         names += [f"{name}.bend", f"{name}.twist", f"{name}.damping"]
-        if options.branches.get(name, options.default_branch).separate_twist_damping:
+        if options.branch_properties.get(name, options.default_branch).separate_twist_damping:
             names.append(f"{name}.twist_damping")
         if options.shape_memory_fraction is not None:
             names.append(f"{name}.memory")
@@ -218,7 +218,7 @@ def parameters(cable: CableTopology, x: Any, covariance: Any, names: tuple[str, 
         branch, _, quantity = name.partition(".")
         result[name] = {"value": float(x[i]), "std": float(covariance[i, i]) ** 0.5}
         if branch in cable.vertex_names_by_branch and quantity in units:
-            weight = OPTIONS.branches.get(branch, OPTIONS.default_branch).linear_density * GRAVITY
+            weight = OPTIONS.branch_properties.get(branch, OPTIONS.default_branch).linear_density * GRAVITY
             result[name] |= {"per_weight": float(x[i]) / weight, "per_weight_unit": units[quantity]}
     return result
 

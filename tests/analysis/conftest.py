@@ -42,7 +42,9 @@ def golden_problem(golden, paper_systems, single_step, dual_step):
             names, seen = [f"w_T{i + 1}" for i in free], trep.w[at - 1][:, free]
             groups.append(PointGroup("points_camera", names, t[at], seen, 5e-3, sensor="camera", pose=np.eye(4)))
         start = np.concatenate([trep.q[0], trep.p[0]])
-        options = ProblemOptions(feedback="proportional", known_initial_states={"golden": start}, path_cutoff=math.inf)
+        options = ProblemOptions(
+            tracking_filter="proportional", known_initial_states={"golden": start}, path_cutoff=math.inf
+        )
         values = dict(zip(STIFFNESSES, map(float, trep.rho), strict=True))
         recording = Recording(joints, tuple(groups), name="golden")
         return EstimationProblem(steps[name], [recording], STIFFNESSES, options, values)

@@ -9,7 +9,7 @@ from small_problems import pendulum_step
 
 from yid_ocp.analysis.discretisation import min_closure_error_by_grasp, step_map_natural_frequencies
 from yid_ocp.analysis.step_diagnostics import (
-    ParameterRowsAndSensorResponse,
+    ParameterDetectability,
     linearise_and_check,
     linearise_step_equations,
     parameter_rows_and_sensor_responses,
@@ -74,37 +74,38 @@ def test_the_twist_of_a_straight_rod_is_seen_by_nobody(hanging, turned):
     twist, bend = found["T1.twist"], found["T1.bend"]
     rows = tuple(f"{row}[T1_{i}_z]" for row in ("del", "p1") for i in range(3))
     assert twist.rows == rows
-    assert twist.seen == ()
-    assert twist.best == ""
+    assert twist.observable_rows == ()
+    assert twist.most_sensitive_sensor == ""
     said = f"T1.twist enters 6 rows ({', '.join(rows)}), none of which a sensor sees to first order."
     assert twist.description.startswith(said)
     assert "moves no reading by a millionth of its standard deviation within 0.6 s" in twist.description
-    assert bend.seen == bend.rows
+    assert bend.observable_rows == bend.rows
     assert "all of which sensors see to first order, points_camera best" in bend.description
     # a rod that hangs straight does not bend: its stiffness moves nothing either
-    assert bend.moved < 1e-6
+    assert bend.max_change_from_rest < 1e-6
 
 
 def test_the_twist_of_a_bent_rod_is_seen_but_not_its_stiffness(hanging):
     """Pulled sideways it bends in one plane, out of which a twist turns it; at rest there is no twist to resist."""
     found, _, _ = judged(hanging(gravity=(3.0, 0.0, -9.0)))
     twist, bend = found["T1.twist"], found["T1.bend"]
-    assert twist.seen == twist.rows
+    assert twist.observable_rows == twist.rows
     assert "all of which sensors see to first order, points_camera best" in twist.description
-    assert twist.moved < 1e-6
-    assert bend.moved > 0.1
-    assert f"one N m/rad more of it moves readings by at most {bend.moved:.2g} standard deviations" in bend.description
+    assert twist.max_change_from_rest < 1e-6
+    assert bend.max_change_from_rest > 0.1
+    change = f"{bend.max_change_from_rest:.2g} standard deviations"
+    assert f"one N m/rad more of it moves readings by at most {change}" in bend.description
 
 
 def test_a_length_changes_readings_directly_and_this_counts(hanging):
     problem = hanging()
     found, rest, _ = judged(problem)
-    assert found["T1.length"].read == ("points_camera",)
-    assert found["T1.bend"].read == ()
+    assert found["T1.length"].directly_dependent_sensors == ("points_camera",)
+    assert found["T1.bend"].directly_dependent_sensors == ()
     assert "the reading of points_camera depends on it directly" in found["T1.length"].description
-    assert found["T1.length"].moved == pytest.approx(moved_by(problem, rest, "T1.length"), rel=1e-6)
+    assert found["T1.length"].max_change_from_rest == pytest.approx(moved_by(problem, rest, "T1.length"), rel=1e-6)
     # the tip goes down by as much, of a standard deviation of 2 mm
-    assert found["T1.length"].moved == pytest.approx(1.0 / STD, rel=1e-6)
+    assert found["T1.length"].max_change_from_rest == pytest.approx(1.0 / STD, rel=1e-6)
 
 
 MODES = pytest.mark.parametrize("swinging", ["driven", "prescribed"], indirect=True)
@@ -159,7 +160,9 @@ def moved_by(problem, rest, name):
 def test_what_a_parameter_moves_is_what_rollouts_say(swinging):
     found, rest, _ = judged(swinging)
     for name in ("elbow.stiffness", "elbow.rest", "elbow.mass", "shoulder.mass", "elbow.damping"):
-        assert found[name].moved == pytest.approx(moved_by(swinging, rest, name), rel=2e-3, abs=2e-4), name
+        assert found[name].max_change_from_rest == pytest.approx(moved_by(swinging, rest, name), rel=2e-3, abs=2e-4), (
+            name
+        )
         assert found[name].unit == swinging.system.parameters[name].unit
 
 
@@ -168,9 +171,9 @@ def test_efforts_of_joints_moved_as_measured_feel_their_own_rows(swinging):
     found, _, _ = judged(swinging)
     damping = found["shoulder.damping"]
     assert damping.rows == ("del[shoulder]", "p1[shoulder]")
-    assert damping.seen == damping.rows
+    assert damping.observable_rows == damping.rows
     if swinging.system.prescribed:
-        assert damping.best == "joints.effort"
+        assert damping.most_sensitive_sensor == "joints.effort"
 
 
 def test_without_sensors_only_rows_are_said(hanging):
@@ -180,8 +183,8 @@ def test_without_sensors_only_rows_are_said(hanging):
     rest = EquilibriumSolver(step).solve(np.zeros(0), theta, None)
     rows = linearise_step_equations(step, rest.state, rest.holding_torque, theta, np.zeros(0))
     found = {e.parameter: e for e in parameter_rows_and_sensor_responses(step, symbols, None, rest.state, theta, rows)}
-    assert found["T1.twist"].seen is None
-    assert found["T1.twist"].moved is None
+    assert found["T1.twist"].observable_rows is None
+    assert found["T1.twist"].max_change_from_rest is None
     assert found["T1.bend"].description == "T1.bend enters 12 rows (6 of del, 6 of p1)."
 
 
@@ -198,20 +201,26 @@ MANY = (*(f"del[{i}]" for i in range(5)), *(f"p1[{i}]" for i in range(4)))
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"rows": MANY, "seen": None}, "k enters 9 rows (5 of del, 4 of p1)."),
-        ({"rows": MANY[:8], "seen": None}, f"k enters 8 rows ({', '.join(MANY[:8])})."),
+        ({"rows": MANY, "observable_rows": None}, "k enters 9 rows (5 of del, 4 of p1)."),
+        ({"rows": MANY[:8], "observable_rows": None}, f"k enters 8 rows ({', '.join(MANY[:8])})."),
         ({}, f"{ROWS}, all of which {SEES}, tip best."),
-        ({"rows": ("del[a]",), "seen": ()}, "k enters 1 row (del[a]), which no sensor sees to first order."),
-        ({"rows": ("del[a]",), "seen": ("del[a]",)}, f"k enters 1 row (del[a]), which {SEES}, tip best."),
-        ({"seen": ("p1[a]",)}, f"{ROWS}, 1 of which {SEES} (p1[a]), tip best."),
-        ({"rows": (), "seen": (), "read": ("tip",)}, f"k enters no row of a step; {READ} depends on it directly."),
-        ({"seen": (), "moved": 0.0}, f"{ROWS}, none of which a sensor sees to first order. {STILL} within 0.5 s."),
-        ({"along": 12.345}, f"{ROWS}, all of which {SEES}, tip best. {ALONG}, to first order."),
-        ({"unit": "1", "moved": 0.25}, f"{ROWS}, all of which {SEES}, tip best. {MOVED} within 0.5 s."),
+        ({"rows": ("del[a]",), "observable_rows": ()}, "k enters 1 row (del[a]), which no sensor sees to first order."),
+        ({"rows": ("del[a]",), "observable_rows": ("del[a]",)}, f"k enters 1 row (del[a]), which {SEES}, tip best."),
+        ({"observable_rows": ("p1[a]",)}, f"{ROWS}, 1 of which {SEES} (p1[a]), tip best."),
+        (
+            {"rows": (), "observable_rows": (), "directly_dependent_sensors": ("tip",)},
+            f"k enters no row of a step; {READ} depends on it directly.",
+        ),
+        (
+            {"observable_rows": (), "max_change_from_rest": 0.0},
+            f"{ROWS}, none of which a sensor sees to first order. {STILL} within 0.5 s.",
+        ),
+        ({"change_along_recordings": 12.345}, f"{ROWS}, all of which {SEES}, tip best. {ALONG}, to first order."),
+        ({"unit": "1", "max_change_from_rest": 0.25}, f"{ROWS}, all of which {SEES}, tip best. {MOVED} within 0.5 s."),
     ],
 )
 def test_words(changes, words):
-    made = ParameterRowsAndSensorResponse("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
+    made = ParameterDetectability("k", "N", ("del[a]", "p1[a]"), ("del[a]", "p1[a]"), "tip", (), None, 0.5)
     assert replace(made, **changes).description == words
 
 

@@ -105,7 +105,7 @@ def made_problem(urdf_folder, feedback, start):
     how = {"sensor": "camera", "pose": np.eye(4)}
     camera = PointGroup("points_camera", ["T1_0_tip"], t[:4] + 0.004, np.zeros((4, 1, 3)), 2e-3, **how)
     step = compile_step(system, 0.01, use_compiler=False)
-    options = ProblemOptions(path_cutoff=math.inf, feedback=feedback, initial_state=start)
+    options = ProblemOptions(path_cutoff=math.inf, tracking_filter=feedback, initial_state=start)
     return EstimationProblem(step, [Recording(joints, (camera,), name="short")], ("T1.bend", "T1.length"), options)
 
 

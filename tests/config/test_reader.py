@@ -97,7 +97,7 @@ METHODS = "compare:\n  methods:\n    gauss_newton: {}\n    multiple_shooting:\n 
         ("model:\n  arms: {joints: left_s0}\n", ["a list"]),
         ("problem:\n  duration: true\n", ["a number"]),
         ("problem:\n  time_step: '0.01'\n", ["a number"]),
-        ("problem:\n  proportional_gains: []\n", ["problem.proportional_gains"]),
+        ("problem:\n  tracking_filter_gains: []\n", ["problem.tracking_filter_gains"]),
         ("description: 2024-01-01\n", ["description"]),
         ("sensors:\n  points: {std: 0}\n", ["above 0"]),
         # unknown keys: the nearest one, and the sections that have it

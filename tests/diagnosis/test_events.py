@@ -224,7 +224,7 @@ def test_a_push_beside_driving_torques_is_an_event_where_the_smoother_finds_a_fo
     arm = joints(JOINTS, t, state, effort=np.vstack([torque, torque[-1:]]), effort_std=0.0, effort_kind="command")
     made = recording(arm, seen(frames, t, place, std=np.full(place.shape, 1e-3)))
     sensors = {"joints.position": SensorOptions(use=False)}
-    options = ProblemOptions(initial_state="equilibrium", feedback="none", sensors=sensors)
+    options = ProblemOptions(initial_state="equilibrium", tracking_filter="none", sensors=sensors)
     problem = EstimationProblem(step, [made], ["shoulder.damping"], options)
     x = solve(problem, GaussNewton()).x
     evaluation = problem.evaluate(x)

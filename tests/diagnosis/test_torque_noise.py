@@ -66,7 +66,7 @@ def recorded(step: Step, seed: int, offset: float | None = None, friction: float
 
 
 def problem_of(step: Step, recordings: list[Recording], held_out: list[Recording] | None = None) -> EstimationProblem:
-    options = ProblemOptions(initial_state="equilibrium", feedback="proportional", proportional_gains=(9.0,))
+    options = ProblemOptions(initial_state="equilibrium", tracking_filter="proportional", tracking_filter_gains=(9.0,))
     return EstimationProblem(step, recordings, FREE, options, None, held_out or [])
 
 
@@ -202,7 +202,7 @@ def geared(step) -> Step:
 
 def weighted_at_truth(geared: Step, recording: Recording, feedback: str) -> EstimationProblem:
     free = (*FREE, *(name for effect in geared.system.effects for name in effect.parameters.names))
-    options = ProblemOptions(initial_state="equilibrium", feedback=feedback, proportional_gains=(9.0,))
+    options = ProblemOptions(initial_state="equilibrium", tracking_filter=feedback, tracking_filter_gains=(9.0,))
     problem = EstimationProblem(geared, [recording], free, options, {"elbow.stiffness": 3.0, "elbow.damping": 0.05})
     return problem_whitened_at(problem, problem.initial_unknowns, rounds=3)
 

@@ -70,7 +70,7 @@ def problem(bench, kinds, *, neutral=False, feedback="none", free=(), **options)
     effects, step = effects_and_step(bench, tuple(kinds), neutral)
     names = tuple(name for effect in effects for name in effect.parameters.names)
     gains = (20.0, 20.0, 10.0)
-    settings = ProblemOptions(**OPEN, feedback=feedback, proportional_gains=gains, **options)
+    settings = ProblemOptions(**OPEN, tracking_filter=feedback, tracking_filter_gains=gains, **options)
     return EstimationProblem(step, [recording(bench)], ("T1.bend", *names, *free), settings)
 
 

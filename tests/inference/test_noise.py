@@ -19,7 +19,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.evaluation import _sensor_whitened_residual
 
 TORQUE, BIAS, ANGLE = 0.3, 0.2, 2e-3
-TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
+TRACKED = {"tracking_filter": "proportional", "tracking_filter_gains": (9.0,)}
 
 
 def problem_of(
@@ -87,7 +87,7 @@ def dense_covariance(problem, x, angle):
     ("how", "effects", "together"),
     [
         ({}, (), True),
-        ({"feedback": {"feedback": "none"}}, (), False),
+        ({"feedback": {"tracking_filter": "none"}}, (), False),
         ({}, (("camera_latency", "camera", {"delay": 0.0137}),), False),
         # the noise of interpolated angles is only as large as white noise makes it
         ({"period": 2, "angle": 1e-9}, (), True),
@@ -117,7 +117,7 @@ def test_innovations_weigh_by_the_covariance_of_all_residuals(urdf_folder, how, 
         {"encoders": True, "period": 2},
         {"encoders": False, "period": 3, "effects": (("camera_latency", "camera", {"delay": 0.0137}),)},
         {"encoders": False, "prescribed": ("elbow",)},
-        {"encoders": True, "feedback": {"feedback": "none"}, "prescribed": ("elbow",), "period": 2},
+        {"encoders": True, "feedback": {"tracking_filter": "none"}, "prescribed": ("elbow",), "period": 2},
         {"encoders": False, "size": 1e4, "angle": 1e-9},
     ],
     ids=["tracked", "encoders", "late", "prescribed", "open_loop", "ill_conditioned"],
@@ -140,7 +140,7 @@ def test_with_encoders_the_outcome_does_not_depend_on_the_tracking_filter(urdf_f
     """Encoders are measurements and the filter only says where to linearise: gains move chi2 by what is not linear."""
     costs = []
     for g in (9.0, gain):
-        feedback = {"feedback": "proportional", "proportional_gains": (g,)}
+        feedback = {"tracking_filter": "proportional", "tracking_filter_gains": (g,)}
         problem = small_gap(problem_of(urdf_folder, encoders=True, feedback=feedback, size=0.1), size=0.1)
         weighted = problem_whitened_at(problem, problem.initial_unknowns)
         rows = problem.residual_rows.data
@@ -198,7 +198,7 @@ def test_a_constant_error_is_seen_and_its_spread_said(urdf_folder):
     assert torque_biases_and_stds_by_recording(problem, problem.initial_unknowns) == [None]
 
 
-@pytest.mark.parametrize("feedback", [TRACKED, {"feedback": "lqr"}], ids=["angles", "angles_and_momenta"])
+@pytest.mark.parametrize("feedback", [TRACKED, {"tracking_filter": "lqr"}], ids=["angles", "angles_and_momenta"])
 def test_a_constant_error_counts_in_what_the_filter_follows_too(urdf_folder, feedback):
     """The momentum of the measured motion is worked out from recorded torques; weights know what their error does."""
     problem = problem_of(urdf_folder, encoders=False, feedback=feedback)

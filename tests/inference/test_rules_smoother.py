@@ -360,7 +360,7 @@ def recorded(system: System, pushed: dict[int, tuple[float, float, float]], seed
 
 def problem_of(system: System, recording: Recording, feedback: Literal["none", "lqr"] = "none") -> EstimationProblem:
     sensors = {"joints.position": SensorOptions(use=False)}
-    options = ProblemOptions(initial_state="equilibrium", feedback=feedback, sensors=sensors)
+    options = ProblemOptions(initial_state="equilibrium", tracking_filter=feedback, sensors=sensors)
     return EstimationProblem(compile_step(system, TIME_STEP), [recording], ("shoulder.damping",), options)
 
 

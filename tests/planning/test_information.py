@@ -24,7 +24,7 @@ OPTIONS = PlanOptions(goal="information", limits=LIMITS, **SIZES)
 
 def problem_of(limited_urdf, free=FREE, **how):
     step = pendulum_step(limited_urdf.parent, **how)
-    options = ProblemOptions(path_cutoff=15.0, feedback="none")
+    options = ProblemOptions(path_cutoff=15.0, tracking_filter="none")
     return EstimationProblem(step, [taken(step, 3, steps=140)], free, options)
 
 

@@ -30,7 +30,7 @@ plan: {point: tip, target_offset: [0.0, 0.15, 0.04], start_joint_positions: {sho
 INFORMATION = """\
   elbow.damping: {free: true}
 recordings: {estimate: [RECORDING]}
-problem: {path_cutoff: 15.0, feedback: none}
+problem: {path_cutoff: 15.0, tracking_filter: none}
 plan:
   {goal: information, duration: 0.8, hold_duration: 0.4, n_spline_coefficients: 3, n_random_starts: 2,
     limits: {max_acceleration: 15.0}}

@@ -12,7 +12,7 @@ from yid_ocp.problem import EstimationProblem, ProblemOptions
 from yid_ocp.problem.measurements import (
     estimated_constant_errors,
     subtract_estimated_biases,
-    whitened_by_constant_errors,
+    whitened_for_sensor_biases,
     whitened_sensitivities_to_unit_biases,
 )
 from yid_ocp.problem.options import SensorOptions
@@ -52,7 +52,7 @@ def test_the_map_is_that_of_generalised_least_squares():
     rng = np.random.default_rng(3)
     slopes, columns = rng.standard_normal((40, 3)) * [0.1, 2.0, 30.0], rng.standard_normal((40, 5))
     covariance = np.eye(40) + slopes @ slopes.T
-    made = whitened_by_constant_errors(slopes, columns)
+    made = whitened_for_sensor_biases(slopes, columns)
     np.testing.assert_allclose(made.T @ made, columns.T @ np.linalg.solve(covariance, columns), rtol=1e-9)
     expected = -slopes.T @ np.linalg.solve(covariance, columns[:, 0])
     found = estimated_constant_errors(slopes, columns[:, 0])

@@ -218,7 +218,7 @@ def driven(urdf_folder):
 
 
 def sprung(step, recording, **options):
-    made = ProblemOptions(feedback="proportional", proportional_gains=(9.0,), **options)
+    made = ProblemOptions(tracking_filter="proportional", tracking_filter_gains=(9.0,), **options)
     return EstimationProblem(step, [recording], ("elbow.stiffness",), made)
 
 

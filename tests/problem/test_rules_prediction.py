@@ -18,8 +18,8 @@ DELAYED = (("effort_delay", "gripper", {"delay": 0.0137}), ("effort_offset", "sh
 SOFT = (("joint_coulomb", "elbow", {"tau_c": 0.05}), ("gravity_tilt", "world", {"rx": 0.03, "ry": 0.02}))
 STICKING = (("joint_presliding", "shoulder", {"tau_c": 0.3, "yield_angle": 0.02}),)
 
-TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
-FILTERED = {"feedback": "lqr"}
+TRACKED = {"tracking_filter": "proportional", "tracking_filter_gains": (9.0,)}
+FILTERED = {"tracking_filter": "lqr"}
 CASES = {
     "free": ((), {}, {}),
     "estimated start": ((), {}, {"initial_state": "estimated"}),
@@ -28,7 +28,7 @@ CASES = {
     "prescribed": (MISREAD + LATE, {"prescribed": ("shoulder",)}, {}),
     "prescribed gears": (GEARS + HEAVY, {"prescribed": ("shoulder",)}, {}),
     "all prescribed": (MISREAD, {"prescribed": PENDULUM}, {}),
-    "driven": (DELAYED + MISREAD, {"driven": ("shoulder",)}, {"feedback": "none"}),
+    "driven": (DELAYED + MISREAD, {"driven": ("shoulder",)}, {"tracking_filter": "none"}),
     "driven, proportional": (MISREAD + GEARS, {"driven": ("shoulder",)}, TRACKED),
     "driven, filtered": (MISREAD + HEAVY + LATE, {"driven": ("shoulder",)}, FILTERED),
     "driven, filtered, both": (MISREAD + HEAVY, {"driven": PENDULUM}, FILTERED),

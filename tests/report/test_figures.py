@@ -15,7 +15,7 @@ from yid_ocp.model.flexible import Segment, flexible_object
 from yid_ocp.model.kinematics import forward_kinematics
 from yid_ocp.model.system import System
 from yid_ocp.report import figures
-from yid_ocp.report.animation import ConfigurationTrajectory, make_animation, recording_animation
+from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories, recording_animation
 from yid_ocp.report.figures import TimeHeatMapRow, TimePlotData, ValueBeforeAfter
 from yid_ocp.report.png_figures import _MAX_SINGLE_LABELS, draw_sparsity_patterns
 
@@ -31,7 +31,7 @@ def point(system: System, name: str, q: np.ndarray) -> np.ndarray:
 
 def animated(system: System, q: np.ndarray):
     told = ConfigurationTrajectory("predicted", system, system.parameters.vector(), np.arange(len(q)), q)
-    return make_animation("a", [told]).motions[0]
+    return animation_of_trajectories("a", [told]).motions[0]
 
 
 def test_places_are_those_of_the_model_and_sticks_its_links(single_arm):
@@ -70,7 +70,7 @@ def test_a_scene_has_what_was_measured_beside_what_was_predicted(single_arm):
     seen[1] = np.nan
     recording = Recording(joints, (PointGroup("camera", ("w_T1",), seldom, seen),), name="a")
     told = ConfigurationTrajectory("predicted", single_arm, single_arm.parameters.vector(), t, q)
-    made = make_animation("a", [told], recording)
+    made = animation_of_trajectories("a", [told], recording)
     assert [motion.name for motion in made.motions] == ["predicted", "measured"]
     assert len(made.t) == 150
     predicted, measured = made.motions

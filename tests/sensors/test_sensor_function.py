@@ -176,7 +176,7 @@ def test_rates_and_constraint_forces_are_read_along_a_rollout(urdf_folder):
     step = compile_step(held, H, use_compiler=False)
     t = H * np.arange(41)
     joints = JointGroup(("shoulder", "elbow"), t, np.zeros((41, 2)), effort=np.sin(4 * t)[:, None] * [1.0, 0.0])
-    options = ProblemOptions(feedback="none", weighting="paper")
+    options = ProblemOptions(tracking_filter="none", weighting="paper")
     tip = PointGroup("points", ("tip",), t, np.zeros((41, 1, 3)), 1.0)
     problem = EstimationProblem(step, [Recording(joints, (tip,), name="held")], names, options)
     samples = measured(Hand(), [3, 7, 20, 39], [0.0, 0.5, 0.0, 1.0], np.zeros((4, 3)), span=(0, 40))

@@ -21,7 +21,7 @@ from yid_ocp.solvers.nonlinear_program import NonlinearProgram, _VectorBlock
 from yid_ocp.solvers.program_terms import GaussNewtonHessianRidge, LocalVariableFunction, ProgramTerm, ResidualTerm
 from yid_ocp.solvers.symbolic_transcription import problem_unknowns_from_program, transcribe
 
-TRACKED = {"feedback": "proportional", "proportional_gains": (9.0,)}
+TRACKED = {"tracking_filter": "proportional", "tracking_filter_gains": (9.0,)}
 CASES = {
     "free": ((), {}, {}),
     "robust": ((), {}, {"huber_threshold": 0.8}),
@@ -32,9 +32,9 @@ CASES = {
     "known start": ((), {}, {"known_initial_states": {"run_1": [0.1, 0.2, 0.01, 0.02], "run_2": [0, 0.3, 0, -0.01]}}),
     "prescribed": ((), {"prescribed": ("shoulder",)}, {}),
     "all prescribed": ((), {"prescribed": PENDULUM}, {}),
-    "driven": ((), {"driven": ("shoulder",)}, {"feedback": "none"}),
+    "driven": ((), {"driven": ("shoulder",)}, {"tracking_filter": "none"}),
     "driven, proportional": ((), {"driven": ("shoulder",)}, TRACKED),
-    "driven, filtered": ((), {"driven": ("shoulder",)}, {"feedback": "lqr"}),
+    "driven, filtered": ((), {"driven": ("shoulder",)}, {"tracking_filter": "lqr"}),
     "driven and prescribed": ((), {"driven": ("elbow",), "prescribed": ("shoulder",)}, TRACKED),
 }
 
@@ -211,7 +211,9 @@ def test_blocks_are_named_after_what_they_hold(urdf_folder):
 
 @pytest.mark.parametrize("encoders", [False, True])
 @pytest.mark.parametrize(
-    "feedback", [TRACKED, {"feedback": "lqr"}, {"feedback": "none"}], ids=["angles", "momenta_too", "none"]
+    "feedback",
+    [TRACKED, {"tracking_filter": "lqr"}, {"tracking_filter": "none"}],
+    ids=["angles", "momenta_too", "none"],
 )
 def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, encoders, feedback):
     """At fixed parameters, with errors so small that everything is linear, the best errors cost what innovations do."""
@@ -251,9 +253,9 @@ def test_errors_as_unknowns_have_the_likelihood_of_innovations(urdf_folder, enco
     assert solver.stats()["success"], solver.stats()["return_status"]
     # beside encoders no torque is taken as better than a thousandth: errors are then not small enough to be linear;
     # where momenta are followed, the noise of the step before is taken for this step's
-    exact = not encoders and feedback["feedback"] != "lqr"
+    exact = not encoders and feedback["tracking_filter"] != "lqr"
     assert float(found["f"]) == pytest.approx(expected, rel=1e-4 if exact else 4e-3)
-    assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback["feedback"] != "none")
+    assert ("angle_error[run_3]" in program.variables) is (not encoders and feedback["tracking_filter"] != "none")
     assert program.block_layout("torque_error").index.shape == (1, len(np.unique(errors.sample_of_step)))
 
 

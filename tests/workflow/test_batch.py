@@ -19,7 +19,7 @@ from yid_ocp.report.html import write_report
 from yid_ocp.report.png_figures import draw_blind_results
 from yid_ocp.report.sections import ReportData
 from yid_ocp.workflow import blind
-from yid_ocp.workflow.batch import list_batch_runs, run_batch
+from yid_ocp.workflow.batch import batch_runs_from_configs, run_batch
 from yid_ocp.workflow.blind import EXPERIMENT_VARIATIONS, blind_experiments_by_name, run_blind
 
 HERE = InlineExecutor()
@@ -43,7 +43,7 @@ def names(outcome):
 
 
 def test_a_failing_run_stops_no_other_and_is_tried_again(pendulum, pendulum_data, fleet, tmp_path):
-    members = list_batch_runs([pendulum], str(fleet / "*.h5"), QUICK)
+    members = batch_runs_from_configs([pendulum], str(fleet / "*.h5"), QUICK)
     assert [member.name for member in members] == ["monday", "spoiled", "tuesday"]
     out = tmp_path / "batch"
     first = run_batch(members, out, workers=HERE)
@@ -77,14 +77,16 @@ def test_a_failing_run_stops_no_other_and_is_tried_again(pendulum, pendulum_data
 def test_robots_are_configurations_and_what_differs_has_no_history(pendulum, written, pendulum_data, tmp_path):
     other = written(pendulum_data.text.replace("rest_position: 0.2", "rest_position: 0.25"), "other.yaml")
     broken = written(pendulum_data.text.replace("free: true", "fre: true"), "broken.yaml")
-    outcome = run_batch(list_batch_runs([pendulum, other, broken], None, QUICK), tmp_path / "batch", workers=HERE)
+    outcome = run_batch(
+        batch_runs_from_configs([pendulum, other, broken], None, QUICK), tmp_path / "batch", workers=HERE
+    )
     assert names(outcome) == {"pendulum": "converged", "other": "converged", "broken": "error"}
     assert "fre" in outcome.result["runs"][2]["message"]
     assert outcome.result["history"] is None
 
 
 def test_a_fleet_is_diagnosed(rubbing, tmp_path):
-    outcome = run_batch(list_batch_runs([rubbing]), tmp_path / "batch", "diagnose", HERE)
+    outcome = run_batch(batch_runs_from_configs([rubbing]), tmp_path / "batch", "diagnose", HERE)
     (entry,) = outcome.result["runs"]
     assert entry["effects"] == ["joint_coulomb@elbow"]
     assert entry["status"] == json.loads((tmp_path / "batch/runs/rubbing/result.json").read_text())["verdict"]
@@ -95,23 +97,23 @@ def test_names_are_told_apart(pendulum, written, pendulum_data, tmp_path):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "run.h5").write_bytes(b"")
     (tmp_path / "a" / "run.yaml").write_text(pendulum_data.text)
-    found = list_batch_runs([pendulum], str(tmp_path / "*" / "run.h5"))
+    found = batch_runs_from_configs([pendulum], str(tmp_path / "*" / "run.h5"))
     assert [member.name for member in found] == ["run", "run-2"]
-    found = list_batch_runs([pendulum, tmp_path / "a" / "run.yaml"], str(tmp_path / "**" / "run.h5"))
+    found = batch_runs_from_configs([pendulum, tmp_path / "a" / "run.yaml"], str(tmp_path / "**" / "run.h5"))
     assert [member.name for member in found] == ["pendulum-run", "pendulum-run-2", "run-run", "run-run-2"]
 
 
 def test_what_cannot_be_a_batch_is_refused(pendulum, tmp_path):
     with pytest.raises(ConfigError, match=r"no recording matches(.|\n)*nowhere/\*\.h5(.|\n)*in quotes"):
-        list_batch_runs([pendulum], "nowhere/*.h5")
+        batch_runs_from_configs([pendulum], "nowhere/*.h5")
     with pytest.raises(ConfigError, match=r"no such configuration(.|\n)*did you mean 'pendulum.yaml'"):
-        list_batch_runs(["pendulun.yaml"])
+        batch_runs_from_configs(["pendulun.yaml"])
     with pytest.raises(ConfigError, match="given twice"):
-        list_batch_runs([pendulum, pendulum])
+        batch_runs_from_configs([pendulum, pendulum])
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes").write_text("")
     with pytest.raises(OutputError, match="no batch"):
-        run_batch(list_batch_runs([pendulum]), tmp_path / "full", workers=HERE)
+        run_batch(batch_runs_from_configs([pendulum]), tmp_path / "full", workers=HERE)
 
 
 def test_the_command_runs_the_fleet_in_processes(cli, pendulum, fleet, tmp_path):

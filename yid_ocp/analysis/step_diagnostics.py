@@ -121,33 +121,33 @@ _MAX_LISTED_ROWS = 8  # rows that are named one by one
 
 
 @dataclass(frozen=True)
-class ParameterRowsAndSensorResponse:
-    """The equations of a step that one parameter enters, and how strongly sensors respond to it."""
+class ParameterDetectability:
+    """Rows of a step's equations that contain one parameter, and how strongly sensors respond to the parameter."""
 
     parameter: str
     unit: str
-    rows: tuple[str, ...]  # that contain it, whatever the state
-    seen: tuple[str, ...] | None  # of these, to which a sensor responds to first order; None without sensors
-    best: str  # sensor that responds most
-    read: tuple[str, ...]  # sensors whose readings depend on it directly
-    moved: float | None  # largest change of a reading from the equilibrium, per unit of it [standard deviations]
-    seconds: float  # within which it is moved
-    along: float | None = None  # the same of all readings of the recordings, root of the sum of squares
+    rows: tuple[str, ...]  # names of rows that contain the parameter in any state
+    observable_rows: tuple[str, ...] | None  # of `rows`, those with a first-order sensor response; None: no sensors
+    most_sensitive_sensor: str  # empty where no sensor responds
+    directly_dependent_sensors: tuple[str, ...]  # whose readings contain the parameter
+    max_change_from_rest: float | None  # largest of a reading for one unit of the parameter [standard deviations]
+    seconds: float  # time within which that change is reached
+    change_along_recordings: float | None = None  # root sum of squares over all readings, likewise
 
     @property
     def description(self) -> str:
         """Sentences on the equation rows, then on the change of readings from rest and along the recordings."""
         said = f"{self.parameter} enters {self._rows}"
-        if self.read:
-            said += f"; the reading of {', '.join(self.read)} depends on it directly"
+        if self.directly_dependent_sensors:
+            said += f"; the reading of {', '.join(self.directly_dependent_sensors)} depends on it directly"
         more = "1 more of it" if self.unit == "1" else f"one {self.unit} more of it"
-        within = f"within {self.seconds:.2g} s"
-        if self.moved is not None and self.moved > _NEGLIGIBLE_STDS:
-            said += f". From rest, {more} moves readings by at most {self.moved:.2g} standard deviations {within}"
-        elif self.moved is not None:
+        within, change = f"within {self.seconds:.2g} s", self.max_change_from_rest
+        if change is not None and change > _NEGLIGIBLE_STDS:
+            said += f". From rest, {more} moves readings by at most {change:.2g} standard deviations {within}"
+        elif change is not None:
             said += f". From rest, {more} moves no reading by a millionth of its standard deviation {within}"
-        if self.along is not None:
-            moves = f"moves all readings together by {self.along:.2g} standard deviations"
+        if self.change_along_recordings is not None:
+            moves = f"moves all readings together by {self.change_along_recordings:.2g} standard deviations"
             said += f". Along the recordings, {more} {moves}, to first order"
         return said + "."
 
@@ -155,16 +155,16 @@ class ParameterRowsAndSensorResponse:
     def _rows(self) -> str:
         if not self.rows:
             return "no row of a step"
-        one, listed = len(self.rows) == 1, _summarize_rows(self.rows)
+        one, listed, seen = len(self.rows) == 1, _summarize_rows(self.rows), self.observable_rows
         said = f"{len(self.rows)} row{'' if one else 's'} ({listed})"
-        if self.seen is None:
+        if seen is None:
             return said
-        best = f", {self.best} best" if self.best else ""
-        if not self.seen:
+        best = f", {self.most_sensitive_sensor} best" if self.most_sensitive_sensor else ""
+        if not seen:
             return f"{said}, {'which no sensor' if one else 'none of which a sensor'} sees to first order"
-        if len(self.seen) == len(self.rows):
+        if len(seen) == len(self.rows):
             return f"{said}, {'which' if one else 'all of which'} sensors see to first order{best}"
-        return f"{said}, {len(self.seen)} of which sensors see to first order ({_summarize_rows(self.seen)}){best}"
+        return f"{said}, {len(seen)} of which sensors see to first order ({_summarize_rows(seen)}){best}"
 
 
 def parameter_rows_and_sensor_responses(
@@ -174,7 +174,7 @@ def parameter_rows_and_sensor_responses(
     state: Array,
     theta: Array,
     stages: StepEquationLinearizations,
-) -> tuple[ParameterRowsAndSensorResponse, ...]:
+) -> tuple[ParameterDetectability, ...]:
     """Dependence of the step equations and of a recording's sensors on every parameter, about a state (nx,).
 
     A unit is added to one row of one step that starts at `state`; with A - B_u K the steps after it are linear, K the
@@ -188,7 +188,7 @@ def parameter_rows_and_sensor_responses(
             entered[column - at.start].append(row)
     known = [(p.name, p.unit, tuple(names[r] for r in sorted(entered[i]))) for i, p in enumerate(parameters)]
     if episode is None:
-        return tuple(ParameterRowsAndSensorResponse(*entry, None, "", (), None, 0.0) for entry in known)
+        return tuple(ParameterDetectability(*entry, None, "", (), None, 0.0) for entry in known)
     gain = np.zeros((step.sizes["nu"], step.sizes["nx"]))
     if episode.tracking_feedback is not None:
         gain[:, episode.tracking_feedback.state_indices] = episode.tracking_feedback.gain[0]
@@ -204,7 +204,7 @@ def parameter_rows_and_sensor_responses(
         best = sensors[int(np.argmax(np.max(by_row[:, answered], axis=1)))].name if answered else ""
         seen, read = tuple(names[r] for r in answered), tuple(s.name for s in sensors if np.any(s.by_theta[:, i]))
         moved = float(np.max(by_theta[:, i], initial=0.0))
-        found.append(ParameterRowsAndSensorResponse(*entry, seen, best, read, moved, span))
+        found.append(ParameterDetectability(*entry, seen, best, read, moved, span))
     return tuple(found)
 
 

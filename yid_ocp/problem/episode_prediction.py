@@ -160,7 +160,7 @@ class EpisodePredictor:
     @property
     def _follows_momenta(self) -> bool:
         """Whether a filter keeps the driven joints on their measured motion by their momenta too."""
-        return bool(self.system.driven) and not self.system.servos and self.options.feedback == "lqr"
+        return bool(self.system.driven) and not self.system.servos and self.options.tracking_filter == "lqr"
 
     # -- what drives the rollout --------------------------------------------------------------------------------------
 

@@ -238,7 +238,7 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
         read = (recording.joints, system.driven, grid, recording.name)
         torque = mean_step_inputs(*read, servos=system.servos)
         arm = smoothed_joint_angles(*read, LowPassFilter(math.inf))
-        smooth = smoothed_joint_angles(*read, low_pass) if options.feedback == "lqr" else arm
+        smooth = smoothed_joint_angles(*read, low_pass) if options.tracking_filter == "lqr" else arm
     samples = _samples(step, recording, options, theta, grid)
     known = (*system.driven, *system.prescribed)
     load = np.zeros((grid.steps + 1, len(known)))
@@ -258,10 +258,10 @@ def prepare_episode(functions: ModelFunctions, recording: Recording, options: Pr
 def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOptions, theta: Array) -> Episode:
     """The episode with the tracking filter of its driven joints, its gains worked out at given parameters."""
     step = functions.step
-    if not step.system.driven or step.system.servos or options.feedback == "none":
+    if not step.system.driven or step.system.servos or options.tracking_filter == "none":
         return episode
-    if options.feedback == "proportional":
-        loop = proportional_feedback(step, episode.measured_driven_angles, options.proportional_gains)
+    if options.tracking_filter == "proportional":
+        loop = proportional_feedback(step, episode.measured_driven_angles, options.tracking_filter_gains)
     else:
         plain = functions.reference_momentum_shift.theta_without_effects(theta)
         known = episode.smoothed_driven_angles, episode.torque, plain

@@ -16,7 +16,7 @@ from yid_ocp.problem.measurements import (
     Measurements,
     ResidualAndJacobian,
     huber_loss_and_residual_factors,
-    whitened_by_constant_errors,
+    whitened_for_sensor_biases,
     whitened_sensitivities_to_unit_biases,
 )
 
@@ -116,7 +116,7 @@ def whitened_episode_residual(
 ) -> ResidualAndJacobian:
     """Whitened residual of one episode: by sensor noise, or by the frozen Kalman filter where one is given.
 
-    Constant sensor errors count as noise, see `whitened_by_constant_errors`.
+    Constant sensor errors count as noise, see `whitened_for_sensor_biases`.
     """
     by_constants = whitened_sensitivities_to_unit_biases(episode.measurements)
     if whitening is None and not by_constants.shape[1]:
@@ -132,7 +132,7 @@ def whitened_episode_residual(
         innovations, _ = whitening.whiten(np.hstack([columns, by_constants]), push)
         columns, by_constants = innovations[:, :kept], innovations[:, kept:]
     if by_constants.shape[1]:
-        columns = whitened_by_constant_errors(by_constants, columns)
+        columns = whitened_for_sensor_biases(by_constants, columns)
     cost, factor = huber_loss_and_residual_factors(columns[:, 0], threshold)
     columns = factor[:, None] * columns
     return ResidualAndJacobian(cost, columns[:, 0], None if plain.jacobian is None else columns[:, 1:], factor)

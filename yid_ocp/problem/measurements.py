@@ -258,7 +258,7 @@ def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[floa
     return float(np.sum(cost)), factor
 
 
-def whitened_by_constant_errors(slopes: Array, columns: Array) -> Array:
+def whitened_for_sensor_biases(slopes: Array, columns: Array) -> Array:
     """Columns (a residual, its derivatives), (r, c), whitened by sensor noise and constant sensor errors.
 
     `slopes` (r, m) are the sensitivities of residuals of unit variance to errors of unit variance.

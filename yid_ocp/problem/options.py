@@ -67,13 +67,13 @@ class ProblemOptions:
             "at rest at the first posture; that plus a free offset with a prior; fitted to the first measured points"
         ),
     ] = "equilibrium"
-    feedback: Annotated[
+    tracking_filter: Annotated[
         Literal["none", "proportional", "lqr"], OptionInfo("tracking filter of driven arms; arms with servos have none")
     ] = "lqr"
-    proportional_gains: Annotated[
+    tracking_filter_gains: Annotated[
         tuple[Annotated[float, Ge(0)], ...],
         Len(1),
-        OptionInfo("of the proportional filter, of one arm or of all driven joints", "N m/rad"),
+        OptionInfo("of the filter `proportional`, for one arm or for all driven joints", "N m/rad"),
     ] = (80.0, 80.0, 60.0, 60.0, 15.0, 15.0, 8.0)
     weighting: Annotated[ResidualWeighting, OptionInfo("cost in standard deviations, or the paper's")] = "whitened"
     huber_threshold: Annotated[

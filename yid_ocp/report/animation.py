@@ -150,7 +150,7 @@ def _shown_frames(system: System) -> list[str]:
     return list(dict.fromkeys([*shown, *hands]))
 
 
-def make_animation(
+def animation_of_trajectories(
     title: str, told: Sequence[ConfigurationTrajectory], recording: Recording | None = None
 ) -> Animation:
     """Animation of model trajectories, the first of which fixes clock and joints, and of the recorded motion.

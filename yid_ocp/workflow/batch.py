@@ -48,7 +48,7 @@ class _BatchRun:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the command and return its exit code."""
-    members = list_batch_runs(arguments.configs, arguments.recordings, arguments.overrides)
+    members = batch_runs_from_configs(arguments.configs, arguments.recordings, arguments.overrides)
     workers = workers_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"
     words = ["yid-ocp", "batch", *map(str, arguments.configs)]
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     return run_command_and_print(arguments, lambda shown: run_batch(*asked, shown, again))
 
 
-def list_batch_runs(
+def batch_runs_from_configs(
     configs: Sequence[str | Path], recordings: str | None = None, overrides: Sequence[str] = ()
 ) -> list[_BatchRun]:
     """Runs of a batch: one per configuration, or one per configuration and recording that matches a pattern.
@@ -104,7 +104,7 @@ def run_batch(
     progress: Progress = NULL_PROGRESS,
     command_line: str = "",
 ) -> CommandResultAndOutput[None]:
-    """Run `solve` or `diagnose` for every run of `list_batch_runs`; finished runs in the folder are reused.
+    """Run `solve` or `diagnose` for every run of `batch_runs_from_configs`; finished runs in the folder are reused.
 
     Successful where all runs were; those that failed say why. The folder `out` then holds `runs/NAME/` (a run folder
     each), `tasks/` (results of tasks, see `yid_ocp.parallel`), `batch.json` (`yid-batch/1`) and `report.html`, which

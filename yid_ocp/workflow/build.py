@@ -112,7 +112,7 @@ def load_system(path: str | Path, overrides: Sequence[str] = ()) -> System:
     return build_system(load_config(path, overrides))
 
 
-def clamped_cable_topology(run: RunSettings) -> CableTopology | None:
+def cable_topology_between_clamps(run: RunSettings) -> CableTopology | None:
     """Measured vertices and clamps of a run's cable held by clamps; None for an object without clamps of its own."""
     with add_setting_location_to_errors(run, "model", "object"):
         return run.model.object.topology() if isinstance(run.model.object, ClampedObject) else None

@@ -32,7 +32,7 @@ from yid_ocp.problem.recorded_inputs import servo_gain_factors_by_recording
 from yid_ocp.sensors.base import channel_kinds_for_group_name
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME, is_point_group_measured_by_arm
 from yid_ocp.workflow import build
-from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, free_parameter_names
+from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, free_parameter_names
 from yid_ocp.workflow.run_inputs import read_recordings_of_role, unknown_name_error
 
 _START_FRAMES = 2  # of a cable's free points, from which every prediction starts
@@ -68,7 +68,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
         sensors[JOINT_POSITION_GROUP_NAME] = replace(sensors.get(JOINT_POSITION_GROUP_NAME, SensorOptions()), use=True)
         for name in {group.name for group in groups if is_point_group_measured_by_arm(group)}:
             sensors[name] = replace(sensors.get(name, SensorOptions()), use=False)
-    cable = clamped_cable_topology(run)
+    cable = cable_topology_between_clamps(run)
     own = build.marker_positions_from_reference_pose(run, system, recordings)
     for name, factors in servo_gain_factors_by_recording(system, recordings).items():
         # what the settings say of a gain goes before what a recording states
@@ -188,7 +188,7 @@ def _check_recordings(
 ) -> tuple[list[Recording], list[Recording], tuple[Issue, ...]]:
     """Recordings to estimate on and to hold out, without duplicates and cut at gaps, and all issues found."""
     doubts: list[Issue] = []
-    cable = clamped_cable_topology(run)
+    cable = cable_topology_between_clamps(run)
     kept: tuple[list[Recording], list[Recording]] = [], []
     arm = None if cable is not None else RecordedJointsModel.from_system(system, system.parameters.vector())
     anywhere = run.problem.initial_state != "equilibrium" or not system.unprescribed_coordinate_indices

@@ -20,7 +20,7 @@ from yid_ocp.problem.episodes import Episode
 from yid_ocp.problem.evaluation import Evaluation
 from yid_ocp.problem.options import SensorOptions
 from yid_ocp.progress import Progress
-from yid_ocp.report.animation import Animation, make_animation, recording_animation
+from yid_ocp.report.animation import Animation, animation_of_trajectories, recording_animation
 from yid_ocp.sensors import CHANNEL_KINDS, joints
 from yid_ocp.solvers.base import parameter_estimates, unknowns_covariance_and_reduced_chi2
 from yid_ocp.workflow.build import build_step, build_system, divided_link_parameter_scale, urdf_reader_options
@@ -175,7 +175,7 @@ def _scenes(problem: EstimationProblem, first: Evaluation) -> list[Animation]:
         if first.ok:
             prediction = first.episode_predictions[i]
             told = predicted_configuration_trajectory("with the initial values", problem, episode, prediction, shared)
-            scenes.append(make_animation(episode.name, [told], episode.recording))
+            scenes.append(animation_of_trajectories(episode.name, [told], episode.recording))
         else:
             theta = problem.predictor.theta_with_episode_values(episode, shared)
             alone = recording_animation(episode.name, problem.system, theta, episode.recording)

@@ -31,7 +31,7 @@ from yid_ocp.files import (
 from yid_ocp.inference.whitening import problem_whitened_by_sensor_noise
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.animation import Animation, make_animation
+from yid_ocp.report.animation import Animation, animation_of_trajectories
 from yid_ocp.sensors.joints import JOINT_EFFORT_GROUP_NAME, JOINT_POSITION_GROUP_NAME
 from yid_ocp.solvers import Solution, solve
 from yid_ocp.solvers.base import Iterate
@@ -218,7 +218,7 @@ def _scenes(finding: DiagnosisResult, predicted: Sequence[HeldOutPredictionPair]
             told.append(
                 prediction_outputs.predicted_configuration_trajectory(name, fit.problem, episode, outcome, theta)
             )
-        scenes.append(make_animation(f"{episode.name} (held out)", told, episode.recording))
+        scenes.append(animation_of_trajectories(f"{episode.name} (held out)", told, episode.recording))
     return scenes
 
 

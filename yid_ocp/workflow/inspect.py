@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,10 @@ from yid_ocp.workflow.run_folder import atomic_run_folder
 _SHOWN_STEPS = 2  # of the NLP in its picture: what comes after looks the same
 _PATTERN_LAYOUT = (("dR_dy", "A"), ("dR_dtheta", "B_theta", "B_u"))
 _PARAMETER_KEYS = ("value", "unit", "lower", "upper", "description")
+_DEPENDENCE_KEYS = (
+    "parameter unit rows seen=observable_rows best=most_sensitive_sensor read=directly_dependent_sensors "
+    "moved=max_change_from_rest seconds along=change_along_recordings words=description"
+)
 
 
 @dataclass(frozen=True)
@@ -108,7 +112,7 @@ def _run_inspect(
             },
             "patterns": {name: _pattern_result(pattern) for name, pattern in patterns.items()},
             "nlp": nlp,
-            "dependence": {entry.parameter: {**asdict(entry), "words": entry.description} for entry in dependences},
+            "dependence": {entry.parameter: named_attributes(entry, _DEPENDENCE_KEYS) for entry in dependences},
             "linearisation": {
                 "at": point.description,
                 "norms": {name: float(np.linalg.norm(matrix)) for name, matrix in matrices.items()},
@@ -213,7 +217,7 @@ def _dependence(
     problem: EstimationProblem | None,
     point: _LinearisationPoint,
     rows: StepEquationLinearizations,
-) -> tuple[step_diagnostics.ParameterRowsAndSensorResponse, ...]:
+) -> tuple[step_diagnostics.ParameterDetectability, ...]:
     """Where every parameter enters and who sees it; along the recordings where the problem frees it."""
     episode = problem.episodes[0] if problem is not None and point.is_equilibrium else None
     found = step_diagnostics.parameter_rows_and_sensor_responses(step, symbols, episode, point.state, point.theta, rows)
@@ -222,7 +226,7 @@ def _dependence(
         return found
     size = np.linalg.norm(at_start.jacobian[problem.residual_rows.data], axis=0)
     along = dict(zip(problem.unknown_names, map(float, size), strict=True))
-    return tuple(replace(entry, along=along.get(entry.parameter)) for entry in found)
+    return tuple(replace(entry, change_along_recordings=along.get(entry.parameter)) for entry in found)
 
 
 def _pattern_result(pattern: step_diagnostics.SparsityPattern) -> dict[str, Any]:

@@ -25,8 +25,8 @@ from yid_ocp.problem.measurements import make_time_grid
 from yid_ocp.problem.recorded_inputs import prescribed_path
 from yid_ocp.problem.signal_filters import LowPassFilter
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.animation import ConfigurationTrajectory, make_animation
-from yid_ocp.workflow.build import build_step, clamped_cable_topology, free_parameter_names
+from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
+from yid_ocp.workflow.build import build_step, cable_topology_between_clamps, free_parameter_names
 from yid_ocp.workflow.build_problem import build_problem
 from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
 from yid_ocp.workflow.run_folder import atomic_run_folder
@@ -66,7 +66,7 @@ def run_plan(
         folder.log_event("end", reached=found.is_successful, message=found.message)
         told = _plan_result(run, found) if isinstance(found, TargetMotionPlan) else _information_plan_result(run, found)
         system, q = found.simulator.step.system, found.rollout.state[:, : found.simulator.step.system.n_coordinates]
-        scene = make_animation(
+        scene = animation_of_trajectories(
             "planned", [ConfigurationTrajectory("planned", system, found.simulator.theta, found.t, q)]
         )
         more = {"plan" if isinstance(found, TargetMotionPlan) else "information": found}
@@ -93,7 +93,7 @@ def configured_or_recorded_start_positions(run: RunSettings, step: Step) -> Mapp
     """
     if run.plan.start_joint_positions is not None or not run.recordings.estimate:
         return run.plan.start_joint_positions
-    [recording], cable, system = read_recordings_of_role(run, count=1), clamped_cable_topology(run), step.system
+    [recording], cable, system = read_recordings_of_role(run, count=1), cable_topology_between_clamps(run), step.system
     clamps = () if cable is None else cable.clamp_pose_definitions
     grid = make_time_grid(recording, step.time_step, run.problem.duration)
     with add_setting_location_to_errors(run, "recordings", "estimate", 0):

@@ -15,7 +15,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.predictions import recording_from_prediction
 from yid_ocp.progress import NULL_PROGRESS, Progress
-from yid_ocp.report.animation import Animation, make_animation, recording_animation
+from yid_ocp.report.animation import Animation, animation_of_trajectories, recording_animation
 from yid_ocp.workflow.build import build_step, build_system
 from yid_ocp.workflow.build_problem import problem_options
 from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
@@ -97,4 +97,4 @@ def _predicted(run: RunSettings, system: System, progress: Progress, seed: int |
         return outcome, []
     made = recording_from_prediction(problem.predictor, episode, outcome, theta, seed, run.description)
     told = predicted_configuration_trajectory("simulated", problem, episode, outcome, theta)
-    return made, [make_animation("simulated", [told], episode.recording)]
+    return made, [animation_of_trajectories("simulated", [told], episode.recording)]

@@ -27,7 +27,7 @@ from yid_ocp.problem.predictions import rmse_unit_and_count_by_channel
 from yid_ocp.progress import NULL_PROGRESS, Progress
 from yid_ocp.solvers import Iterate, Solution, Status, solve
 from yid_ocp.workflow import prediction_outputs
-from yid_ocp.workflow.build import build_step, build_system, clamped_cable_topology, divided_link_parameter_scale
+from yid_ocp.workflow.build import build_step, build_system, cable_topology_between_clamps, divided_link_parameter_scale
 from yid_ocp.workflow.build_problem import build_problem, issues_to_plain_data
 from yid_ocp.workflow.command_runner import CommandResultAndOutput, command_with_settings
 from yid_ocp.workflow.prediction_outputs import EpisodeAndPrediction
@@ -65,7 +65,7 @@ def run_solve(
         solution = replace(solution, parameters=inflated)
         progress.begin_stage("predicting the held-out recordings", 1.2, 1.5)
         held_out = problem.predict_held_out(solution.x)
-        cable = clamped_cable_topology(run)
+        cable = cable_topology_between_clamps(run)
         solution, doubts = solution_and_fit_issues(problem, solution, held_out, cable)
         end = {"status": solution.status.value, "message": solution.message, "seconds_solving": solution.wall_time}
         folder.log_event("end", **end)

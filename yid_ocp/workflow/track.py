@@ -32,7 +32,7 @@ from yid_ocp.files import (
 from yid_ocp.model.system import System
 from yid_ocp.parallel import InlineExecutor, Task, TaskResult, WorkerConfig, require_task_values, run_tasks
 from yid_ocp.progress import Progress
-from yid_ocp.report.animation import ConfigurationTrajectory, make_animation
+from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.vision import camera_registration as registration
 from yid_ocp.vision import surface_meshes, track_result
 from yid_ocp.vision.calibration import CameraCalibration
@@ -105,7 +105,7 @@ def _run_track(
                 doubts += [doubt for doubt in own if doubt.cause.startswith("point_")]
             theta = system.parameters.vector()
             shape = ConfigurationTrajectory("fitted shape", tracker.system, theta, found.t, found.configurations)
-            told = [make_animation("tracked", [shape], tracked)]
+            told = [animation_of_trajectories("tracked", [shape], tracked)]
             result["truth_errors"] = {} if made is None else _truth_errors(system, found, made)
         result |= {"doubts": issues_to_plain_data(doubts), "refused": "" if refused is None else refused.what}
         files = [folder.path / "track.png", *sorted((folder.path / "pictures").glob("*.png"))]

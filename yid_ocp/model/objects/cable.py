@@ -76,7 +76,7 @@ class CableOptions:
     [m/s^2].
     """
 
-    branches: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by name, parent and children")] = field(
+    branch_properties: Annotated[Mapping[str, CableBranchOptions], OptionInfo("by name, parent and children")] = field(
         default_factory=dict
     )
     default_branch: CableBranchOptions = field(default_factory=CableBranchOptions)
@@ -247,7 +247,7 @@ def _segments(cable: CableTopology, lengths: Mapping[tuple[str, str], float], op
         carried.append(carried[-1] @ turn)
     segments = []
     for name, chain in cable.vertex_names_by_branch.items():
-        branch = options.branches.get(name, options.default_branch)
+        branch = options.branch_properties.get(name, options.default_branch)
         if name == cable.parent_segment:
             chain, at, own, before = chain[1:], None, turns[1:], lengths[parent[0], parent[1]]
         else:
@@ -294,14 +294,14 @@ model:
     undeformed_shape_file: undeformed.csv
     end_clamp_kind: axis
 """,
-        "model.object.branches.NAME": """\
+        "model.object.branch_properties.NAME": """\
 model:
   object:
     kind: cable
     points_along_parent_branch: [p0, p1, p2, p3, p4, p5]
     undeformed_shape_file: undeformed.csv
     points_along_child_branches: {side: [p2, s1, s2]}
-    branches:
+    branch_properties:
       side: {linear_density: 0.03, separate_twist_damping: true}    # [kg/m]
 """,
     }
@@ -323,10 +323,10 @@ model:
     def topology(self) -> CableTopology:
         undeformed = read_vertex_positions(self.undeformed_shape_file)
         found = CableTopology(self.points_along_parent_branch, dict(self.points_along_child_branches), undeformed)
-        for name in self.branches:
+        for name in self.branch_properties:
             if name not in found.vertex_names_by_branch:
                 hint = nearest_name_hint(name, found.vertex_names_by_branch)
-                raise ModelError(f"there is no branch '{name}'", where=f"branches.{name}", hint=hint)
+                raise ModelError(f"there is no branch '{name}'", where=f"branch_properties.{name}", hint=hint)
         return found
 
     def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:

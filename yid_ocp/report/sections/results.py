@@ -18,7 +18,7 @@ from yid_ocp.model.system import System
 from yid_ocp.problem import EstimationProblem
 from yid_ocp.problem.episodes import Episode, EpisodePrediction
 from yid_ocp.report import diagnosis_summaries, figures, summaries  # noqa: F401, they register
-from yid_ocp.report.animation import ConfigurationTrajectory, make_animation
+from yid_ocp.report.animation import ConfigurationTrajectory, animation_of_trajectories
 from yid_ocp.report.figures import TimePlotData, lines_over_time_figure
 from yid_ocp.report.png_figures import interval_and_p_value_calibration_rates
 from yid_ocp.report.sections import ReportData, figures_by_unit, register_report_section
@@ -248,7 +248,7 @@ def _animation(findings: ReportData) -> Mapping[str, Any] | None:
             system, grid = own.problem.system, own.episode.grid
             q = own.prediction.rollout.state[:, : system.n_coordinates]
             told = ConfigurationTrajectory("predicted", system, own.theta, grid.node_times, q)
-            scenes.append(make_animation(f"{own.episode.name} ({own.role})", [told], own.episode.recording))
+            scenes.append(animation_of_trajectories(f"{own.episode.name} ({own.role})", [told], own.episode.recording))
     scenes = [entry for entry in scenes if len(entry.t) > 1]
     text = json.dumps([entry.to_dict() for entry in scenes[:_MAX_ANIMATIONS]], separators=(",", ":"))
     names = [[motion.name for motion in entry.motions] for entry in scenes]
