@@ -113,10 +113,10 @@ def check_robot_held_point_clock(
     std: float,
     path: PositionsAtTimes,
 ) -> Iterator[Issue]:
-    """Issues of clock offset or drift of points whose positions follow from the joint angles.
+    """Yield issues about clock offset or drift of points whose positions follow from the joint angles.
 
     They are seen (N, np, 3) [m] at the times `t` (N,); `by_angle` (N, np, 3, k) is the derivative of their places by
-    the angles, `std` their noise [m], zero where nobody says.
+    the angles, `std` their noise [m], zero if unknown.
     """
     span, step = (float(t[0]), float(t[-1])), 0.5 * median_sample_period(joints.t)
     shifted = np.broadcast_to(np.eye(3), (*seen.shape, 3))
@@ -166,14 +166,14 @@ def _drift_issue(found: _ClockError, group: str, limit: float, severity: Severit
 
 
 def timestamp_correction_advice(late: float, drift: float, middle: float) -> str:
-    """Advice on how to correct time stamps with an offset and a drift."""
+    """Advice on how to correct time stamps t that are `late` [s] at t = `middle` and drift by the fraction `drift`."""
     return f"replace its times t by t {-late:+.4g} {-drift:+.4g} (t - {middle:.6g})"
 
 
 def search_clock_offset_and_drift(
     path: PositionsAtTimes, knots: tuple[float, float], t: Array, seen: Array, drifts: bool = False
 ) -> tuple[float, float]:
-    """Clock offset [s] and relative drift that bring points nearest to a path, by a coarse-to-fine search.
+    """Clock offset [s] and relative drift at which points lie nearest to a path, found by a coarse-to-fine search.
 
     The path is known from the first to the last of `knots` [s]; points `seen` (N, np, 3) [m] at the times `t` (N,).
     With `drifts` the clock may run apart as well, by up to `_MAX_DRIFT`.

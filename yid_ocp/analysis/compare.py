@@ -56,7 +56,7 @@ class _MethodResult:
 
 @dataclass(frozen=True)
 class MethodComparison:
-    """Results of all methods on one problem, and where they disagree."""
+    """Results of all estimation methods on one problem, and their disagreements on identifiable parameters."""
 
     method_results: tuple[_MethodResult, ...]
     reference_method: str  # of the lowest cost, with which the others are compared
@@ -70,7 +70,7 @@ class MethodComparison:
 
     @property
     def is_consistent(self) -> bool:
-        """Whether every method agrees on every identifiable parameter."""
+        """Whether all methods agree on every identifiable parameter."""
         return not any(self.disagreements.values())
 
 
@@ -216,7 +216,7 @@ def _resident() -> float:
 
 @dataclass(frozen=True)
 class ChosenCableMemoryFit:
-    """Problem and solution with or without cable memory, and the reason; the message is empty without a decision."""
+    """Problem and solution with or without cable memory, and the reason as a message, empty if nothing was decided."""
 
     problem: EstimationProblem
     solution: Solution
@@ -229,7 +229,7 @@ def decide_cable_memory(
     solution: Solution,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> ChosenCableMemoryFit:
-    """The solution, refitted without cable memory where recordings that start in motion do not support it.
+    """Return the fit, refitted without cable memory if recordings that start in motion do not support the memory.
 
     Where a cable moves when its recording begins, the load that it bears there is not known, and what it seems to
     remember may be that motion. Each recording that starts so is predicted from the others alone (one Gauss-Newton

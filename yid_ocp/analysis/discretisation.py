@@ -34,7 +34,7 @@ _EXTRAPOLATION_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class EstimateShiftByLinksAndTimeStep:
-    """Shift of one estimate with links divided in two, and half the time step, in its unit; None where not tried."""
+    """Shifts of one estimate, in its unit, by dividing links in two and by halving the time step; None if not tried."""
 
     links: float | None = None
     time_step: float | None = None
@@ -42,7 +42,7 @@ class EstimateShiftByLinksAndTimeStep:
 
 @dataclass(frozen=True)
 class FinerDiscretisationProblem:
-    """An estimation problem with a finer discretisation, and how its unknowns map to the coarse ones.
+    """An estimation problem with a finer discretisation, and the mapping from coarse to fine unknowns.
 
     `parameter_factors` lead from a coarse parameter to the same physical object in the finer model, 1 for absent names;
     `subdivided_joints` are, for each joint of a divided link, the fine joints that share its angle.
@@ -191,7 +191,7 @@ _DAMPING_PARAMETERS = ("damping", "twist_damping")
 
 @dataclass(frozen=True)
 class NaturalFrequencies:
-    """Natural frequencies of one step map about an equilibrium, its robot held still.
+    """Natural frequencies of a system's step map about an equilibrium, with the robot held still.
 
     Unstable modes are damped ones that still grow from step to step: the equilibrium is unstable, or the time step is
     too long for the tension that the grasps put on the object.
@@ -245,7 +245,7 @@ def _eigenvalues(step: Step, rest: Equilibrium, known: Array, theta: Array) -> A
 
 
 def min_closure_error_by_grasp(system: System, configuration: Mapping[str, float], theta: Array) -> dict[str, float]:
-    """Smallest remaining gap of each grasp [m], by name: the robot's joints are fixed, the object may bend.
+    """Smallest possible gap [m] of each grasp, by name, with the robot's joints fixed and the object free to bend.
 
     `configuration` holds driven and prescribed coordinates [rad or m]; lengths are taken from `theta`.
     """
@@ -308,12 +308,12 @@ class AlternatingErrorGrowth:
 
     @property
     def keeps_errors_below_resolution(self) -> bool:
-        """Whether an alternating error grows by at most six decades: rounding stays below what sensors resolve."""
+        """Whether alternating errors grow by at most six decades, so that rounding stays below sensor resolution."""
         return self.growth_decades <= _MAX_GROWTH_DECADES
 
     @property
     def description(self) -> str:
-        """A sentence on the stability and, where unstable, on the remedy."""
+        """Sentence that states whether the time step is stable and, if it is not, the remedy."""
         step = f"{self.recording_name}: the step of {self.time_step:g} s is"
         if self.keeps_errors_below_resolution:
             return f"{step} stable along the motion"
@@ -367,7 +367,7 @@ def _alternating_mode_magnitude(
 
 
 def largest_alternating_error_growth(problem: EstimationProblem, x: Array) -> AlternatingErrorGrowth | None:
-    """Largest error growth of all recordings at unknowns x (nx,), up to a failed step; None where none has a start."""
+    """Largest alternating error growth of all recordings at x (nx,), up to a failed step; None if none can start."""
     predictor, system = problem.predictor, problem.system
     found = []
     looks = max(_N_CHECKED_NODES // len(problem.episodes), _MIN_CHECKED_NODES)

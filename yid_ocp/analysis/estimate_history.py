@@ -44,7 +44,7 @@ class RunEstimates(ReprMixin):
 
     @property
     def std(self) -> Array:
-        """Standard deviations, shape (n,)."""
+        """Standard deviations of the n parameters, shape (n,)."""
         return np.sqrt(np.diag(self.covariance))
 
     def _only(self, names: Sequence[str]) -> RunEstimates:
@@ -85,7 +85,7 @@ class _RunOutlierTest:
 
 @dataclass(frozen=True)
 class DriftAndOutlierTests:
-    """Tests for drift of each parameter and for outlier runs of one model; chi2 is of all differences together."""
+    """Tests of several runs of one model for parameter drift and outlier runs; chi2 is of all differences together."""
 
     run_names: tuple[str, ...]
     parameter_drifts: tuple[_ParameterDrift, ...]
@@ -97,7 +97,7 @@ class DriftAndOutlierTests:
 
 
 def nearby_positive_definite_covariance(covariance: Array) -> Array:
-    """A nearby invertible covariance with the same standard deviations: small correlation eigenvalues are raised."""
+    """A nearby invertible covariance with the same standard deviations; small correlation eigenvalues are raised."""
     std = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(std, std))
     clipped = (vectors * np.maximum(values, _MIN_CORRELATION_EIGENVALUE)) @ vectors.T
@@ -106,7 +106,7 @@ def nearby_positive_definite_covariance(covariance: Array) -> Array:
 
 
 def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, int]:
-    """Pool the estimates of several runs; returns them with chi2 of the differences and its degrees of freedom.
+    """Pool several runs' estimates; return them, chi2 of the differences between runs, and its degrees of freedom.
 
     Each run may lack some of the parameters. The pooled estimates are of all parameters of any run, widened by Birge's
     ratio where the runs differ by more than they state.
@@ -136,7 +136,7 @@ def pool_estimates(runs: Sequence[RunEstimates]) -> tuple[RunEstimates, float, i
 
 
 def assess_drift_and_outlier_runs(runs: Sequence[RunEstimates], level: float = 0.01) -> DriftAndOutlierTests:
-    """Test which parameters drifted between runs, in the order of time, and which run is an outlier.
+    """Test which parameters drifted between runs, given in order of time, and which run is an outlier.
 
     Each parameter is tested by its marginal variances, each run by its whole covariance; the significance level is
     divided by the number of parameters, and by that of runs. A run is an outlier where it disagrees with the others and

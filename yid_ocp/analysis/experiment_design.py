@@ -49,7 +49,7 @@ _INWARD_GRIPPER_OFFSET, _FORWARD_GRIPPER_OFFSET = 0.05, 0.08
 
 @dataclass(frozen=True)
 class FrameObservationSchedule:
-    """Times and standard deviations of one frame measured by a group."""
+    """Observation of one frame by a point group: sample times and standard deviations."""
 
     point_group: str
     frame: str
@@ -59,7 +59,7 @@ class FrameObservationSchedule:
 
 @dataclass(frozen=True)
 class RecordedExperiment:
-    """The recorded experiment, and what its variants may use."""
+    """The recorded experiment to be varied: its problem, the unknowns, prior knowledge and an optional second arm."""
 
     problem: EstimationProblem
     x: Array  # unknowns at which the information is evaluated, shape (nx,)
@@ -74,12 +74,12 @@ class RecordedExperiment:
         return dict(zip(self.problem.system.parameters.names, map(float, theta), strict=True))
 
     def camera_sample_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """The camera's point group, its frame times since the start [s] and its typical standard deviation [m]."""
+        """The camera's point group (None: defaults are used), frame times since the start [s] and typical std [m]."""
         times = uniform_sample_times(episode.grid, _DEFAULT_CAMERA_RATE)
         return self._sampling(episode, lambda g: recorded_camera_pose(g) is not None, times, _DEFAULT_CAMERA_STD)
 
     def arm_point_sample_times_and_std(self, episode: Episode) -> tuple[PointGroup | None, Array, float]:
-        """Point group, sample times [s] and standard deviation [m] of points that the arms measure."""
+        """Point group that the arms measure (None: defaults are used), its sample times [s] and typical std [m]."""
         times = episode.grid.node_times - episode.grid.start_time
         return self._sampling(episode, lambda g: "arm" in g.name or g.sensor == "arm", times, _DEFAULT_ARM_POINT_STD)
 
@@ -91,7 +91,7 @@ class RecordedExperiment:
         return None, times, std
 
     def existing_sensor_observations(self, episode: Episode) -> list[FrameObservationSchedule]:
-        """Observations of the recording's sensors, one entry for each point."""
+        """Observation schedules of the points measured in a recording, one for each point."""
         found = []
         for group in _used_point_groups(self.problem, episode):
             std, t = self._std(group), group.t - episode.grid.start_time
@@ -120,7 +120,7 @@ def _used_point_groups(problem: EstimationProblem, episode: Episode) -> list[Poi
 
 
 def uniform_sample_times(grid: TimeGrid, rate: float) -> Array:
-    """Evenly spaced sample times over a recording, from its start [s]."""
+    """Evenly spaced sample times [s] at `rate` [Hz], from zero to the end of a recording."""
     return np.arange(0.0, grid.steps * grid.time_step + 1e-9, 1.0 / rate)
 
 
@@ -134,7 +134,7 @@ class _ObservableFrame(NamedTuple):
 
 
 def observable_frames(system: System) -> list[_ObservableFrame]:
-    """Measurable frames: tips and middles of segments and markers beside them; without segments, links and markers."""
+    """Measurable frames: segment tips, middles and markers beside the tips, or links and markers without segments."""
     tree, off_axis = system.mechanism, f"a marker {100 * _MARKER_AXIS_DISTANCE:g} cm off the axis"
     held = {grasp.held_frame for grasp in system.grasps}
     found: list[_ObservableFrame] = []
@@ -166,7 +166,7 @@ def _displaced(frame: Frame, offset: ArrayLike) -> Frame:
 
 
 def add_observable_frames_to_step(step: Step) -> tuple[Step, list[_ObservableFrame]]:
-    """The step with all measurable frames in its mechanism, and these; the equations of motion stay the same."""
+    """The step with all measurable frames added to its mechanism, and those frames; its equations stay the same."""
     mechanism, seen = step.system.mechanism, observable_frames(step.system)
     added = {sight.name: sight.added_frame for sight in seen if sight.added_frame is not None}
     system = replace(step.system, mechanism=replace(mechanism, frames={**mechanism.frames, **added}))
@@ -175,7 +175,7 @@ def add_observable_frames_to_step(step: Step) -> tuple[Step, list[_ObservableFra
 
 @dataclass
 class CandidateExperimentSensitivities:
-    """Sensitivities of all frames that could be measured in one variant of an experiment.
+    """Sensitivities of the positions of all measurable frames in one variant of an experiment.
 
     Sensitivities of a frame's position at every node, by (episode, group, frame), are by the unknowns, then by the q
     that stand for the errors of the torques that drive this episode (`point_sensitivities_and_joint_information`).
@@ -192,7 +192,7 @@ class CandidateExperimentSensitivities:
     _known: dict[tuple[int, str, str, bytes, bytes], Array] = field(default_factory=dict, repr=False)
 
     def fisher_information(self, views: Sequence[Sequence[FrameObservationSchedule]]) -> Array:
-        """Fisher information of observations, one list for each recording, plus the prior information, (nx, nx)."""
+        """Fisher information (nx, nx) of observations (one list for each recording) plus the prior information."""
         total = self.prior_information.copy()
         nx = len(total)
         for i, episode in enumerate(self.problem.episodes):
@@ -228,7 +228,7 @@ MECHANICAL_CHANGE_DESCRIPTIONS: Mapping[str, str] = {
 
 
 class CandidateExperimentBuilder:
-    """Builds and caches variants of an experiment by their mechanical changes."""
+    """Builder of experiment variants from sets of mechanical changes; results are cached."""
 
     def __init__(self, setting: RecordedExperiment, progress: Progress = NULL_PROGRESS) -> None:
         self.setting = setting
@@ -236,7 +236,7 @@ class CandidateExperimentBuilder:
         self._layouts: dict[frozenset[str], CandidateExperimentSensitivities | str] = {}
 
     def build_experiment(self, mechanics: frozenset[str]) -> CandidateExperimentSensitivities | str:
-        """Sensitivities with a set of mechanical changes, or a message why the experiment cannot be built."""
+        """Sensitivities of the experiment with a set of mechanical changes, or a message why it cannot be built."""
         if mechanics not in self._layouts:
             if mechanics:
                 words = " and ".join(MECHANICAL_CHANGE_DESCRIPTIONS[name] for name in sorted(mechanics))
@@ -248,7 +248,7 @@ class CandidateExperimentBuilder:
         return self._layouts[mechanics]
 
     def applicable_mechanical_changes(self) -> list[str]:
-        """Names of the mechanical changes that apply to the system."""
+        """Names of the mechanical changes that are possible for the experiment's system."""
         setting, system, episodes = self.setting, self.setting.problem.system, self.setting.problem.episodes
         moves = bool(system.driven) and not system.servos
         measured = any(s.sensor.effort_joints for e in episodes for s in e.measurements)

@@ -26,7 +26,7 @@ _MAX_CLOUD_POINTS = 1500
 
 @dataclass(frozen=True)
 class FrictionLawFit:
-    """One law fitted to all recordings, and its errors on those left out in turn.
+    """One friction law fitted to all recordings, with its prediction errors on recordings left out in turn.
 
     Each recording's root mean square error is that of a prediction by a fit without its kind of motion; NaN where that
     failed. It is in the channels' unit, or in standard deviations where units differ.
@@ -40,7 +40,7 @@ class FrictionLawFit:
 
 
 def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
-    """Names of recordings by kind of motion, a name up to its number, or each by itself; none whose motors are off."""
+    """Recording names grouped by the name without its number, or singly if groups are few; none with motors off."""
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
     names = [name for name in joints if not problem.system.servos or name in commanded]
@@ -55,7 +55,7 @@ def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[
 def cross_validate_friction_law(
     law: str, problem: EstimationProblem, solution: Solution, kinds: Mapping[str, Sequence[str]]
 ) -> FrictionLawFit:
-    """A law's fit to all recordings, `solution`, with errors of refits that leave out one kind of motion in turn."""
+    """A friction law's fit to all recordings, with errors of refits that leave out one kind of motion in turn."""
     errors: dict[str, float] = {}
     units = {sample.sensor.unit for episode in problem.episodes for sample in episode.measurements}
     pairs, known = list(zip(problem.episodes, problem.whitening_filters, strict=True)), problem.named_values(solution.x)
@@ -81,13 +81,13 @@ def cross_validate_friction_law(
 def left_out_error_mean_and_std_error(
     errors: Mapping[str, float], kinds: Mapping[str, Sequence[str]]
 ) -> tuple[float, float]:
-    """Mean over kinds of motion of errors by recording, and its standard error."""
+    """Mean of the recordings' errors over kinds of motion, and its standard error."""
     by_kind = np.array([np.mean([errors[name] for name in own]) for own in kinds.values()])
     return float(np.mean(by_kind)), float(np.std(by_kind, ddof=1) / np.sqrt(len(by_kind)))
 
 
 def warranted_law(fits: Sequence[FrictionLawFit], kinds: Mapping[str, Sequence[str]]) -> FrictionLawFit:
-    """The first law of the ladder whose error is within one standard error of the least one's.
+    """The first friction law of the ladder whose error is within one standard error of the smallest error.
 
     Hastie, Tibshirani and Friedman (2009), The elements of statistical learning, 7.10, doi:10.1007/978-0-387-84858-7.
     """
@@ -110,7 +110,7 @@ class _FrictionTorqueCloud:
 def friction_torque_clouds(
     problem: EstimationProblem, solution: Solution, friction_parameters: Sequence[str]
 ) -> tuple[_FrictionTorqueCloud, ...]:
-    """Friction torque of every driven joint with friction; none where a model has constraints or internal coordinates.
+    """Friction torque data of driven joints with friction; empty for models with constraints or internal coordinates.
 
     What the discrete equations lack along the smoothed measured angles with the friction at zero, and what the fitted
     law adds there.
@@ -173,7 +173,7 @@ def _load_function(problem: EstimationProblem) -> ca.Function:
 
 
 def problem_estimating_on_held_out_too(problem: EstimationProblem) -> EstimationProblem:
-    """The problem with its held-out recordings among those to estimate on."""
+    """The problem with its held-out recordings moved to the recordings for estimation."""
     added = (replace(held, initial_state_shared_with=None) for held in problem.held_out)
     filters = (*problem.whitening_filters, *problem.held_out_whitening_filters)
     return problem.with_episodes((*problem.episodes, *added), (), filters, ())

@@ -63,7 +63,7 @@ _MAX_RELATIVE_DATA_CHANGE = 0.1  # by which a combination may move the data, of 
 
 @dataclass(frozen=True)
 class ParameterIdentifiability:
-    """Uncertainty and verdict of one parameter, in `unit`.
+    """Value, standard deviations and identifiability verdict of one parameter.
 
     The verdict is that of a solution at the same point (`inference.uncertainty.parameter_verdict`), consistent with the
     95 % interval by profile likelihood about the best fit of all unknowns; this is None where not requested.
@@ -95,7 +95,7 @@ class _ParameterDirection:
 
 @dataclass(frozen=True, repr=False)
 class IdentifiabilityResult(ReprMixin):
-    """Identifiability of the p free parameters from a set of recordings."""
+    """Identifiability of p free parameters: verdicts, correlations, Fisher information and uncertain directions."""
 
     parameters: Mapping[str, ParameterIdentifiability]
     parameter_names: tuple[str, ...]  # in the order of the matrices
@@ -116,7 +116,7 @@ class IdentifiabilityResult(ReprMixin):
 
     @property
     def unidentifiable_directions(self) -> tuple[_ParameterDirection, ...]:
-        """Directions whose verdict is `not_identifiable`."""
+        """Directions in parameter space whose verdict is `not_identifiable`."""
         return tuple(entry for entry in self.directions if entry.verdict == "not_identifiable")
 
 
@@ -243,7 +243,7 @@ def unknowns_from_solution(problem: EstimationProblem, solution: Solution | Arra
 def with_nuisance_unknowns(
     problem: EstimationProblem, start: InitialStateKnowledge, grasp_std: float | None
 ) -> EstimationProblem:
-    """The problem with initial states, where `start` is "unknown", and grasp offsets (prior in m) as unknowns."""
+    """The problem with initial states (if `start` is "unknown") and grasp offsets (if a prior is given) as unknowns."""
     options, grasps, priors = problem.options, [], dict(problem.options.prior_stds)
     initial = "estimated" if start == "unknown" else options.initial_state
     if grasp_std is not None:
@@ -269,7 +269,7 @@ def with_nuisance_unknowns(
 
 
 def transfer_unknowns_by_name(x: Array, names: Sequence[str], other: EstimationProblem) -> Array:
-    """Unknown vector of another problem: values of the same names, its own initial values for the rest."""
+    """Unknown vector of another problem: values from `x` for the same names, its own initial values for the rest."""
     known = dict(zip(other.unknown_names, other.initial_unknowns, strict=True)) | dict(zip(names, x, strict=True))
     return np.array([known[name] for name in other.unknown_names])
 

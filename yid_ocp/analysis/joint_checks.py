@@ -63,13 +63,13 @@ class RecordedJointsModel:
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """In the order of `joint_names`."""
+        """Joints of the model, in the order of `joint_names`."""
         mechanism = self.system.mechanism
         return tuple(mechanism.joints[mechanism.joint_index(name)] for name in self.joint_names)
 
     @property
     def joint_configuration_indices(self) -> tuple[int, ...]:
-        """Indices of the joints in the configuration."""
+        """Indices of the joints in the system's configuration vector."""
         return tuple(self.system.mechanism.joint_index(name) for name in self.joint_names)
 
     def is_frame_determined_by_angles(self, frame: str) -> bool:
@@ -84,7 +84,7 @@ class RecordedJointsModel:
         return not any(set(ancestors(i)) & known for i in range(self.system.n_coordinates) if i not in known)
 
     def frame_positions_and_jacobians(self, frames: tuple[str, ...], q: Array) -> tuple[Array, Array]:
-        """Positions (N, nf, 3) [m] of frames and their Jacobian (N, nf, 3, k) by the recorded angles (N, k).
+        """Positions (N, nf, 3) [m] of frames and their Jacobian (N, nf, 3, k) in the recorded angles `q` (N, k).
 
         The frames are such that `is_frame_determined_by_angles`.
         """
@@ -163,7 +163,7 @@ def _smoothed_motion(joints: JointGroup, names: tuple[str, ...]) -> _SmoothedMot
 
 
 def check_joint_limits(arm: RecordedJointsModel, recording: Recording) -> Iterator[Issue]:
-    """Issues where recorded angles or speeds exceed the joint limits."""
+    """Yield issues about recorded angles or speeds that exceed the joint limits."""
     joints = recording.joints
     if joints is None:
         return
@@ -208,14 +208,14 @@ def _speed_issues(arm: RecordedJointsModel, t: Array, position: Array) -> Iterat
 
 
 def known_effect_config_line(kind: str, location: str, quantity: str, value: float) -> str:
-    """The configuration line that models an error as a known effect."""
+    """Configuration line that adds an effect of a kind at a location with a known parameter value."""
     return f"model.effects: [{{kind: {kind}, location: {location}, values: {{{quantity}: {value:.3g}}}}}]"
 
 
 def check_inertial_effort_excitation(
     arm: RecordedJointsModel, recording: Recording, effort: SensorOptions
 ) -> Iterator[Issue]:
-    """Issue where efforts due to speed and acceleration do not exceed the noise of measured efforts.
+    """Yield an issue if efforts due to speed and acceleration do not exceed the noise of measured efforts.
 
     Weight and stiffness can be found from static configurations; damping, friction and inertia only from these efforts,
     taken from inverse dynamics and friction of a typical size. The arm `has_all_angles_recorded` in it.
@@ -256,7 +256,7 @@ def _noise(joints: JointGroup, names: Sequence[str], effort: SensorOptions) -> A
 def check_joint_excitation(
     recordings: Sequence[Recording], asked: Mapping[str, Sequence[str]], position: SensorOptions
 ) -> Iterator[Issue]:
-    """Issues of joints that have free parameters, `asked` by joint, but hardly move in any recording."""
+    """Yield issues about joints with free parameters (`asked`, by joint) that hardly move in any recording."""
     for joint, parameters in asked.items():
         widest, limit, name = 0.0, QUALITY_LIMITS.min_joint_motion, ""
         for recording in recordings:
@@ -340,7 +340,7 @@ class _Fit(NamedTuple):
 
 
 def check_efforts_by_inverse_dynamics(arm: RecordedJointsModel, recording: Recording) -> list[Issue]:
-    """Issues of recorded efforts that disagree with the inverse dynamics of the recorded motion."""
+    """Issues about recorded efforts that disagree with the inverse dynamics of the recorded motion."""
     joints = recording.joints
     motion = None if joints is None else _smoothed_motion(joints, arm.joint_names)
     if joints is None or motion is None or motion.effort is None or len(motion.t) < 10:

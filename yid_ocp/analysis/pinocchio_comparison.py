@@ -61,7 +61,7 @@ class _PinocchioComparison:
 
 
 def compare_system_with_pinocchio(system: System, theta: Array, posture: Array) -> _PinocchioComparison:
-    """Compare the built system, its parameters at `theta`, with Pinocchio's model of the same joints and bodies.
+    """Compare a system with parameters `theta` with Pinocchio's model of the same joints and bodies.
 
     The posture (n,) [rad or m] is compared besides `_N_RANDOM_CONFIGURATIONS` drawn ones.
     """
@@ -79,7 +79,7 @@ def compare_urdf_with_pinocchio(
     locked: Mapping[str, float] | None = None,
     exclude_links: Sequence[str] = (),
 ) -> _PinocchioComparison:
-    """Compare a robot as this package read it from URDF with Pinocchio's reading of the same file.
+    """Compare this package's model of a URDF robot with Pinocchio's model of the same file.
 
     `mechanism` is what `read_urdf` made of it with the same `joints` (all movable ones when absent), values `locked` of
     those that were not kept [rad or m], and `exclude_links`, left out with all that hangs on them; gravity (3,) is in

@@ -59,7 +59,7 @@ def _point_frames(system: System, group: PointGroup, choice: SensorOptions) -> d
 
 
 def check_robot_held_points(arm: RecordedJointsModel, recording: Recording, choice: _SensorChoices) -> Iterator[Issue]:
-    """Issues of points whose positions disagree with the forward kinematics of the recorded angles."""
+    """Yield issues about points whose positions disagree with the forward kinematics of the recorded angles."""
     joints, tree = recording.joints, arm.system.mechanism
     if joints is None or median_sample_period(joints.t) <= 0:
         return
@@ -237,7 +237,7 @@ def _distances(arm: RecordedJointsModel | None, system: System, theta: Array, fr
 def check_point_distances(
     arm: RecordedJointsModel | None, system: System, theta: Array, recording: Recording, choice: _SensorChoices
 ) -> Iterator[Issue]:
-    """Issues of object points farther from root or each other than the length along the object, which only bends."""
+    """Yield issues about points farther from the root or each other than the length along the object between them."""
     mechanism = system.mechanism
     for group in recording.points:
         frames = _point_frames(system, group, choice(group.name))
@@ -275,7 +275,7 @@ def check_point_distances(
 
 
 def check_object_points_by_rollout(episode: Episode, result: EpisodePrediction, size: float) -> Iterator[Issue]:
-    """Issues of points grossly off a rollout at the parameters' initial values, beside the object's `size` [m]."""
+    """Yield issues about points far from the rollout at initial parameters, relative to the object's `size` [m]."""
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         names = samples.sensor.point_names
         if not names or not size > 0:
@@ -314,7 +314,7 @@ def _changed_pose(seen: Array, place: Array, pose: Array) -> Iterator[_Change]:
 
 
 def check_cable_point_geometry(cable: CableTopology, recording: Recording, gravity: Array) -> Iterator[Issue]:
-    """Issues of cable points whose edge lengths differ from the undeformed shape, or that lie above the clamps."""
+    """Yield issues about cable points with edge lengths unlike the undeformed shape or positions above the clamps."""
     for group in recording.points:
         at = {name: group.position[:, group.names.index(name)] for name in cable.vertices if name in group.names}
         edges = [edge for edge in cable.edges if edge[0] in at and edge[1] in at]

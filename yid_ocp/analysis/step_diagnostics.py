@@ -25,7 +25,7 @@ _DIFFERENCE_STEP = 1e-5
 
 @dataclass(frozen=True)
 class CheckedStepLinearisation:
-    """Linearised step at a state (q, p, z), with its deviation from finite differences."""
+    """Linearisation A, B of a step at a state (q, p, z), with its deviations from finite differences."""
 
     state: Array
     a: Array  # A_k, shape (nx, nx)
@@ -36,7 +36,7 @@ class CheckedStepLinearisation:
 
 
 def step_size_summary(step: Step) -> dict[str, Any]:
-    """Sizes of a step's vectors, number of unknowns, nonzeros of d(residual)/d(unknowns), operations of its functions.
+    """Sizes of a step: vector lengths, number of unknowns, Jacobian nonzeros, and operations of its functions.
 
     `unknowns` are the free coordinates, internal coordinates and multipliers that Newton's iteration solves for.
     """
@@ -76,7 +76,7 @@ def linearise_and_check(step: Step, state: Array, torque: Array, theta: Array, p
 def linearise_step_equations(
     step: Step, state: Array, torque: Array, theta: Array, path: Array
 ) -> StepEquationLinearizations:
-    """Linearised equations of the step from a state (nx,), torque (nu,) [N m] and path (nc,), by all parameters too."""
+    """Linearised step equations at a state (nx,), torque (nu,) [N m] and path (nc,), with parameter derivatives."""
     n = step.sizes["n"]
     q1, p1, lam, status = step(state[:n], state[n : 2 * n], torque, theta, (path, path), state[2 * n :])
     pair = np.stack([state, np.concatenate([q1, p1, status.internal_coordinates])])
@@ -84,7 +84,7 @@ def linearise_step_equations(
 
 
 def system_with_numeric_parameters(system: System, theta: Array) -> System:
-    """The system with numeric parameter values in place of symbols, internal coordinates at zero."""
+    """The system with numeric parameter values in place of symbols, and internal coordinates at zero."""
     inner = ca.vertcat(ca.SX(0, 1), *system.internal_coordinate_symbols.values())
     symbols = ca.vertcat(system.parameters.symbols, inner)
     values = np.concatenate([theta, np.zeros(inner.numel())])
@@ -136,7 +136,7 @@ class ParameterDetectability:
 
     @property
     def description(self) -> str:
-        """Sentences on the equation rows, then on the change of readings from rest and along the recordings."""
+        """Sentences on the rows that contain the parameter, and on the readings' change with the parameter."""
         said = f"{self.parameter} enters {self._rows}"
         if self.directly_dependent_sensors:
             said += f"; the reading of {', '.join(self.directly_dependent_sensors)} depends on it directly"
@@ -175,7 +175,7 @@ def parameter_rows_and_sensor_responses(
     theta: Array,
     stages: StepEquationLinearizations,
 ) -> tuple[ParameterDetectability, ...]:
-    """Dependence of the step equations and of a recording's sensors on every parameter, about a state (nx,).
+    """For each parameter, the step equations that contain it and the sensors' response to it about a state (nx,).
 
     A unit is added to one row of one step that starts at `state`; with A - B_u K the steps after it are linear, K the
     tracking filter's first gain. The row is seen to first order where a reading answers within `_RESPONSE_STEPS` steps.
@@ -482,7 +482,7 @@ def nlp_stage_sparsity(
 
 
 def full_nlp_size(stage: _NlpStage, steps: Sequence[int]) -> dict[str, int]:
-    """Size of the NLP with a node at every step, of several recordings, whose numbers of steps are given.
+    """Size of the NLP with a node at every step, for recordings with the given numbers of `steps`.
 
     `jacobian_nonzeros` counts those of the constraints, `hessian_nonzeros` both triangles of the exact Hessian of the
     steps' constraints times their multipliers; what measurements add to it is not counted, and the start is linear in
@@ -526,7 +526,7 @@ def _nlp_sparsity_masks(stage: _NlpStage, steps: int) -> tuple[BoolArray, BoolAr
 
 
 def kkt_sparsity_pattern(stage: _NlpStage, steps: int) -> SparsityPattern:
-    """Sparsity of the KKT matrix [[H, J'], [J, 0]] of a recording's first steps, as if every node were measured."""
+    """Sparsity of the KKT matrix [[H, J'], [J, 0]] of a recording's first steps, with a measurement at every node."""
     jacobian, hessian, measured = _nlp_sparsity_masks(stage, steps)
     blank = np.zeros((len(jacobian), len(jacobian)), bool)
     mask = np.vstack([np.hstack([hessian | measured, jacobian.T]), np.hstack([jacobian, blank])])

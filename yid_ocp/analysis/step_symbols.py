@@ -83,7 +83,7 @@ class _FormulaText:
 
 
 def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
-    """Number of operations that evaluate all expressions, each shared one counted once."""
+    """Number of operations that evaluate all expressions; shared subexpressions count once."""
     function = _function(expressions, variables)
     skipped = (*_LEAF_OPERATIONS, ca.OP_OUTPUT, ca.OP_PARAMETER)
     return sum(function.instruction_id(i) not in skipped for i in range(function.n_instructions()))
@@ -92,7 +92,7 @@ def count_operations(expressions: Sequence[ca.SX], variables: ca.SX) -> int:
 def format_expressions(
     expressions: Sequence[ca.SX], variables: ca.SX, names: Sequence[_SymbolName], latex: bool = False
 ) -> _FormulaText:
-    """Scalar expressions as text or LaTeX, with the names of the variables (k, 1), all symbols that may occur."""
+    """Scalar expressions as text or LaTeX; `names` are those of the variables (k, 1), the only symbols in them."""
     nodes, results = _nodes(_function(expressions, variables), len(expressions))
     uses = [0] * len(nodes)
     for used in itertools.chain(*(parts for op, parts, _ in nodes if op not in _LEAF_OPERATIONS), results):
@@ -183,13 +183,13 @@ class SymbolBlock:
 
     @property
     def full_names(self) -> tuple[str, ...]:
-        """Full names, `q1[T1_0_x]`; those of parameters and of the time step are their labels."""
+        """Full names such as `q1[T1_0_x]`; parameters and the time step have the label alone."""
         return tuple(label if self.name in ("theta", "time_step") else f"{self.name}[{label}]" for label in self.labels)
 
 
 @dataclass(frozen=True)
 class EquationOrDerivativeFormula:
-    """Formula of an equation of a step or, where a column is named, of its derivative by it, and variables in it."""
+    """Formula of one step equation or, if a column is named, of its derivative with respect to that variable."""
 
     row_name: str
     column_name: str
@@ -199,21 +199,21 @@ class EquationOrDerivativeFormula:
 
     @property
     def title(self) -> str:
-        """The entry's name as a formula, `d ROW / d COLUMN` for a derivative."""
+        """Name of the equation, or `d ROW / d COLUMN` for a derivative."""
         return f"d {self.row_name} / d {self.column_name}" if self.column_name else self.row_name
 
     @property
     def is_identically_zero(self) -> bool:
-        """Whether it is zero for every state."""
+        """Whether the expression is zero for every state."""
         return bool(self.expression.is_zero())
 
     def numeric_value(self, variables: ca.SX, at: Array) -> float:
-        """Numeric value of the entry at values (k,) of the variables."""
+        """Numeric value of the expression at values `at` (k,) of the variables (k, 1)."""
         return float(ca.Function("value", [variables], [ca.densify(self.expression)])(at))
 
     @property
     def text_lines(self) -> list[str]:
-        """Text lines of the whole expression, its shared parts first."""
+        """Text lines of the whole formula, with shared subexpressions first."""
         if self.is_identically_zero:
             return [f"{self.title} = 0 whatever the state"]
         said = [_headline(self.title, self.formula.n_operations, self.variable_names)]
@@ -223,7 +223,7 @@ class EquationOrDerivativeFormula:
 
 @dataclass(frozen=True, repr=False)
 class StepSymbols(ReprMixin):
-    """Equations of one step with named rows and columns.
+    """Symbolic equations of one time step, with named rows (equations) and columns (variables).
 
     Rows are in the blocks `del` (DEL equations; at a prescribed coordinate what is left is -h times its effort),
     `internal`, `constraint`, and `p1`, the momentum after the step; columns in `q0`, `p0`, `z0`, `u`, `theta`,
@@ -242,7 +242,7 @@ class StepSymbols(ReprMixin):
 
     @staticmethod
     def from_equations(equations: DiscreteEquations) -> StepSymbols:
-        """Named rows and columns of a step's equations."""
+        """Build the named rows and columns from the discrete equations of a step."""
         e, system = equations, equations.system
         joints, internal = system.mechanism.joint_names, tuple(system.internal_coordinate_symbols)
         closed = tuple(name for grasp in system.grasps for name in grasp.constraint_equation_names)
@@ -268,12 +268,12 @@ class StepSymbols(ReprMixin):
 
     @property
     def row_names(self) -> tuple[str, ...]:
-        """Full names of all rows, in order."""
+        """Full names of all rows (equations), in order."""
         return tuple(name for block in self.row_blocks for name in block.full_names)
 
     @property
     def column_names(self) -> tuple[str, ...]:
-        """Full names of all columns, in order."""
+        """Full names of all columns (variables), in order."""
         return tuple(name for block in self.column_blocks for name in block.full_names)
 
     @cached_property
@@ -282,12 +282,12 @@ class StepSymbols(ReprMixin):
 
     @cached_property
     def column_symbols(self) -> ca.SX:
-        """Symbols of all columns, one below the other."""
+        """Symbols of all columns (variables) as one column vector."""
         return ca.vertcat(*(block.expressions for block in self.column_blocks))
 
     @cached_property
     def jacobian_sparsity_pattern(self) -> ca.Sparsity:
-        """Sparsity of the Jacobian of all rows by all columns."""
+        """Sparsity of the Jacobian of all rows (equations) with respect to all columns (variables)."""
         found: ca.Sparsity = ca.jacobian_sparsity(self._row_expressions, self.column_symbols)
         return found
 

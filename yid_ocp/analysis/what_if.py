@@ -39,7 +39,7 @@ _MAX_CHANGE_SET_SIZE = 3
 
 @dataclass(frozen=True)
 class ExperimentChange:
-    """One change of an experiment.
+    """One change of an experiment: a mechanical change, another measured frame or a camera rate.
 
     Its name is `weld`, `second_arm`, `motion`, `travel`, `torque`, `camera:FRAME`, `arm:FRAME` or `rate:HERTZ`.
     """
@@ -54,9 +54,9 @@ class ExperimentChange:
 
 @dataclass(frozen=True)
 class ChangedExperimentResult:
-    """Predicted identifiability of an experiment with some changes; without verdicts where it could not be evaluated.
+    """Predicted identifiability of an experiment with some changes; no verdicts if it could not be evaluated.
 
-    The gain is that of information, 1/2 log det(1 + 16 I) over relative changes [nat], for a prior standard deviation
+    The gain is information gain, 1/2 log det(1 + 16 I) over relative changes [nat], for a prior standard deviation
     of 400 % of each parameter.
     """
 
@@ -150,7 +150,7 @@ def what_if(
 def evaluate_change_sets(
     setting: RecordedExperiment, sets: Sequence[Sequence[str]], inflation: float
 ) -> list[ChangedExperimentResult]:
-    """Predicted results with each of several sets of changes by name, variances `inflation` times what is stated."""
+    """Predicted result of each set of named changes, with stated variances multiplied by `inflation`."""
     outcomes = _Outcomes(setting, inflation)
     known = {change.name: change for change in outcomes.possible}
     return outcomes.of_all([[known[name] for name in names] for names in sets])

@@ -51,7 +51,7 @@ class _ParameterShift:
 
 @dataclass(frozen=True)
 class BaselineComparison:
-    """The baseline runs and the shift of every parameter from them."""
+    """Comparison of a fit with baseline runs: the runs, their agreement, and the shift of every parameter."""
 
     baseline_runs: tuple[str, ...]  # folders or names of the earlier runs
     is_baseline_explained: bool  # whether the model explained their recordings
@@ -70,7 +70,7 @@ class BaselineComparison:
 def with_baseline_prior(problem: EstimationProblem, baseline: RunEstimates) -> EstimationProblem:
     """Return the problem with a baseline's estimates as a joint prior and its parameters free.
 
-    `ConfigError`: parameters or effects that the model does not have, or that differ from recording to recording here.
+    Raises `ConfigError` for parameters or effects that the model lacks, or that differ between its recordings.
     """
     names, parameters = baseline.parameter_names, problem.system.parameters
     for name in names:
@@ -108,7 +108,7 @@ class BaselineData:
 
     @staticmethod
     def from_runs(runs: Sequence[RunEstimates], without: tuple[Recording, ...]) -> BaselineData:
-        """Combine the estimates of several runs into one baseline."""
+        """Combine the estimates of several runs, and reference recordings `without` the effect, into a baseline."""
         if not runs:
             return BaselineData(None, (), 0.0, 1.0, without)
         known, chi2, degrees = pool_estimates(runs)
@@ -141,7 +141,7 @@ class BaselineData:
         return BaselineComparison(self.baseline_runs, baseline.is_fit_adequate, labels, *between, tuple(shifts))
 
     def has_changed_parameters(self, fit: RefittedModel, limits: Thresholds) -> bool:
-        """Whether any parameter of `fit` differs significantly from the earlier runs."""
+        """Whether any parameter of `fit` differs significantly from the earlier runs; False without runs."""
         found = self.compare_with_baseline(fit, limits)
         return found is not None and bool(found.changed_parameters)
 
@@ -150,8 +150,8 @@ class BaselineData:
     ) -> CounterfactualPredictionErrors | None:
         """Predict reference recordings with the effects of `last` removed, and the diagnosed ones with them added.
 
-        None without effects or reference recordings. Without earlier runs what is known of the world without the
-        effects is estimated on the reference recordings.
+        None without effects or reference recordings. Without earlier runs, the parameters of the system without the
+        effects are estimated on the reference recordings.
         """
         without, known = self.reference_recordings, self.combined_estimates
         if not last.effects or not without:
@@ -227,7 +227,7 @@ class CounterfactualPredictionErrors:
     effects_added: _PredictionErrors
 
     def to_dict(self) -> dict[str, Any]:
-        """The test as a dictionary, `counterfactual` of `yid-diagnosis/2`."""
+        """The prediction errors as a dictionary, the entry `counterfactual` of `yid-diagnosis/2`."""
         return {"removed": self.effects_removed.to_dict(), "added": self.effects_added.to_dict()}
 
 

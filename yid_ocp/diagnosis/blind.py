@@ -52,7 +52,7 @@ _MIN_CASES_PER_EXPERIMENT = 3  # cases below which an experiment is not worth it
 
 @dataclass(frozen=True)
 class PlannedBlindCase:
-    """A planned case: experiment, category and effect size."""
+    """Plan of one blind case: number, experiment, category and effect size."""
 
     number: int
     experiment: str
@@ -67,7 +67,7 @@ def plan_blind_cases(
     chains: frozenset[str] = frozenset(),
     purpose: str = ENSEMBLE_PURPOSES[0],
 ) -> list[PlannedBlindCase]:
-    """Return the planned cases of an ensemble, in an order given by the seed.
+    """Return `count` planned blind cases, distributed over experiments by `weights` and ordered by the seed.
 
     The weights are how large a part of the cases each experiment gets; fewer than `_MIN_CASES_PER_EXPERIMENT` are none,
     but for the largest. The objects of `chains` can be made of finer links. `ConfigError` where there is no case.
@@ -132,7 +132,7 @@ _GRIPPER_TRAVEL, _SHARED_GRIPPER_TRAVEL = 0.15, 0.08
 
 @dataclass(frozen=True)
 class CaseGroundTruth:
-    """True effects and parameters of a case, sealed until scoring."""
+    """Label of a blind case: its true effects and parameters, sealed until scoring."""
 
     case: str
     category: str  # null, single, pair, outside, left_out or finer_chain
@@ -147,14 +147,14 @@ class CaseGroundTruth:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> CaseGroundTruth:
-        """The label of which `to_dict` made the dictionary."""
+        """The label, restored from a dictionary that `to_dict` made."""
         injected = tuple(InjectedEffect(**entry) for entry in data["injected"])
         return CaseGroundTruth(**{**data, "injected": injected})
 
 
 @dataclass(frozen=True)
 class BlindCase:
-    """Recordings and candidate exclusions of a case, as given to the diagnosis."""
+    """A blind case as given to the diagnosis: recordings and the effect kinds excluded from the candidates."""
 
     name: str
     estimation_recordings: tuple[Recording, ...]
@@ -163,13 +163,13 @@ class BlindCase:
 
 
 def labels_json_and_sha256(labels: Sequence[CaseGroundTruth]) -> tuple[str, str]:
-    """Return the labels as JSON text and its SHA-256 hash, published before the diagnosis."""
+    """Return the labels as JSON text, and the text's SHA-256 hash, which is published before the diagnosis."""
     text = json.dumps([label.to_dict() for label in labels], indent=1, sort_keys=True, allow_nan=False)
     return text, hashlib.sha256(text.encode()).hexdigest()
 
 
 def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
-    """Read sealed labels; `DataError` where the text is not the one that was committed to."""
+    """Read sealed labels from JSON `text`; raise `DataError` if its SHA-256 hash is not `commitment`."""
     if hashlib.sha256(text.encode()).hexdigest() != commitment:
         raise DataError("the labels are not those that were committed to", where="sealed labels")
     return [CaseGroundTruth.from_dict(entry) for entry in json.loads(text)]
@@ -177,7 +177,7 @@ def open_sealed_labels(text: str, commitment: str) -> list[CaseGroundTruth]:
 
 @dataclass(frozen=True)
 class SyntheticRecordingConditions:
-    """Settings of the synthetic recordings of an experiment."""
+    """Settings of an experiment's synthetic recordings: number, sensor noise, simulation and camera."""
 
     estimation_count: int = 1  # to estimate on; one more is held out
     arm_noise: ArmSensorNoise = field(default_factory=ArmSensorNoise)
@@ -248,7 +248,7 @@ class BlindCaseGenerator:
         name: str,
         links: int = 1,
     ) -> Recording:
-        """Simulate one recording with injected effects; it carries no description or truth."""
+        """Simulate one recording with injected effects; the recording has no description and no ground truth."""
         nominal, posture = self.simulated_system, self.initial_configuration
         system = nominal if links == 1 or self._finer is None else self._finer(links)
         values = truth if links == 1 else scale_parameters_to_more_links(nominal, system, truth)
@@ -277,14 +277,14 @@ class BlindCaseGenerator:
         )
 
     def candidate_sensitivities_to_json(self) -> list[dict[str, Any]]:
-        """Return the sensitivity of every candidate, which gives its detectable size, JSON-compatible."""
+        """Return JSON-compatible sensitivities of all candidates, from which their detectable sizes follow."""
         return [
             {"effect": effect.label, "shape": dict(shape), "columns": factor.tolist()}
             for effect, shape, factor in self._detectable
         ]
 
     def load_candidate_sensitivities(self, detectable: Sequence[Mapping[str, Any]]) -> None:
-        """Take the candidates' sensitivities that `candidate_sensitivities_to_json` returned in another process."""
+        """Set the candidates' sensitivities to those that `candidate_sensitivities_to_json` returned elsewhere."""
         by_label = {effect.label: effect for effect in self._effects}
         self._detectable = tuple(
             (by_label[own["effect"]], dict(own["shape"]), np.atleast_2d(np.array(own["columns"], float)))
@@ -297,7 +297,7 @@ class BlindCaseGenerator:
         return EstimationProblem(nominal.step, list(recordings), nominal.free, nominal.options, values)
 
     def draw_planned_case(self, wanted: PlannedBlindCase) -> tuple[BlindCase, CaseGroundTruth]:
-        """Draw a planned case, the same for the same seed and purpose; `ModelError` if no draw can be simulated."""
+        """Draw recordings and label of a planned case, as its seed determines; `ModelError` if no draw succeeds."""
         name = f"case_{wanted.number:03d}"
         purposes = [f"estimate_{i}" for i in range(self.conditions.estimation_count)]
         for attempt in range(MAX_CASE_DRAWS):
@@ -405,7 +405,7 @@ def simulate_random_motion(
     rng: np.random.Generator,
     conditions: SyntheticRecordingConditions,
 ) -> Recording:
-    """Simulate a random motion planned for the nominal system and `truth`; `values` are those of the simulated one."""
+    """Simulate a random motion, planned with the nominal system at `truth`, with the `simulated` system at `values`."""
     travel = _GRIPPER_TRAVEL if len(nominal.grasps) < 2 else _SHARED_GRIPPER_TRAVEL
     excitation = MultisineOptions(gripper_travel=travel, duration=conditions.simulation.duration)
     seed = int(rng.integers(2**31))
@@ -422,7 +422,7 @@ def simulate_random_motion(
 
 
 def first_recorded_driven_joint_positions(system: System, recording: Recording) -> dict[str, float]:
-    """Return the initial positions of the driven joints of a recording; `ConfigError` where one is not recorded."""
+    """Return the first recorded position of every driven joint, by name; `ConfigError` if one is not recorded."""
     joints = recording.joints
     names = [] if joints is None else list(joints.names)
     missing = [name for name in system.driven if name not in names]
@@ -433,7 +433,7 @@ def first_recorded_driven_joint_positions(system: System, recording: Recording) 
 
 
 def scale_parameters_to_more_links(nominal: System, finer: System, truth: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters of the same tubes with more links: joint springs and dampers scaled by their number."""
+    """Return the parameters of the same tubes with more links; joint stiffness and damping are scaled to match."""
     start = dict(zip(nominal.parameters.names, map(float, nominal.parameters.vector()), strict=True))
     finer_start = dict(zip(finer.parameters.names, map(float, finer.parameters.vector()), strict=True))
     values = dict(truth)
@@ -457,7 +457,7 @@ def diagnose_blind_case(
     candidates: CandidateChoice = "all",
     thresholds: Thresholds | None = None,
 ) -> DiagnosisResult:
-    """Diagnose a blind case from its recordings alone."""
+    """Diagnose a blind case from its recordings and exclusions, without its label."""
     problem, held_out = ensemble._nominal_problem(case.estimation_recordings), [case.held_out_recording]
     return diagnose(problem, candidates, held_out, thresholds=thresholds, exclude=case.excluded_kinds)
 
@@ -465,7 +465,7 @@ def diagnose_blind_case(
 def true_effects_gap_closure(
     ensemble: BlindCaseGenerator, case: BlindCase, label: CaseGroundTruth, candidates: CandidateChoice = "all"
 ) -> float:
-    """Return the held-out closure of the true effects after a refit, the best a diagnosis could reach."""
+    """Return the fraction of the held-out gap that a refit of the true effects closes; NaN if the refit fails."""
     problem = ensemble._nominal_problem(case.estimation_recordings)
     effects = make_candidate_effects(problem.system, case.estimation_recordings, candidates)
     composed = AllCandidatesProblem.from_problem(problem, effects, [case.held_out_recording])

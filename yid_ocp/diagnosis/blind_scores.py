@@ -29,7 +29,7 @@ _VERDICTS = ("no_gap", "unknown", "insufficient_data", "effect", "confusable")
 
 @dataclass(frozen=True)
 class BlindCaseScore:
-    """Score of one diagnosis against its label."""
+    """Score of one blind diagnosis against its label: correct answers, gap closure, errors and time."""
 
     case: str
     category: str
@@ -73,7 +73,7 @@ class BlindCaseScore:
 def score_blind_case(
     label: CaseGroundTruth, result: Mapping[str, Any], best: float = math.nan, seconds: float = math.nan
 ) -> BlindCaseScore:
-    """Score a `yid-diagnosis/2` result against its label; `best` is of `true_effects_gap_closure`."""
+    """Score a `yid-diagnosis/2` result against its label; `best` is the closure by `true_effects_gap_closure`."""
 
     def labels(entries: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
         return tuple(f"{e['kind']}@{e['location']}" for e in entries)
@@ -150,7 +150,7 @@ def _binomial_proportion(hits: Sequence[bool]) -> dict[str, float | int | None]:
 
 
 def detection_and_false_alarm_rates(marks: Sequence[BlindCaseScore]) -> dict[str, Any]:
-    """Rates of false alarms, detection, right answers and more over an ensemble; None for a rate without cases."""
+    """Rates of false alarms, detections, correct answers and more over an ensemble; a rate without cases is None."""
 
     def mean(values: Sequence[float]) -> float | None:
         return float(np.mean(values)) if len(values) else None
@@ -241,7 +241,7 @@ _Statistic = Callable[[_Statistics, Thresholds, str], float]
 
 
 def permissive_thresholds(limits: Thresholds) -> Thresholds:
-    """Return thresholds by which any residual is a gap and the best candidate is added, to see how far chance goes."""
+    """Return thresholds that make any residual a gap and accept the best candidate, to calibrate against chance."""
     sure = 1.0 + 1e-9
     return replace(
         limits,
@@ -356,7 +356,7 @@ def calibrate_thresholds(
     limits: Thresholds = DEFAULT_THRESHOLDS,
     coverage: float = _TARGET_COVERAGE,
 ) -> dict[str, Any]:
-    """Return conformal quantiles for thresholds, and what each would do to the ensemble, as `yid-calibration/1`.
+    """Return conformal quantiles as thresholds, and the effect of each on the ensemble, as `yid-calibration/1`.
 
     Labels, marks and answers are of the same cases. An answer is a `result` with its `statistics`, and those with open
     thresholds (`open`) where no gap was seen; `limits` are those by which it was given.

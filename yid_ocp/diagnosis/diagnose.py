@@ -459,7 +459,7 @@ def fit_nominal_model(
     store: RefitStore | None = None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel:
-    """Return the fit of the nominal model within the problem with all candidates; `SolverError` if it cannot move."""
+    """Return the nominal model's fit within the problem with all candidates; `SolverError` if it cannot be fitted."""
     known = load_stored_refit(composed, (), store)
     if known is not None and composed.problem.has_process_noise:
         known = load_stored_refit(composed.whitened_at(known.values), (), store)

@@ -47,7 +47,7 @@ _FORMAT = "yid-diagnosis/2"
 
 @dataclass(frozen=True)
 class NominalParameterChange:
-    """Change of a nominal parameter between the nominal model and the model with the effects."""
+    """Change of one nominal parameter: value in the nominal model and in the model with the accepted effects."""
 
     name: str
     unit: str
@@ -58,7 +58,7 @@ class NominalParameterChange:
 
 @dataclass(frozen=True, repr=False)
 class DiagnosisResult(ReprMixin):
-    """The result of a diagnosis: verdict, gap, locations, effects and the statistics behind them."""
+    """Result of a diagnosis: verdict, gap, locations, effects and the statistics on which they are based."""
 
     verdict: str  # effect, confusable, no_gap, unknown or insufficient_data
     noise_floor: tuple[AssumedChannelNoiseLevel, ...]
@@ -106,7 +106,7 @@ class DiagnosisResult(ReprMixin):
 
     @property
     def accepted_effects(self) -> tuple[EffectBase, ...]:
-        """Effects accepted by the verdict, in the order they were added; empty unless effect or confusable."""
+        """Effects of an `effect` or `confusable` verdict, in the order they were added; empty for other verdicts."""
         named = self.verdict in ("effect", "confusable")
         return tuple(entry.effect for entry in self.selected_effects) if named else ()
 
@@ -116,7 +116,7 @@ class DiagnosisResult(ReprMixin):
         return self.selected_effects[-1].refitted_model if self.accepted_effects else self.nominal_model
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as `yid-diagnosis/2`, JSON-compatible."""
+        """Return the result as a JSON-compatible dictionary in the format `yid-diagnosis/2`."""
         smoothed, accepted, since = self.smoother_result, self.accepted_effects, self.baseline_comparison
         cuts = "recording kept=kept_duration whole=full_duration"
         carried = "effect=effect_label parameter value=estimation_value std=estimation_std again=held_out_value"
@@ -177,7 +177,7 @@ class DiagnosisResult(ReprMixin):
 
 
 def decision_statistics_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
-    """Return the statistics compared with `Thresholds`, JSON-compatible, from which these are calibrated.
+    """Return the statistics that are compared with `Thresholds` as a JSON-compatible dictionary, for calibration.
 
     `p_value` and `chi2_per_dof` of the null test (of both residuals together), `largest_channel` (chi2/n of the worst
     channel), `candidate` (p-value of the best, as the best of so many), `evidence` (rise of the log evidence by unknown
@@ -219,7 +219,7 @@ def _behind(fit: RefittedModel, first: RefittedModel) -> dict[str, float]:
 
 
 def final_model_to_dict(finding: DiagnosisResult) -> dict[str, Any]:
-    """Return `model` of result.json: parameters of the final model and its effects, and the free ones' covariance."""
+    """Return the final model for result.json: its parameters and effects, and the free parameters' covariance."""
     fit = finding.final_model
     problem, shared = fit.problem, fit.problem.shared_parameters
     idle = {entry.effect.label for entry in finding.detectability} - {effect.label for effect in fit.effects}
@@ -351,7 +351,7 @@ def _separating_experiment(rivals: Sequence[EffectBase]) -> str:
 def recommended_experiment_text(
     verdict: str, added: Sequence[SelectedEffect], where: Sequence[GapLocation], seen: Sequence[DetectableAmplitudes]
 ) -> str:
-    """Return the sentence that recommends the next recording, by verdict, place of the gap and confusable effects."""
+    """Return a sentence that recommends the next recording, from verdict, gap location and confusable effects."""
     rivals = next((entry.equivalent_effects for entry in added if len(entry.equivalent_effects) > 1), ())
     if rivals and verdict != "insufficient_data":
         return _separating_experiment(rivals)
@@ -369,7 +369,7 @@ def recommended_experiment_text(
 def insufficient_data_message(
     verdict: str, before: NullTestResult, unknowns: int, seen: Sequence[DetectableAmplitudes], limits: Thresholds
 ) -> str:
-    """Return why the data are insufficient; empty if they suffice."""
+    """Return a message why the data are insufficient; the empty string if they suffice."""
     if verdict != "insufficient_data":
         return ""
     if not any(entry.is_detectable for entry in seen):
@@ -380,7 +380,7 @@ def insufficient_data_message(
 
 
 def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
-    """Return the sentence on how far the nominal model follows a held-out recording."""
+    """Return a sentence on how far the nominal model follows a truncated held-out recording."""
     if cut.kept_duration == 0:
         return f"The nominal model cannot follow {cut.recording} at all, which is left out."
     part = f"{cut.kept_duration:.3g} of {cut.full_duration:.3g} s"
@@ -569,7 +569,7 @@ def _event_sentences(events: EventSet) -> str:
 
 
 def ignored_after_overspeed_messages(events: EventSet) -> list[str]:
-    """Return one sentence for each recording whose end is ignored because a joint moves too fast."""
+    """Return a sentence for each recording whose end is ignored because a joint exceeds `max_joint_speed`."""
     said, why = "s on nothing is judged in", "moves too fast for the model to follow."
     return [f"From {e.start_time:.3g} {said} {e.recording}, where {e.joint} {why}" for e in events.overspeeds]
 

@@ -79,7 +79,7 @@ class ForceOrFaultEvent:
         return min(self.end_time, other.end_time) - max(self.start_time, other.start_time)
 
     def to_dict(self) -> dict[str, Any]:
-        """The event as a dictionary, an entry of `events` in result.json."""
+        """The event as a dictionary, which is an entry of `events` in result.json."""
         names = "recording location channel kind from=start_time to=end_time impulse peak=peak_value unit"
         return attributes_to_json(self, f"{names} std=impulse_std")
 
@@ -95,7 +95,7 @@ class _Overspeed:
 
 @dataclass(frozen=True)
 class EventSet:
-    """All events of a diagnosis by recording and time, overspeeds, and the unknown force where an event is."""
+    """Events of a diagnosis by recording and time, recordings' overspeeds, and force estimates at the events."""
 
     disturbances: tuple[ForceOrFaultEvent, ...] = ()
     overspeeds: tuple[_Overspeed, ...] = ()
@@ -105,13 +105,13 @@ class EventSet:
         return bool(self.disturbances or self.overspeeds)
 
     def has_same_disturbances(self, other: EventSet) -> bool:
-        """Whether both hold events of the same channels at overlapping times."""
+        """Whether both sets have the same number of events, in the same channels at overlapping times."""
         pairs = list(zip(self.disturbances, other.disturbances, strict=False))
         same = [(a.recording, a.channel) == (b.recording, b.channel) and a._overlap(b) > 0 for a, b in pairs]
         return len(self.disturbances) == len(other.disturbances) and all(same)
 
     def split_force_from_other_events(self) -> tuple[EventSet, EventSet]:
-        """The force events alone, and the other events with the overspeeds."""
+        """Two sets: the force events alone, and all other events with the overspeeds."""
         forces, others = (tuple(e for e in self.disturbances if (e.kind == "force") is of) for of in (True, False))
         return EventSet(forces), EventSet(others, self.overspeeds)
 
@@ -134,7 +134,7 @@ def find_force_and_fault_events(
     smoothed: SmootherResult | None,
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> EventSet:
-    """Find events in all recordings of a problem that are more than chance, by the false-discovery rate of all windows.
+    """Find significant events in all recordings of a problem, at a false-discovery rate over all time windows.
 
     The problem is whitened by the sensors' noise and has all samples; `x` (nx,) is its fit, at which `evaluation` has a
     Jacobian where there is `smoothed`. Forces that move the model are sought where the smoother found some.

@@ -38,7 +38,7 @@ model is lost already, and a fit on less of the recording may fail earlier."""
 def make_candidate_effects(
     system: System, recordings: Sequence[Recording], choice: CandidateChoice
 ) -> list[EffectBase]:
-    """Return the candidate effects, excluding those of the nominal model `system`.
+    """Return the candidate effects for a system, without the effects that its nominal model already has.
 
     The choice is "all", or names of the form `kind` (wherever a diagnosis tries it) or `kind@location`. `ConfigError`:
     no such kind, one that has no place here, an effect of the nominal model, an empty list; `ModelError`: no such
@@ -90,18 +90,18 @@ def exclude_candidates(effects: Sequence[EffectBase], names: Sequence[str]) -> l
 
 
 def neutral_effect_parameter_values(effects: Sequence[EffectBase]) -> dict[str, float]:
-    """Return the parameter values at which some effects are absent, by parameter name."""
+    """Return the parameter values, by name, at which the given effects change nothing."""
     return {name: value for effect in effects for name, value in effect.neutral_values.items()}
 
 
 def join_effect_labels(effects: Sequence[EffectBase]) -> str:
-    """Join the labels `kind@location` of several effects by "and"; "the nominal model" for none."""
+    """Join the effects' labels `kind@location` with "and"; return "the nominal model" if there are no effects."""
     return " and ".join(effect.label for effect in effects) or "the nominal model"
 
 
 @dataclass(frozen=True)
 class TruncatedHeldOutRecording:
-    """A held-out recording truncated where the nominal model stops following it."""
+    """Name and durations of a held-out recording that is truncated where the nominal model stops following it."""
 
     recording: str
     kept_duration: float  # how much of it is compared [s]; 0 where nothing is
@@ -124,7 +124,7 @@ class AllCandidatesProblem:
     def from_problem(
         problem: EstimationProblem, effects: Sequence[EffectBase], held_out: Sequence[Recording] = ()
     ) -> AllCandidatesProblem:
-        """Build from a problem and its candidates; `DataError` if a recording is both estimated on and held out."""
+        """Add candidate effects to a problem; `DataError` if a recording is both estimated on and held out."""
         effects = tuple(effects)
         joint = compile_step_like(problem.step, problem.step.system.with_effects(effects))
         estimate = [episode.recording for episode in problem.episodes]
@@ -145,7 +145,7 @@ class AllCandidatesProblem:
         return self.problem.free
 
     def whitened_at(self, values: Mapping[str, float]) -> AllCandidatesProblem:
-        """Return the problem whitened by sensor noise and torque noise, linearised at these unknowns."""
+        """The problem with residuals whitened by sensor and torque noise; the filters are linearised at `values`."""
         # twice in a row, so that what is frozen is about the offsets that the torques have there
         x = self.problem.vector(values)
         return replace(self, problem=problem_with_whitened_held_out(problem_whitened_at(self.problem, x, rounds=2), x))
@@ -176,12 +176,12 @@ class AllCandidatesProblem:
         return replace(self, problem=cut, is_split_in_blocks=self.is_split_in_blocks or not kept), tuple(cuts)
 
     def with_free_effects(self, effects: Sequence[EffectBase]) -> EstimationProblem:
-        """Return the problem with the nominal parameters and those of some effects free."""
+        """Return the estimation problem with the nominal parameters and the parameters of `effects` free."""
         own = (name for effect in effects for name in effect.parameters.names)
         return self.problem.with_compiled_parameters_free((*self.nominal_free_parameters, *own))
 
     def relinearized_with_effects(self, effects: Sequence[EffectBase], at: Mapping[str, float]) -> EstimationProblem:
-        """Return the problem with some effects free, relinearised about the torque errors that remain with them.
+        """Return the problem with `effects` free; filters are relinearised about the torque offsets at the values `at`.
 
         Filters of held-out recordings are left as they are: see `with_held_out_relinearized`.
         """
@@ -191,7 +191,7 @@ class AllCandidatesProblem:
     def with_held_out_relinearized(
         self, own: EstimationProblem, effects: Sequence[EffectBase], at: Mapping[str, float]
     ) -> EstimationProblem:
-        """Return a `relinearized_with_effects` problem with held-out recordings relinearised too, after a fit."""
+        """Return `own` of `relinearized_with_effects` with held-out filters relinearised at the fitted values."""
         return problem_with_relinearized_held_out(own, *_beside(own, effects, at)) if own.has_process_noise else own
 
 
@@ -239,5 +239,5 @@ def _masked(episode: Episode, parity: int) -> Episode:
 
 
 def mask_out_samples(samples: Measurements, hidden: BoolArray) -> Measurements:
-    """Return measurements of which some samples, shape (M, k), do not count."""
+    """Return measurements in which the samples of the mask `hidden` (M, k) do not count."""
     return replace(samples, value=np.where(hidden, np.nan, samples.value), weight=np.where(hidden, 0.0, samples.weight))

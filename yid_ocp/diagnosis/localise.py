@@ -19,7 +19,7 @@ _MAX_NAMED_LOCATIONS = 3  # places that are named at most
 
 @dataclass(frozen=True)
 class GapLocation:
-    """A location with its share of the gap."""
+    """A location in the model or sensors with its share of the gap, observability and time windows."""
 
     location: str
     gap_share: float  # of the gap that can be located; all shares add up to one
@@ -29,7 +29,7 @@ class GapLocation:
 
 
 def main_gap_locations(where: Sequence[GapLocation]) -> tuple[GapLocation, ...]:
-    """Return the locations to report: shares above `_MIN_NAMED_SHARE`, at most three, at least one."""
+    """Return the locations to report: those with a share above `_MIN_NAMED_SHARE`, or the first, at most three."""
     return tuple([place for place in where if place.gap_share > _MIN_NAMED_SHARE] or where[:1])[:_MAX_NAMED_LOCATIONS]
 
 
@@ -40,9 +40,9 @@ def _by_share(places: Iterable[GapLocation]) -> tuple[GapLocation, ...]:
 def gap_locations_by_smoother_evidence(
     smoothed: SmootherResult, location_z: float = DEFAULT_THRESHOLDS.location_z
 ) -> tuple[GapLocation, ...]:
-    """Return all locations by their share of the log evidence, largest first, then observable ones without a share.
+    """Return all locations with their share of the log evidence, largest first; at equal shares observable ones first.
 
-    The gap is there when an unknown is `location_z` standard deviations away from zero.
+    A location's time windows are those in which an unknown is over `location_z` standard deviations from zero.
     """
     groups: dict[str, list[SmoothedUnknownGroup]] = {}
     for source in smoothed.log_evidence_drop:
@@ -62,7 +62,7 @@ def gap_locations_by_smoother_evidence(
 
 
 def is_significantly_nonzero(trace: SmoothedUnknowns, columns: Sequence[int], limit: float) -> BoolArray:
-    """Whether some unknowns are further from zero than `limit` standard deviations, shape (J, columns)."""
+    """Mask (J, columns) of the unknowns that are more than `limit` standard deviations from zero."""
     std = np.maximum(trace.posterior_std[:, columns], 1e-12)
     return np.asarray(np.abs(trace.posterior_mean[:, columns]) > limit * std)
 
@@ -79,7 +79,7 @@ def _windows(
 
 
 def merge_time_intervals(spans: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
-    """Merge overlapping or adjacent time intervals."""
+    """Merge overlapping or adjacent time intervals; return them in order of time."""
     joined: list[tuple[float, float]] = []
     for begin, end in sorted(spans):
         if joined and begin <= joined[-1][1] + 1e-9:
@@ -95,7 +95,7 @@ def gap_locations_by_effect_closure(
     rest: Sequence[GapLocation],
     windows: tuple[tuple[float, float], ...],
 ) -> tuple[GapLocation, ...]:
-    """Return locations with shares by the closure of the effects there, the rest shared out by the smoother.
+    """Return locations with gap shares by the closure of effects there; the smoother distributes the rest.
 
     `before` and `rest` are the locations of the nominal model and of the model with the effects, `closed` is the part
     that the effects at each close, `windows` serve locations without an unknown of the smoother (`world`, `clock`).
@@ -120,9 +120,9 @@ def gap_locations_by_effect_closure(
 def smoothed_unknown_z_scores(
     smoothed: SmootherResult, recording: int = 0, informed_fraction: float = DEFAULT_THRESHOLDS.informed_fraction
 ) -> tuple[Array, tuple[str, ...], Array]:
-    """Return edges (J + 1,) [s], names, and values (J, nd) of a recording's unknowns over their posterior std.
+    """Return interval edges (J + 1,) [s], names and z scores (J, nd), mean over posterior std, of the unknowns.
 
-    They are NaN unless 1 - posterior/prior variance is above `informed_fraction`.
+    Scores are NaN unless 1 - posterior/prior variance is above `informed_fraction`.
     """
     trace = smoothed.smoothed_unknowns[recording]
     prior = np.array([smoothed.group_variance[source] for source in trace.unknown_groups])
@@ -133,13 +133,13 @@ def smoothed_unknown_z_scores(
 
 
 def smoothed_unknown_units(system: System, trace: SmoothedUnknowns) -> tuple[str, ...]:
-    """Return the SI unit of every unknown of a trace: force or torque, push, grasp offset or sensor bias."""
+    """Return the SI unit of every smoothed unknown in `trace`: force, torque, push, grasp offset or sensor bias."""
     pairs = zip(trace.unknown_names, trace.unknown_groups, strict=True)
     other = {"push": "N", "offset": "m", "bias": "m"}
     return tuple(generalised_force_unit(system, name) if of.kind == "force" else other[of.kind] for name, of in pairs)
 
 
 def generalised_force_unit(system: System, coordinate: str) -> str:
-    """Return the SI unit of the generalised force at a coordinate, N or N m."""
+    """Return the SI unit of the generalised force at a coordinate: N for a prismatic joint, else N m."""
     kinds = {joint.name: joint.kind for joint in system.mechanism.joints}
     return "N" if kinds.get(coordinate) == "prismatic" else "N m"

@@ -42,7 +42,7 @@ _RELINEARIZE_Z = 1.0  # stated standard deviations of a torque's offset: an effe
 
 @dataclass(frozen=True)
 class HeldOutLoss:
-    """Whitened squared prediction error of a model on the held-out recordings, by block of time, shape (nb,) each."""
+    """Whitened squared prediction errors (nb,) of a model in nb time blocks of the held-out recordings."""
 
     block_chi2: Array  # sums of whitened squares; infinite where a rollout failed
     block_sample_counts: Array
@@ -52,12 +52,12 @@ class HeldOutLoss:
 
     @property
     def total_chi2(self) -> float:
-        """Sum of squares, the contradiction to a baseline counted in."""
+        """Sum of whitened squares over all blocks, plus the chi2 of the deviation from a baseline."""
         return float(self.block_chi2.sum()) + self.baseline_chi2
 
     @property
     def chi2_per_sample(self) -> float:
-        """Sum of whitened squares divided by the number of held-out samples, chi2/n; 1 is noise alone."""
+        """`total_chi2` divided by the number n of held-out samples; 1 is expected of noise alone."""
         return self.total_chi2 / max(float(self.block_sample_counts.sum()), 1.0)
 
     @property
@@ -68,7 +68,7 @@ class HeldOutLoss:
 
 @dataclass(frozen=True)
 class StoredFit:
-    """The result of a refit as stored: one evaluation restores its `RefittedModel`."""
+    """Stored result of a refit: values and standard deviations, from which one evaluation restores `RefittedModel`."""
 
     values: dict[str, float]  # of every unknown
     std: dict[str, float]  # inflated by the misfit as in `solve`; infinite where the data say nothing
@@ -78,7 +78,7 @@ class StoredFit:
 
 @dataclass(frozen=True)
 class RefittedModel(StoredFit):
-    """The nominal model with some effects, fitted again, with its standard deviations and held-out loss."""
+    """The nominal model with some effects after a refit: values, standard deviations, evaluation and held-out loss."""
 
     effects: tuple[EffectBase, ...]
     problem: EstimationProblem  # of the composed system, with the nominal parameters and those of the effects free
@@ -89,27 +89,27 @@ class RefittedModel(StoredFit):
 
     @property
     def effect_parameter_count(self) -> int:
-        """Number of the effects' parameters."""
+        """Number of parameters of all effects in the model."""
         return sum(len(effect.parameters) for effect in self.effects)
 
     def reported_parameters(self, effect: EffectBase) -> dict[str, ReportedParameter]:
-        """Return an effect's parameters in reported units, with standard deviations."""
+        """Return an effect's fitted parameters in reported units with standard deviations, by name."""
         return effect.reported_parameters(self.values, self.std)
 
 
 class RefitStore(Protocol):
-    """Store of finished refits of one diagnosis, which an interrupted diagnosis reads; called by two threads."""
+    """Interface of a store of finished refits, from which an interrupted diagnosis resumes; two threads call it."""
 
     def get(self, name: str) -> StoredFit | None:
-        """The refit of this name, None where it is not known."""
+        """Return the refit stored under a name; None if there is none."""
 
     def put(self, name: str, refitted: StoredFit) -> None:
-        """Keep a refit under a name."""
+        """Store a refit under a name."""
 
 
 @dataclass(frozen=True)
 class NominalSolutionAndRefitStore:
-    """What is known before a diagnosis begins: the nominal problem's solution, and refits of an interrupted run."""
+    """Results known before a diagnosis begins: the nominal problem's solution, and refits of an interrupted run."""
 
     solution: Solution | None = None
     store: RefitStore | None = None  # told of every further refit
@@ -117,7 +117,7 @@ class NominalSolutionAndRefitStore:
 
 @dataclass(frozen=True)
 class RefitContext:
-    """Problem, thresholds, progress, store and time shared by all refits of one diagnosis."""
+    """Problem, thresholds, progress, store and deadline that all refits of one diagnosis share."""
 
     problem: AllCandidatesProblem
     thresholds: Thresholds
@@ -128,7 +128,7 @@ class RefitContext:
     left_by: dict[str, str] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
 
     def skip_if_late(self, *what: str) -> bool:
-        """Whether the time for refits is spent; what it leaves untried is noted."""
+        """Whether the deadline for refits has passed; if so, `what` is noted as skipped."""
         is_late = time.perf_counter() >= self.deadline
         self.skipped.extend(what if is_late else ())
         return is_late
@@ -151,7 +151,7 @@ def refit_with_effects(
     name: str = "",
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> RefittedModel | None:
-    """Fit the nominal parameters and those of some effects, and predict held-out recordings; None if it never runs.
+    """Fit nominal and effect parameters and predict held-out recordings; return None if no rollout succeeds.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def refit_with_effects(
 def load_stored_refit(
     problem: AllCandidatesProblem, effects: Sequence[EffectBase], store: RefitStore | None, name: str = ""
 ) -> RefittedModel | None:
-    """Return a refit from the store, evaluated once; None if the store does not have it."""
+    """Return a refit restored from the store by one evaluation; None if the store does not have it."""
     known = None if store is None else store.get(name or join_effect_labels(effects))
     unknowns = {*problem.with_free_effects(effects).unknown_names}
     amplitudes = {amplitude for effect in effects for amplitude in effect.amplitude_names}
@@ -332,7 +332,7 @@ def refit_with_each_effect(
     values: Mapping[str, float],
     where: str = "",
 ) -> list[RefittedModel]:
-    """Refit the model with each of several effects or pairs added to those of `base`; return the refits that succeed.
+    """Refit the model with each of several effects or pairs added to `base`; return the refits that succeed.
 
     Each of those `tried` stands beside the parameters at which it begins, `values` is where all other unknowns begin,
     and `where` says so in the store if the same effects are refitted from elsewhere too.
@@ -406,7 +406,7 @@ def _held_out_loss(problem: EstimationProblem, x: Array) -> HeldOutLoss:
 
 
 def held_out_channel_errors(found: Sequence[tuple[Episode, EpisodePrediction | str]]) -> dict[str, tuple[float, str]]:
-    """Root mean square error and its unit by channel, over the held-out recordings that could be predicted."""
+    """Root mean square error and unit, by channel, over the held-out recordings that could be predicted."""
     predicted = [(result, episode) for episode, result in found if not isinstance(result, str)]
     errors = rmse_unit_and_count_by_channel(*map(list, zip(*predicted, strict=True))) if predicted else {}
     return {name: (float(entry["rmse"]), str(entry["unit"])) for name, entry in errors.items()}

@@ -44,7 +44,7 @@ class _EffectSignature:
 
 @dataclass(frozen=True)
 class AllCandidatesLinearization:
-    """Residual and signatures of all candidates, linearised at one point."""
+    """Residual and candidate signatures linearised at one point, with the model's free parameters projected out."""
 
     projected_residual: Array  # P r, shape (nr,)
     signatures: tuple[_EffectSignature, ...]  # one for each candidate and grid value
@@ -52,7 +52,7 @@ class AllCandidatesLinearization:
 
 @dataclass(frozen=True)
 class DetectableAmplitudes:
-    """Smallest detectable amplitudes of a candidate, from sensitivity and noise alone."""
+    """Smallest amplitudes of a candidate that would be detected, from sensitivity and noise alone."""
 
     effect: EffectBase
     detectable_amplitudes: dict[str, float]  # in the parameter's unit
@@ -61,7 +61,7 @@ class DetectableAmplitudes:
 
 @dataclass(frozen=True)
 class CandidateScore:
-    """Score test (Lagrange multiplier) of a candidate on the residual."""
+    """Result of a candidate's score test (Lagrange multiplier): predicted values, chi2 decrease and p-value."""
 
     effect: EffectBase
     predicted_values: dict[str, float]  # amplitudes after the step of the linear model, and the shape values
@@ -83,7 +83,7 @@ def linearize_candidates(
     values: Mapping[str, float],
     grid: int = DEFAULT_THRESHOLDS.shape_grid_size,
 ) -> AllCandidatesLinearization:
-    """Return the residual and the signatures of all candidates that are not yet in the model.
+    """Linearise the residual at `values` in the amplitudes of all candidates that are not yet in the model.
 
     Effects of `base` are in the model with all their parameters free, `values` are the unknowns of its fit, and `grid`
     is the number of values of every shape parameter. `SolverError` where the model cannot be rolled out there.
@@ -130,7 +130,7 @@ def _basis(matrix: Array) -> Array:
 def candidate_detectable_amplitudes(
     point: AllCandidatesLinearization, z: float = DEFAULT_THRESHOLDS.detectable_amplitude_z
 ) -> tuple[DetectableAmplitudes, ...]:
-    """Return the smallest detectable amplitudes of every candidate: of `z` standard deviations."""
+    """Return the smallest amplitudes of every candidate that are detectable at `z` standard deviations."""
     found: dict[str, DetectableAmplitudes] = {}
     for signature in point.signatures:
         effect, neutral = signature.effect, signature.effect.neutral_values
@@ -189,7 +189,7 @@ def score_candidates(
     series: Sequence[ResidualChannelIndices],
     visible: Sequence[DetectableAmplitudes],
 ) -> tuple[CandidateScore, ...]:
-    """Return the score of every detectable candidate, largest predicted decrease of r'r first."""
+    """Return the score test of every detectable candidate, largest predicted decrease of r'r first."""
     seen = {entry.effect.label for entry in visible if entry.is_detectable}
     scores: dict[str, list[CandidateScore]] = {}
     for signature in point.signatures:
@@ -250,13 +250,13 @@ def _values(effect: EffectBase, step: Array) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class ConfusabilityMatrix:
-    """Fractions of each candidate's signature that the others explain, beyond what the nominal parameters can."""
+    """Fractions of each candidate's signature that each other explains, beyond what nominal parameters explain."""
 
     labels: tuple[str, ...]
     overlap_fractions: Array  # shape (nj, nj): of row j's signature by column i's
 
     def confusable_with(self, label: str, limit: float) -> tuple[str, ...]:
-        """Return the candidates that explain at least the fraction `limit` of one candidate's signature."""
+        """Return labels of the other candidates that explain at least the fraction `limit` of one's signature."""
         row = self.overlap_fractions[self.labels.index(label)]
         return tuple(n for n, f in zip(self.labels, row, strict=True) if f >= limit and n != label)
 
@@ -279,7 +279,7 @@ class AllCandidatesScoreModel:
         return np.split(np.arange(len(self.score_vector)), np.cumsum([len(e.amplitude_names) for e in self.effects]))
 
     def ranked_pairs(self, among: Sequence[str]) -> Iterator[_CandidatePair]:
-        """Yield all pairs of the candidates with these labels, largest decrease of r'r first.
+        """Yield all pairs of the candidates labelled in `among`, largest predicted decrease of r'r first.
 
         What two effects do together neither need do alone: one of them may hide in what the other leaves.
         """
@@ -305,7 +305,7 @@ class AllCandidatesScoreModel:
 def make_joint_score_model(
     point: AllCandidatesLinearization, chosen: Sequence[CandidateScore] = ()
 ) -> AllCandidatesScoreModel:
-    """Return the joint linear model of all candidates, at the scores' shape values or the middle of the grid."""
+    """Return the joint linear model of all candidates, at the shape values of `chosen` or the middle of the grid."""
     shape = {s.effect.label: {n: s.predicted_values[n] for n in s.effect.shape_parameter_names} for s in chosen}
     groups: dict[str, list[_EffectSignature]] = {}
     for signature in point.signatures:
@@ -319,7 +319,7 @@ def make_joint_score_model(
 
 
 def confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMatrix:
-    """Return the matrix of signature fractions that candidates explain, amplitudes scaled by prior range."""
+    """Return the signature fractions that candidates explain of each other, with amplitudes scaled by prior range."""
     ranges = [effect.prior_ranges[name] for effect in everything.effects for name in effect.amplitude_names]
     scale = np.array([(high - low) / 2 for low, high in ranges])
     gram = everything.information * scale[:, None] * scale
@@ -350,7 +350,7 @@ def screen_candidates(
     values: Mapping[str, float],
     limits: Thresholds = DEFAULT_THRESHOLDS,
 ) -> ScreeningResult:
-    """Screen all candidates except those of `base`: detectability, score and confusability."""
+    """Screen all candidates not in `base`; return their detectability, scores and confusability at `values`."""
     point = linearize_candidates(problem, base, values, limits.shape_grid_size)
     visible = candidate_detectable_amplitudes(point, limits.detectable_amplitude_z)
     ranked = score_candidates(point, residual_channel_indices(problem.problem), visible)

@@ -35,7 +35,7 @@ _N_BOOTSTRAP = 1000  # draws of held-out blocks for the interval of a closure
 
 @dataclass(frozen=True)
 class GapClosure:
-    """Fraction of the held-out gap that a model closes, with its 95 % interval; NaN if there was no gap."""
+    """Fraction of the held-out gap that a model closes, with its 95 % interval; NaN if there is no gap."""
 
     fraction: float
     ci_low: float
@@ -48,7 +48,7 @@ UNDEFINED_GAP_CLOSURE = GapClosure(math.nan, math.nan, math.nan)
 
 @dataclass(frozen=True)
 class SelectedEffect:
-    """An effect added by the selection, with the refitted model of its round."""
+    """An effect added by forward selection, with its refitted model, cumulative closure and equivalent effects."""
 
     effect: EffectBase
     refitted_model: RefittedModel  # with all effects up to this one
@@ -128,7 +128,7 @@ def _noise_difference(fit: RefittedModel, other: RefittedModel, limits: Threshol
 
 
 def penalized_chi2_difference(fit: RefittedModel, other: RefittedModel) -> float:
-    """Return r'r of `fit` minus that of `other` over all recordings, fitted and held out, with parameter penalty.
+    """Return r'r of `fit` minus r'r of `other`, over fitted and held-out recordings, plus a parameter penalty.
 
     Every parameter counts as the one by which chance alone lowers r'r.
     """
@@ -186,7 +186,7 @@ def _is_rmse_reduced(before: HeldOutLoss, after: HeldOutLoss, limits: Thresholds
 
 
 def relative_rmse_reduction(before: HeldOutLoss, after: HeldOutLoss) -> float:
-    """Return the relative reduction of the held-out RMSE: the larger of all channels together and the best channel."""
+    """Return the relative reduction of the held-out RMSE, of all channels or the best channel, whichever is larger."""
     channels = [name for name in before.channel_rmse if name in after.channel_rmse]
     pairs = [(np.sqrt(before.chi2_per_sample), np.sqrt(after.chi2_per_sample))]
     pairs += [(before.channel_rmse[name][0], after.channel_rmse[name][0]) for name in channels]

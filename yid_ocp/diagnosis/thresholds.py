@@ -20,7 +20,7 @@ from yid_ocp.options import OptionInfo
 class Thresholds(SmootherThresholds):
     """Thresholds of every step of a diagnosis: null test, screening, refits, selection, localisation and events.
 
-    What each is stands beside it; the same texts are in the settings' reference (section `diagnosis`).
+    Every field has its description beside it; the settings' reference (section `diagnosis`) repeats them.
     """
 
     # is there a gap
@@ -104,7 +104,7 @@ class Thresholds(SmootherThresholds):
 
     @property
     def null_test_limits(self) -> ExcessResidualCriteria:
-        """Limits of the null test, which `solve` uses as well."""
+        """Significance level and smallest excess of the null test, in the form that `solve` uses as well."""
         return ExcessResidualCriteria(self.significance_level, self.min_excess_chi2)
 
 

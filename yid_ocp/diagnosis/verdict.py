@@ -28,7 +28,7 @@ _DISAGREEMENT_Z = 2.0  # standard deviations beyond which two fits disagree
 
 @dataclass(frozen=True)
 class ParameterTransferCheck:
-    """One parameter of an effect, estimated on the estimation recordings and again on the held-out ones."""
+    """Comparison of one effect parameter's estimates from the estimation recordings and from the held-out ones."""
 
     effect_label: str
     parameter: str
@@ -41,20 +41,20 @@ class ParameterTransferCheck:
 
     @property
     def both_estimates_text(self) -> str:
-        """Text of both estimates with their standard deviations and unit."""
+        """Text with both estimates, their standard deviations and unit."""
         here = f"{self.estimation_value:.3g} ± {self.estimation_std:.2g} {self.unit} on the recordings to estimate on"
         there = f"{self.held_out_value:.3g} ± {self.held_out_std:.2g} on the held-out ones"
         return f"{self.effect_label}.{self.parameter} is {here} and {there}"
 
     @property
     def estimate_difference_and_std(self) -> tuple[float, float]:
-        """Absolute difference of the two estimates, and its standard deviation."""
+        """Absolute difference between the two estimates, and its standard deviation."""
         spread = math.hypot(self.estimation_std, self.held_out_std)
         return abs(self.estimation_value - self.held_out_value), spread
 
 
 def check_parameter_transfer(search: RefitContext, fit: RefittedModel) -> tuple[ParameterTransferCheck, ...]:
-    """Refit the effects on the held-out recordings and compare every amplitude.
+    """Refit the effects on the held-out recordings and compare each amplitude with its estimate in `fit`.
 
     Empty if one recording is split, or if the model cannot be fitted there, which is no evidence against it.
     """
@@ -94,7 +94,7 @@ def _compare(
 
 
 def fit_with_disagreement_in_std(fit: RefittedModel, entries: Sequence[ParameterTransferCheck]) -> RefittedModel:
-    """Return the fit with amplitude standard deviations inflated by the disagreement between the recordings.
+    """Return the fit with standard deviations increased for amplitudes that disagree between the recordings.
 
     Where two fits differ by more than `_DISAGREEMENT_Z` standard deviations of both together, each is known to the
     spread of the two, the difference over the square root of two.
@@ -119,9 +119,9 @@ def has_significant_gap(
     ranked: Sequence[CandidateScore] = (),
     offsets: bool = False,
 ) -> bool:
-    """Whether the residual exceeds noise significantly and by a relevant amount.
+    """Whether the residual, as a whole or along a candidate's signature, exceeds noise by a relevant amount.
 
-    Either as a whole, or along what a candidate would do to it with some channel above noise: the sum over all channels
+    Along a candidate's signature some channel must be above noise too; the sum over all channels
     does not notice what only a few samples show. A candidate alone has to be surer than that sum. An offset of a torque
     beyond what was stated needs no such channel where `offsets` are stated: it is one number among thousands.
     """
@@ -142,7 +142,7 @@ def is_barely_significant_and_unexplained(
     held_out: NullTestResult,
     limits: Thresholds,
 ) -> bool:
-    """Whether an excess is barely significant and no unknown or candidate explains it, so that it counts as chance.
+    """Whether an excess counts as chance: barely significant, and explained by no unknown or candidate.
 
     A sure excess without shape stays a gap: stated noise that is too small looks like that.
     """
@@ -158,7 +158,7 @@ def decide_verdict(
     reason: UnknownVerdictReason,
     added: Sequence[SelectedEffect],
 ) -> str:
-    """Return the verdict; `enough`: whether there are samples enough for the unknowns."""
+    """Return the verdict of a diagnosis; `enough` states whether there are enough samples for the unknowns."""
     if not enough or not any(entry.is_detectable for entry in visible):
         return "insufficient_data"
     if not gap:
@@ -169,12 +169,12 @@ def decide_verdict(
 
 
 def effect_count_with_each_kind_once(added: Sequence[SelectedEffect]) -> int:
-    """Number of independent assumptions: a kind at several locations counts once, local effects count each."""
+    """Number of independent assumptions in effects: one for each kind, but one for each local effect."""
     return len({entry.effect.label if entry.effect.is_local else entry.effect.kind for entry in added})
 
 
 def required_fraction_of_smoother_chi2(added: Sequence[SelectedEffect], limits: Thresholds) -> float:
-    """Return the fraction of the smoother's explained chi2 that the effects are required to explain.
+    """Return the fraction of the chi2 explained by the smoother that the effects are required to explain.
 
     Each further assumption has to explain that part of what could be left.
     """
@@ -184,7 +184,7 @@ def required_fraction_of_smoother_chi2(added: Sequence[SelectedEffect], limits: 
 def find_unknown_verdict_reason(
     added: Sequence[SelectedEffect], total: GapClosure, limits: Thresholds, explained: float, carried: bool
 ) -> UnknownVerdictReason:
-    """Return why a gap has no accepted effect; empty if it has one.
+    """Return the code of the reason why no effect is accepted for a gap; empty if one is accepted.
 
     Effects have to explain the part `required_fraction_of_smoother_chi2` of what the smoother explains where the model
     was fitted; a single assumption passes too where the lower 95 % bound of its held-out closure reaches
@@ -203,7 +203,7 @@ def find_unknown_verdict_reason(
 def explained_fraction_of_smoother_chi2(
     nominal: RefittedModel, added: Sequence[SelectedEffect], smoothed: SmootherResult | None
 ) -> float:
-    """Return the effects' decrease of r'r as a fraction of the smoother's, both less degrees of freedom; else one."""
+    """Return the effects' decrease of r'r over the smoother's, less degrees of freedom each; 1 if not defined."""
     if smoothed is None or not added:
         return 1.0
     last = added[-1].refitted_model

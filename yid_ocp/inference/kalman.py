@@ -28,7 +28,7 @@ from yid_ocp.integrator.step_model import out_of_memory_error
 
 @dataclass(frozen=True)
 class FilterStateTransition:
-    """Transition x' = (M (s, p1 + ... + pg), f p) of the state x = (s, p), p being g groups of equal slopes."""
+    """State transition x' = (M (s, p1 + ... + pg), f p) of a filter; x = (s, p) with g parameter groups p1 to pg."""
 
     state_rows: Array  # M, shape (ns, ns + m)
     decay: Array  # f, shape (nx - ns,), nx - ns = g m
@@ -39,7 +39,7 @@ class FilterStateTransition:
         return len(self.decay) // m if m else 0, m
 
     def propagate_state(self, columns: Array) -> Array:
-        """States after the step, from those before it, as columns (nx, c)."""
+        """States (nx, c) after the step, from the states (nx, c) before it; each column is a state."""
         ns, rows, own = len(self.state_rows), self.state_rows, columns[len(self.state_rows) :]
         together = own.reshape(*self._shape, own.shape[1]).sum(axis=0)
         return np.vstack([rows[:, :ns] @ columns[:ns] + rows[:, ns:] @ together, self.decay[:, None] * own])
@@ -54,7 +54,7 @@ class FilterStateTransition:
 
 @dataclass(frozen=True)
 class KalmanStep:
-    """Measurement update with fixed gains, and transition, of one step of a linear Kalman filter.
+    """One step of a linear Kalman filter with fixed gains: a measurement update, then a state transition.
 
     A state x = (s, p) of s and parameters p is measured by y = H x + e with noise e of unit covariance, and goes on by
     x' = (M x, f p) + process noise. With the covariance P before the measurement and S = I + H P H', the normalized
@@ -67,12 +67,12 @@ class KalmanStep:
     transition: FilterStateTransition
 
     def update_and_propagate(self, mean: Array, measured: Array) -> tuple[Array, Array]:
-        """Normalized innovations (r, c) of measured columns (r, c), and the mean (nx, c) after the step."""
+        """Normalized innovations (r, c) of the measurements (r, c), and the state means (nx, c) after the step."""
         white = self.whitening @ (measured - self.observation @ mean)
         return white, self.transition.propagate_state(mean + self.projected_covariance.T @ white)
 
     def smooth_backward(self, white: Array, costate: Array) -> tuple[Array, Array]:
-        """Smoothed noise (r, c), and the costate (nx, c) before the step from that after it.
+        """Smoothed measurement noise (r, c), and the costate (nx, c) before the step, from the costate after it.
 
         The smoothed state is the filter's prediction + P costate.
         """
@@ -81,7 +81,7 @@ class KalmanStep:
         return noise, pulled + self.observation.T @ noise
 
     def costate_covariance_before_step(self, information: Array) -> Array:
-        """Covariance (nx, nx) of the costate before the step, from that after it."""
+        """Covariance (nx, nx) of the costate before the step, from its covariance `information` after the step."""
         shaped, projected = self.whitening @ self.observation, self.projected_covariance
         pulled = self.transition._propagate_costate_back(self.transition._propagate_costate_back(information).T)
         pulled -= (pulled @ projected.T) @ shaped
@@ -92,7 +92,7 @@ class KalmanStep:
 def kalman_step_and_covariance(
     covariance: Array, observation: Array, transition: FilterStateTransition
 ) -> tuple[KalmanStep, Array, float]:
-    """One filter step with fixed gains, the covariance after it (without process noise), and log det S.
+    """A filter step with fixed gains, the state covariance after it without process noise, and log det S.
 
     `covariance` is P (nx, nx) before the measurement by H (r, nx). The determinant is infinite, and S counts by its
     diagonal alone, where covariances differ by so many decades that rounding shows.
@@ -125,7 +125,7 @@ def kalman_steps_and_covariance(
     decay: Array,
     variance: Array,
 ) -> tuple[list[KalmanStep], Array]:
-    """Filter steps with fixed gains one after another, and the covariance after them; in compiled code where possible.
+    """Successive filter steps with fixed gains, and the state covariance after the last; in compiled code if possible.
 
     `moves` (k, ns, ns + m + c) are the state rows of k steps' transitions and, beside them, what c unit `noises` add to
     the states; `decay` (k, nx - ns) is that of the parameters, `variance` (k, nx - ns) that of their process noise.

@@ -23,7 +23,7 @@ from yid_ocp.problem.model_functions import ModelFunctions, TimeGridStateValues
 
 @dataclass(frozen=True)
 class NominalTrajectory:
-    """Nominal trajectory of an episode and its measurements, about which residuals are linearized.
+    """Trajectory of an episode with its delay-corrected measurements, about which the residual is linearized.
 
     Measurements are shifted by their delays to the times at which they were true. The derivatives of the start by the
     first angles and the first torque of the driven joints, shape (nx, nu), are zero where it does not follow from them.
@@ -42,7 +42,7 @@ class NominalTrajectory:
 def nominal_trajectory_from_prediction(
     predictor: EpisodePredictor, episode: Episode, result: EpisodePrediction, theta: Array
 ) -> NominalTrajectory:
-    """Nominal trajectory of an episode from its prediction, about which the residual is linearized."""
+    """Nominal trajectory of an episode, made from the episode's prediction at the parameters `theta`."""
     own, rest, sizes = predictor.theta_with_episode_values(episode, theta), result.equilibrium, predictor.step.sizes
     by_angles = by_torque = np.zeros((sizes["nx"], sizes["nu"]))
     if rest is not None:
@@ -54,9 +54,9 @@ def nominal_trajectory_from_prediction(
 
 @dataclass(frozen=True)
 class ResidualDerivativesAtNodes:
-    """Derivatives of a recording's r residuals [sensor noise] at the nodes around each sample, two or four of them.
+    """Derivatives of a recording's r residuals with respect to states and efforts at the nodes around each sample.
 
-    The shares of the interpolation are included.
+    Residuals are in units of sensor noise, depend on two or four nodes each, and include the interpolation weights.
     """
 
     node: IntArray  # first of each row's nodes, shape (r,)
@@ -67,7 +67,7 @@ class ResidualDerivativesAtNodes:
     def from_nominal_trajectory(
         course: NominalTrajectory, *, with_neighbours: bool = False
     ) -> ResidualDerivativesAtNodes:
-        """The residual's derivatives from those of the sensors along a nominal trajectory.
+        """Residual derivatives, computed from the sensors' derivatives along a nominal trajectory.
 
         A sensor that reads velocities, accelerations or constraint forces depends on four nodes, the first one before
         its sample's; `DataError` of such a sensor unless that is allowed by `with_neighbours`.
@@ -116,21 +116,21 @@ class ResidualDerivativesAtNodes:
 
     @property
     def visible_state_mask(self) -> BoolArray:
-        """Mask of the states that any of the residuals depends on, shape (nx,)."""
+        """Mask (nx,) of the states on which at least one residual depends."""
         return np.asarray(np.any(self.by_state != 0, axis=(0, 1)))
 
     def select_states(self, kept: IntArray) -> ResidualDerivativesAtNodes:
-        """The derivatives by the states at the indices `kept` alone."""
+        """The derivatives with respect to only the states at the indices `kept`."""
         return replace(self, by_state=self.by_state[:, :, kept])
 
     def select_residual_rows(self, rows: IntArray) -> ResidualDerivativesAtNodes:
-        """The derivatives of the residuals at the indices `rows` alone."""
+        """The derivatives of only the residuals at the indices `rows`."""
         return ResidualDerivativesAtNodes(self.node[rows], self.by_state[:, rows], self.by_effort[:, rows])
 
     def directional_residual_derivatives(self, by_node: Array, effort: Array, first: int) -> Array:
-        """Derivatives of the residuals in d directions (r, d), from those of states (K, nx, d) and efforts (K, nc, d).
+        """Residual derivatives (r, d) in d directions, from those of node states (K, nx, d) and efforts (K, nc, d).
 
-        They are of K nodes from `first` on; a row beyond them is read at the last.
+        The K nodes begin with `first`; a residual beyond them uses the last one.
         """
         found = np.zeros((len(self.node), by_node.shape[2]))
         for shift, (by_state, by_effort) in enumerate(zip(self.by_state, self.by_effort, strict=True)):
@@ -142,7 +142,7 @@ class ResidualDerivativesAtNodes:
         return found
 
     def residual_rows_by_node(self, last: int) -> list[IntArray]:
-        """Indices of the residuals that belong to each node, from node 0 to `last`."""
+        """Indices of the residuals whose first node is node k, one array for each k from 0 to `last`."""
         order = np.argsort(self.node, kind="stable")
         return np.split(order, np.searchsorted(self.node[order], np.arange(1, last + 1)))
 
@@ -162,7 +162,7 @@ def linearization_without_weak_priors(problem: EstimationProblem, evaluation: Ev
 
 
 def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float, lower: Array, upper: Array) -> Array:
-    """Solve min |J d + r|^2 + mu c |d|^2 with lower <= d <= upper, c the largest squared column norm."""
+    """Return the bounded step d that minimises |J d + r|^2 + mu c |d|^2; c is the largest squared column norm of J."""
     count = jacobian.shape[1]
     factor = scipy.linalg.qr(np.column_stack([jacobian, residual]), mode="r", check_finite=False)[0][: count + 1]
     small = np.zeros((count + 1, count + 1))
@@ -182,19 +182,19 @@ def bounded_levenberg_marquardt_step(jacobian: Array, residual: Array, mu: float
 
 
 def predicted_cost_reduction(jacobian: Array, residual: Array, step: Array) -> float:
-    """Reduction of 1/2 |r|^2 that the linear model predicts for a step."""
+    """Reduction of the cost 1/2 |r|^2 that the linear model predicts for a step."""
     return -float((jacobian.T @ residual) @ step) - 0.5 * float(np.sum((jacobian @ step) ** 2))
 
 
 def is_stationary_point(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> bool:
-    """Whether no step from a point (evaluated with its Jacobian) promises a relevant cost reduction."""
+    """Whether no step from `x` promises a relevant cost reduction in the linear model; False without a Jacobian."""
     noise = problem.rms_noise_of_data_residuals**2
     worth = max(_MAX_RELATIVE_REDUCTION * evaluation.cost, _MAX_NOISE_UNIT_REDUCTION * noise)
     return achievable_cost_reduction(problem, x, evaluation) <= worth
 
 
 def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: Evaluation) -> float:
-    """Cost reduction that a step up to the unknowns' size promises in the linear model; infinite without a Jacobian."""
+    """Predicted cost reduction of the best step up to each unknown's size; infinite without a Jacobian."""
     if evaluation.jacobian is None:
         return math.inf
     if not len(x):
@@ -206,7 +206,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
 def solve_step_within_unknown_sizes(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
-    """Least-squares step within the bounds, of at most the larger of value and typical size of each unknown, (nx,)."""
+    """Least-squares step (nx,) within bounds; no unknown moves by more than its value or typical size."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)

@@ -41,7 +41,7 @@ DEFAULT_EXCESS_RESIDUAL_CRITERIA = ExcessResidualCriteria()
 
 @dataclass(frozen=True)
 class ResidualChannelIndices:
-    """Times, and indices into the residual, of the samples of one scalar sensor output of a recording."""
+    """Sample times of one scalar sensor output of a recording, and the samples' indices in the residual vector."""
 
     recording: str
     channel: str
@@ -54,7 +54,7 @@ class ResidualChannelIndices:
 
 @dataclass(frozen=True)
 class AssumedChannelNoiseLevel:
-    """Median standard deviation that a problem assumes for the noise of one channel, smoothed like its samples."""
+    """Noise standard deviation that a problem assumes for one channel: the median over its (smoothed) samples."""
 
     channel: str
     unit: str
@@ -75,7 +75,7 @@ class _ResidualWindow:
 
 @dataclass(frozen=True)
 class NullTestResult:
-    """Result of the null test: chi2 per degree of freedom, and the probability of one this large under noise alone."""
+    """Null test result: chi2 per degree of freedom, and the probability that noise alone gives a value this large."""
 
     chi2_per_dof: float
     degrees_of_freedom: float  # effective ones, of autocorrelated noise
@@ -85,7 +85,7 @@ class NullTestResult:
 
 
 def assumed_channel_noise_levels(problem: EstimationProblem) -> tuple[AssumedChannelNoiseLevel, ...]:
-    """Noise levels that the problem assumes (stated, not measured), one for each channel."""
+    """Noise level that the problem assumes for each channel; the level is stated, not measured."""
     found: dict[str, list[Array]] = {}
     units: dict[str, str] = {}
     for episode in problem.episodes:
@@ -105,7 +105,7 @@ def _variance_inflation(autocorrelation: Array) -> float:
 
 
 def chi2_p_value(chi2: float, degrees: float) -> float:
-    """Probability of a chi2 at least this large; 1 without degrees of freedom."""
+    """Probability that noise alone gives at least `chi2` with `degrees` degrees of freedom; 1 for zero degrees."""
     return float(scipy.special.chdtrc(degrees, max(chi2, 0.0))) if degrees else 1.0
 
 
@@ -116,7 +116,7 @@ def run_null_test(
     level: float = DEFAULT_EXCESS_RESIDUAL_CRITERIA.significance_level,
     window: float = RESIDUAL_WINDOW_SECONDS,
 ) -> NullTestResult:
-    """Test a whitened residual (nr,), with a number of free parameters, against the hypothesis of noise alone.
+    """Test the hypothesis that a whitened residual (nr,), fitted with a number of parameters, is noise alone.
 
     Rows that belong to no series (priors) do not count. `level` is the false-discovery rate of the windows, `window`
     their length [s].
@@ -135,7 +135,7 @@ def run_null_test(
 
 
 def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
-    """Whiten a residual (nr,) by its noise and by k further independent errors, (I + F F')^(-1/2) r.
+    """Return a residual r (nr,) in noise units, whitened by k further independent errors too: (I + F F')^(-1/2) r.
 
     The `spread` F (nr, k) is the change of the residual per standard deviation of each error; non-finite columns are
     ignored.
@@ -148,7 +148,7 @@ def whiten_with_extra_errors(residual: Array, spread: Array) -> Array:
 def residuals_exceed_noise(
     tests: Sequence[NullTestResult], limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA
 ) -> bool:
-    """Whether residuals of one model, fitted or held out, exceed noise, both significantly and by a relevant size."""
+    """Whether residuals of one model, fitted or held out, exceed noise significantly and by a relevant amount."""
     significant = min_bonferroni_p_value(tests) < limits.significance_level
     return significant and max(test.chi2_per_dof for test in tests) > 1 + limits.min_excess_chi2
 
@@ -183,7 +183,7 @@ def _windows(
 
 
 def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
-    """Which of several p-values are significant at a false-discovery rate among `tries` tests, reported or not.
+    """One flag per p-value: significant at the false-discovery rate `level` among `tries` tests, passed here or not.
 
     Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x.
     """
@@ -200,7 +200,7 @@ def times_since_recording_start(episode: Episode, samples: Measurements) -> Arra
 
 
 def residual_channel_indices(problem: EstimationProblem) -> tuple[ResidualChannelIndices, ...]:
-    """Where each scalar sensor output of each recording stands in a problem's residual: times and indices."""
+    """Sample times and residual indices of each scalar sensor output of each recording of a problem."""
     series: list[ResidualChannelIndices] = []
     for episode, groups in zip(problem.episodes, problem.residual_rows.measurements, strict=True):
         for samples, rows in zip(episode.measurements, groups, strict=True):

@@ -48,7 +48,7 @@ _LATER_GROUP_TRIALS = 6  # groups tried after the first round, the most promisin
 
 @dataclass(frozen=True)
 class SmoothedUnknowns:
-    """Smoothed unknowns of one recording over its J intervals."""
+    """Smoothed unknown forces, offsets and biases of one recording: mean and standard deviation in J intervals."""
 
     recording: str
     interval_edges: Array  # shape (J + 1,) [s]
@@ -61,7 +61,7 @@ class SmoothedUnknowns:
 
 @dataclass(frozen=True)
 class SmootherResult:
-    """Result of the weak-constraint smoother: smoothed unknowns and the evidence of every group."""
+    """Result of the weak-constraint smoother: smoothed unknowns, and the evidence for every group of unknowns."""
 
     smoothed_unknowns: tuple[SmoothedUnknowns, ...]
     group_variance: dict[SmoothedUnknownGroup, float]  # at the largest evidence [squared reference]
@@ -86,7 +86,7 @@ class SmootherResult:
 
     @property
     def gap_origin(self) -> str:
-        """Origin of the gap by evidence: "none", "plant", "sensor", "both", or "either" if they are confounded."""
+        """Origin of the gap: "none", "plant", "sensor", "both", or "either" if plant and sensor are confounded."""
         if max(self.log_evidence.values()) <= 0:
             return "none"
         heaviest = max(self.log_evidence_drop, key=lambda source: self.log_evidence_drop[source])
@@ -359,7 +359,7 @@ def select_and_smooth_unknowns(
 def force_log_likelihood_coefficients(
     model: LinearResidualModel, variance: Mapping[SmoothedUnknownGroup, float], unknown: int
 ) -> tuple[Array, Array]:
-    """Return g (J,) and L (J, J) of the log likelihood g'f - f'L f / 2 of one unknown f over a recording's intervals.
+    """Return g (J,) and L (J, J) of the log likelihood g'f - f'L f / 2; f (J,) are one unknown's values by interval.
 
     f is in units of the unknown's reference; free parameters, states and all other unknowns, whose groups have these
     variances [squared reference], are integrated out.

@@ -54,7 +54,7 @@ _FORCE_POINT = "75%"  # by arc length, where a segment is pushed: near what acts
 
 @dataclass(frozen=True)
 class SmootherThresholds:
-    """How large unknowns may be, and what counts as evidence for a group of them (5 is odds of 150 to 1)."""
+    """Thresholds of the smoother: prior sizes of unknowns, and the log evidence for a group (5: odds of 150 to 1)."""
 
     min_log_bayes_factor: Annotated[
         float, Gt(0), OptionInfo("rise of the log evidence that a group of unknowns must bring")
@@ -170,7 +170,7 @@ def _unknown_forces(
 
 
 def sensor_bias_location(system: System, sensor: Sensor, frame: str) -> str:
-    """Return the location of a sensor's bias: camera, `wrist:FRAME`, the arm that holds the frame, else its group."""
+    """Return the location of a sensor's bias: camera, `wrist:FRAME`, the arm that holds the frame, or its group."""
     if sensor.camera_pose is not None:
         return "camera"
     if isinstance(sensor, MountedSensor):
@@ -244,7 +244,7 @@ class _IntervalModel:
 
 @dataclass(frozen=True)
 class LinearResidualModel:
-    """Linear state-space model of the residual of one recording, interval by interval."""
+    """Linear state-space model of one recording's residual, with one set of matrices for each time interval."""
 
     recording: str
     intervals: tuple[_IntervalModel, ...]
@@ -258,7 +258,7 @@ class LinearResidualModel:
     torque_noise_variance: Array  # that each has whatever its group's is, shape (nd,) [squared reference]
 
     def unknown_variances_from_groups(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
-        """Variances of all unknowns from those of their groups and torque noise, shape (nd,) [squared reference]."""
+        """Variances (nd,) [squared reference] of all unknowns: the variance of the group plus that of torque noise."""
         return np.array([group_variance[group] for group in self.unknown_groups]) + self.torque_noise_variance
 
 
@@ -269,9 +269,9 @@ def recording_models_with_unknown_forces(
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
     interval: float = _MIN_INTERVAL,
 ) -> tuple[LinearResidualModel, ...]:
-    """Return the linear model of every recording about its rollout at `x`, with unknown forces, offsets and biases.
+    """Return the linear residual model of every recording at `x`, with unknown forces, offsets and biases.
 
-    The evaluation is that at `x`, with its Jacobian; unknowns are constant over `interval` [s] at the least.
+    `evaluation` is that at `x`, with its Jacobian; unknowns are constant over `interval` [s] at the least.
     """
     assert evaluation.jacobian is not None
     columns = -np.column_stack([evaluation.residual, evaluation.jacobian * problem.unknown_scales])

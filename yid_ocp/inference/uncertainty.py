@@ -43,7 +43,7 @@ _MAX_CHECKED_PARAMETERS = 12
 
 @dataclass(frozen=True)
 class GoodnessOfFit:
-    """Whether the model explains the recordings on which it was fitted."""
+    """Null test of a fit: chi2, p-value, and whether the model explains the recordings on which it was fitted."""
 
     chi2_per_dof: float
     p_value: float  # probability of a chi2 this large under noise alone
@@ -71,7 +71,7 @@ class ParameterEstimate:
 
     @property
     def confidence_interval_ends(self) -> tuple[float, float]:
-        """Ends of the 95 % interval: as stated, infinite where open; else 1.96 standard deviations away."""
+        """Ends of the 95 % interval: infinite where open, and value ± 1.96 std where no interval is stated."""
         if self.interval is None:
             return self.value - 1.96 * self.std, self.value + 1.96 * self.std
         lower, upper = self.interval
@@ -83,7 +83,7 @@ def assess_goodness_of_fit(
     evaluation: Evaluation,
     limits: ExcessResidualCriteria = DEFAULT_EXCESS_RESIDUAL_CRITERIA,
 ) -> GoodnessOfFit:
-    """Null test of a fit on its own recordings, with residuals in noise units whatever the weighting."""
+    """Null test of a fit on its own recordings; residuals are in noise units whatever the problem's weighting."""
     if not evaluation.ok:
         return GoodnessOfFit(math.nan, math.nan, False)
     residual = evaluation.residual
@@ -100,7 +100,7 @@ def assess_goodness_of_fit(
 
 
 def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation: Evaluation) -> tuple[Array, float]:
-    """Return the covariance of the unknowns, from data and stated priors, and chi2 per degree of freedom.
+    """Return the covariance (nx, nx) of the unknowns from data and stated priors, and chi2 per degree of freedom.
 
     Directions that the data do not inform get a variance of (1e8 x scale)^2 rather than an infinite one.
     """
@@ -111,7 +111,7 @@ def unknowns_covariance_and_reduced_chi2(problem: EstimationProblem, evaluation:
 
 
 def unknowns_covariance_factor(problem: EstimationProblem, evaluation: Evaluation) -> Array:
-    """Square-root factor F of the covariance F F' that noise alone gives the unknowns, shape (nx, nx).
+    """Factor F (nx, nx) of the unknowns' covariance F F' that results from noise alone.
 
     The factor keeps the digits that a covariance with uninformed directions loses.
     """
@@ -180,7 +180,7 @@ def _clusters(problem: EstimationProblem) -> list[list[IntArray]]:
 
 
 def misfit_robust_covariance(problem: EstimationProblem, evaluation: Evaluation, fit: GoodnessOfFit) -> Array:
-    """Covariance of the unknowns at a fit: a sandwich that counts misfit where the model does not explain the data."""
+    """Covariance (nx, nx) of the unknowns at a fit; if the model does not explain the data, it includes the misfit."""
     covariance, _ = unknowns_covariance_and_reduced_chi2(problem, evaluation)
     return covariance if fit.explains else _misfit_sandwich_covariance(problem, evaluation, covariance)
 
@@ -218,13 +218,13 @@ def _cost_checked_std(problem: EstimationProblem, x: Array, evaluation: Evaluati
 
 
 def parameter_unknown_names(problem: EstimationProblem) -> tuple[str, ...]:
-    """Unknowns that are parameters, local ones with their recording's name; initial states are left out."""
+    """Names of the unknowns that are parameters (local ones with their recording's name), not initial states."""
     parameters = {*problem.shared_parameters, *problem.local_parameters}
     return tuple(name for name in problem.unknown_names if name.split("[")[0] in parameters)
 
 
 def std_from_covariance(covariance: Array, x: Array) -> Array:
-    """Standard deviations from a covariance, shape (nx,); infinite where it holds no numbers."""
+    """Standard deviations (nx,) from a covariance; infinite where the covariance is NaN."""
     if not len(covariance):
         return np.zeros(len(x))
     diagonal = np.diag(covariance)
@@ -232,9 +232,9 @@ def std_from_covariance(covariance: Array, x: Array) -> Array:
 
 
 def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]) -> dict[str, Any]:
-    """Names and covariance matrix for result.json, from the correlations in `matrix` (n, n) and the deviations `std`.
+    """Names and covariance for result.json, from the correlations in `matrix` (n, n) and the standard deviations.
 
-    Those that are not finite and positive are left out: nothing is known of their parameters.
+    Parameters without a finite and positive standard deviation are left out: nothing is known of them.
     """
     at = [i for i, value in enumerate(std) if math.isfinite(value) and value > 0 and matrix[i, i] > 0]
     factor = np.asarray(std, float)[at] / np.sqrt(np.diag(matrix)[at])
@@ -243,7 +243,7 @@ def covariance_to_dict(names: Sequence[str], matrix: Array, std: Sequence[float]
 
 
 def cost_without_weak_priors(problem: EstimationProblem, evaluation: Evaluation) -> float:
-    """Cost of data and stated priors in units of the noise."""
+    """Cost of the data, in noise units, plus that of stated priors, without weak priors."""
     rows = problem.residual_rows
     weak, stated = (0.5 * float(np.sum(evaluation.residual[r] ** 2)) for r in (rows.weak_priors, rows.stated_priors))
     return (evaluation.cost - weak - stated) / problem.rms_noise_of_data_residuals**2 + stated
@@ -275,7 +275,7 @@ def parameter_verdict(
 
 
 def verdict_by_relative_std(value: float, std: float, scale: float = 0.0) -> str:
-    """Verdict by relative standard deviation alone: identifiable, weak or not_identifiable."""
+    """Verdict from the relative standard deviation alone: identifiable, weak or not_identifiable."""
     if not math.isfinite(std):
         return "not_identifiable"
     relative, reach = std / max(abs(value), 1e-12), abs(value) + 2 * std
@@ -313,12 +313,12 @@ def with_profile_interval(entry: ParameterEstimate, interval: ConfidenceInterval
 
 
 def needs_no_profile_likelihood(entry: ParameterEstimate) -> bool:
-    """Whether a parameter is identifiable with a standard deviation of at most 10 %, which needs no profile."""
+    """Whether a parameter needs no profile: it is identifiable with a relative standard deviation up to 10 %."""
     return entry.verdict == "identifiable" and entry.std <= MAX_IDENTIFIABLE_RELATIVE_STD * abs(entry.value)
 
 
 def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mapping[str, float]:
-    """Plausible size of each free parameter: by its prior, its bounds, similar parameters, or its initial value.
+    """Typical magnitude of each free parameter, from its prior, its bounds, similar parameters or its initial value.
 
     A prior counts with its standard deviation, finite bounds with half of what lies between them, the others of the
     same kind (`bend`, say, or else of the same unit) with the median of their sizes.
@@ -354,9 +354,9 @@ def typical_parameter_magnitudes(problem: EstimationProblem, x: Array) -> Mappin
 def parameter_estimates(
     problem: EstimationProblem, x: Array, evaluation: Evaluation, covariance: Array, fit: GoodnessOfFit | None
 ) -> dict[str, ParameterEstimate]:
-    """Estimates of all parameters, local ones by recording, from the covariance (nx, nx) and the evaluation at `x`.
+    """Estimates of all parameters, local ones by recording, from the covariance (nx, nx) and evaluation at `x`.
 
-    Where the point is not a fit, which None stands for, misfit and bounds are ignored.
+    `fit` is None where `x` is not a fit; misfit and bounds are then ignored.
     """
     known = fit is not None and evaluation.ok and evaluation.jacobian is not None
     spread = _cost_checked_std(problem, x, evaluation, covariance) if known else std_from_covariance(covariance, x)
@@ -392,7 +392,7 @@ def parameter_estimates(
 
 
 def estimates_marked_not_trusted(known: Mapping[str, ParameterEstimate]) -> dict[str, ParameterEstimate]:
-    """Copies of estimates with the verdict not_trusted, but for fixed and not identifiable parameters."""
+    """Copies of estimates with the verdict not_trusted, except for fixed and not_identifiable parameters."""
     doubted = {name for name, entry in known.items() if entry.free and entry.verdict != "not_identifiable"}
     return {name: replace(e, verdict="not_trusted") if name in doubted else e for name, e in known.items()}
 
@@ -410,7 +410,7 @@ VERDICT_TABLE_TEXTS = {verdict: text.removeprefix("is ") for verdict, text in VE
 
 
 def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
-    """Sentence that tells whether a model explains its recordings, with advice where it does not."""
+    """Sentence that states whether a model explains its recordings, with advice if it does not."""
     if chi2_per_dof is None or chi2_per_dof != chi2_per_dof:
         return "whether the model explains the recordings is not known"
     size = f"chi2 per degree of freedom is {chi2_per_dof:.3g}"
@@ -421,7 +421,7 @@ def goodness_of_fit_message(chi2_per_dof: float | None, explains: bool) -> str:
 
 
 def value_and_uncertainty_text(value: float, std: float | None, interval: ConfidenceInterval | None) -> str:
-    """Format a value with its 95 % interval, or else its standard deviation where the data inform it."""
+    """Format a value with its 95 % interval if there is one, else with its standard deviation if there is one."""
     if interval is not None and interval != (None, None):
         return f"{value:.4g} ({interval_text(*interval)})"
     return f"{value:.4g}" if std is None else f"{value:.4g} ± {std:.2g}"
@@ -438,7 +438,7 @@ def percent_text(part: float) -> str:
 
 
 def interval_text(lower: float | None, upper: float | None) -> str:
-    """Format a 95 % interval, whose ends may be open."""
+    """Format the ends of a 95 % interval; None is an open end."""
     if lower is None and upper is None:
         return "open"
     if lower is None:

@@ -96,7 +96,7 @@ class WhiteningFilter:
     torque_bias_std: Array  # of b after all measurements, shape (nu,) [N m]
 
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Normalized innovations (r, c) of the Kalman filter, and the torque biases from all rows (nu, c) [N m].
+        """Normalized innovations (r, c) of residual columns, and torque biases (nu, c) [N m] estimated from all rows.
 
         Rows (r, c) are a residual in units of the sensors' noise, then columns of its derivative; `push` (N, nu, c) is
         the tracking filter's correction of the torque, and its derivative [N m].
@@ -226,7 +226,7 @@ def _filter_steps(
 
 
 def estimate_episode_torque_bias(episode: Episode, result: EpisodePrediction, whitening: ResidualWhitener) -> Array:
-    """Constant torque error of each driven joint, estimated from all measurements of an episode, (nu,) [N m]."""
+    """Constant torque error (nu,) [N m] of each driven joint, estimated from all measurements of an episode."""
     return whitening.whiten(_plain(episode, result)[:, None], result.torque_correction_and_sensitivity)[1][:, 0]
 
 
@@ -331,7 +331,7 @@ def problem_whitened_at(
 def problem_with_whitened_held_out(
     problem: EstimationProblem, x: ArrayLike, *, keep_weights: bool = False
 ) -> EstimationProblem:
-    """Whiten held-out residuals by all noise at `x` as well; by sensor noise alone where a rollout fails.
+    """The problem with held-out residuals whitened by all noise at `x`, or by sensor noise if a rollout fails.
 
     Filters are relinearized about the smoothed motion; `keep_weights` weighs once, which is enough for torque offsets.
     """
@@ -345,7 +345,7 @@ def problem_with_whitened_held_out(
 
 
 def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
-    """The same problem, filters relinearized from the torque offsets at `frozen` to those at `x`, weights unchanged."""
+    """The problem with filters relinearized about the torque offsets at `x`, not at `frozen`; weights unchanged."""
     parts = problem.theta_and_initial_state_offset
     at = [(e, *parts(x, i), parts(frozen, i)[0]) for i, e in enumerate(problem.episodes)]
     episodes, made = _relinearized(problem.predictor, problem.episodes, problem.whitening_filters, at)
@@ -353,7 +353,7 @@ def problem_relinearized_at_torque_bias(problem: EstimationProblem, x: Array, fr
 
 
 def problem_with_relinearized_held_out(problem: EstimationProblem, x: Array, frozen: Array) -> EstimationProblem:
-    """The same problem with held-out filters relinearized from the torque offsets at `frozen` to those at `x`."""
+    """The problem with held-out filters relinearized about the torque offsets at `x`, not at `frozen`."""
     before = problem.held_out_theta(frozen)
     at = [(*own, before) for own in problem.held_out_prediction_inputs(x)]
     held_out, made = _relinearized(problem.predictor, problem.held_out, problem.held_out_whitening_filters, at)
@@ -380,7 +380,7 @@ def _with_errors(
 
 
 def torque_biases_and_stds_by_recording(problem: EstimationProblem, x: ArrayLike) -> list[tuple[Array, Array] | None]:
-    """Each recording's constant torque errors at `x`, and their standard deviations, (nu,) [N m].
+    """Constant torque errors (nu,) [N m] at `x` and their standard deviations, one pair for each recording.
 
     None where torques are taken as exact, or where no whitening filter is set (`problem_whitened_at`).
     """
@@ -440,7 +440,7 @@ def _settled(
 def max_torque_bias_change_between_filters(
     some: Sequence[ResidualWhitener | None], others: Sequence[ResidualWhitener | None]
 ) -> float:
-    """Largest difference of the torque offsets of two sets of filters, in stated standard deviations."""
+    """Largest difference between the torque offsets of two sets of filters, in stated standard deviations."""
     pairs = zip(some, others, strict=True)
     return max((_apart(one, other) for one, other in pairs if one and other), default=0.0)
 

@@ -50,7 +50,7 @@ class _ParameterPrecision:
 
 @dataclass(frozen=True, eq=False)
 class InformativeMotionPlan(PlannedMotion):
-    """The most informative motion that was found, with predicted parameter precisions."""
+    """The most informative motion found, with predicted parameter precisions and distances between effects."""
 
     parameter_precisions: Mapping[str, _ParameterPrecision]
     # for each pair of effects, distance of the change by the first from what the second and all free unknowns can
@@ -70,7 +70,7 @@ def plan_informative_motion(
     effects: Mapping[str, Mapping[str, float]] | None = None,
     progress: Progress = NULL_PROGRESS,
 ) -> InformativeMotionPlan:
-    """Plan the motion of the arms that best identifies parameters or discriminates effects, within limits.
+    """Plan the arm motion within limits that best identifies parameters or discriminates between effects.
 
     Parameters
     ----------

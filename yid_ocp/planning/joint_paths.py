@@ -30,7 +30,7 @@ _PlanGoal = Literal["place", "path", "box", "information"]
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
-    """Limits of a planned motion: parts of the URDF's velocity and effort limits, acceleration and spring angles."""
+    """Limits of a planned motion: fractions of URDF velocity and effort limits, acceleration and spring angles."""
 
     velocity_fraction: Annotated[float, Gt(0), Le(1), OptionInfo("part of the URDF's velocity limits that is used")] = (
         0.9
@@ -116,7 +116,7 @@ class PlanOptions:
 
 
 class FramePositionFunction:
-    """Function for world positions of named frames and their Jacobian by the configuration.
+    """Numeric function for world positions of named frames and their Jacobian with respect to the configuration.
 
     Raises `ConfigError` for a frame that does not exist.
     """
@@ -135,7 +135,7 @@ class FramePositionFunction:
             self._function = ca.Function("points", [q, theta], [ca.densify(at), ca.vec(slope.T)])
 
     def positions_and_jacobian(self, q: Array, theta: Array) -> tuple[Array, Array]:
-        """Positions (N, 3 np) [m] and their Jacobian (N, 3 np, n) at configurations (N, n)."""
+        """Positions (N, 3 np) [m] of the np frames and their Jacobian (N, 3 np, n) at configurations (N, n)."""
         at, slope = (np.array(x).T for x in self._function(np.asarray(q).T, np.asarray(theta)))
         return at, slope.reshape(len(at), at.shape[1], np.shape(q)[1])
 
@@ -166,12 +166,12 @@ class SplinePath:
         return BSpline(knots, controls, _SPLINE_DEGREE).derivative(order)
 
     def coefficients_to_control_points_matrix(self, order: int = 0) -> Array:
-        """Matrix that maps coefficients to control points of the spline or of a derivative, shape (..., K)."""
+        """Matrix (..., K) from coefficients to control points of the spline or of its derivative of an order."""
         splines = self._splines(order)
         return np.asarray(splines.c[: len(splines.t) - splines.k - 1])
 
     def basis_values(self, t: Array, order: int = 0) -> Array:
-        """Values of the basis functions, or of a derivative of them, at times, shape (N, K)."""
+        """Values (N, K) of the K basis functions, or of their derivative of an order, at times `t` (N,) [s]."""
         values = self._splines(order)(np.minimum(np.asarray(t, float), self.duration))
         return np.asarray(np.where((np.asarray(t) > self.duration)[:, None] & (order > 0), 0.0, values))
 
@@ -196,7 +196,7 @@ class PathSimulator:
 
     @property
     def moved_joint_indices(self) -> list[int]:
-        """Configuration indices of the moved joints."""
+        """Indices of the moved joints in the configuration vector."""
         return list(self.step.system.prescribed_coordinate_indices)
 
     @property
@@ -205,21 +205,21 @@ class PathSimulator:
         return np.asarray(self.start_equilibrium.state[self.moved_joint_indices])
 
     def coefficient_bounds(self) -> tuple[Array, Array]:
-        """Lowest and highest coefficients that keep the joints' position limits, shape (K, nc) each."""
+        """Lower and upper bounds (K, nc) of the coefficients, within which joints keep their position limits."""
         shape, limits = (self.path.n_coefficients, 1), _position_limits(self.step.system)
         lower, upper = (np.tile(side - self.moved_joint_start_positions, shape) for side in limits)
         return lower, upper
 
     @cached_property
     def node_times(self) -> Array:
-        """Times of the nodes, shape (N + 1,) [s]."""
+        """Times of the nodes from the start of the motion, shape (N + 1,) [s]."""
         moving = round(self.path.duration / self.step.time_step)
         standing = max(1, round(self.hold_duration / self.step.time_step))
         return np.asarray(self.step.time_step * np.arange(moving + standing + 1))
 
     @cached_property
     def standstill_node_indices(self) -> IntArray:
-        """Indices of the nodes at which the joints stand still at the end."""
+        """Indices of the nodes from the end of the motion on, where the joints stand still."""
         return np.flatnonzero(self.node_times >= self.path.duration - 1e-9)
 
     @cached_property
@@ -227,11 +227,11 @@ class PathSimulator:
         return self.path.basis_values(self.node_times)
 
     def joint_positions(self, w: Array) -> Array:
-        """Positions of the moved joints at the nodes, shape (N + 1, nc), for coefficients (K, nc)."""
+        """Positions (N + 1, nc) of the moved joints at the nodes, for spline coefficients (K, nc)."""
         return self.moved_joint_start_positions + self._basis @ w
 
     def simulate_path(self, w: Array, slopes: bool = False, names: Sequence[str] = ()) -> Rollout:
-        """Rollout of the path of coefficients (K, nc), with sensitivities to named parameters, then coefficients."""
+        """Rollout of the path with coefficients (K, nc), with sensitivities to named parameters, then coefficients."""
         directions = None
         if slopes or names:
             size = w.size if slopes else 0
@@ -266,7 +266,7 @@ TARGET_REACHED_TOLERANCE_FACTOR = 1.5  # of that unit: beyond it a place is out 
 
 @dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """A planned motion of the arms and its rollout."""
+    """A planned motion of the arms: simulator, spline coefficients, rollout, success and message."""
 
     simulator: PathSimulator
     spline_coefficients: Array  # (K, nc)
@@ -286,27 +286,27 @@ class PlannedMotion:
 
     @property
     def joint_positions(self) -> Array:
-        """Joint positions, shape (N + 1, nc) [rad or m]."""
+        """Positions of the moved joints, shape (N + 1, nc) [rad or m]."""
         return self.simulator.joint_positions(self.spline_coefficients)
 
     @property
     def joint_velocities(self) -> Array:
-        """Joint velocities, shape (N + 1, nc) [rad/s or m/s]."""
+        """Velocities of the moved joints, shape (N + 1, nc) [rad/s or m/s]."""
         return self.simulator.path.basis_values(self.t, 1) @ self.spline_coefficients
 
     @property
     def joint_accelerations(self) -> Array:
-        """Joint accelerations, shape (N + 1, nc) [rad/s^2 or m/s^2]."""
+        """Accelerations of the moved joints, shape (N + 1, nc) [rad/s^2 or m/s^2]."""
         return self.simulator.path.basis_values(self.t, 2) @ self.spline_coefficients
 
     @property
     def joint_efforts(self) -> Array:
-        """Required joint efforts, the last row repeated, shape (N + 1, nc) [N m or N]."""
+        """Required efforts of the moved joints, shape (N + 1, nc) [N m or N]; the last row is repeated."""
         return np.vstack([self.rollout.effort, self.rollout.effort[-1:]])
 
     @cached_property
     def point_trajectories(self) -> dict[str, Array]:
-        """Trajectories of the system's points and of the one with a target by name, each of shape (N + 1, 3) [m]."""
+        """Trajectories (N + 1, 3) [m] of the system's points, and of a target point if there is one, by name."""
         system = self.simulator.step.system
         names = tuple(dict.fromkeys((*system.point_frames, *self._further_points)))
         places = self.simulator.frame_trajectories(FramePositionFunction(system, names), self.rollout.state)
@@ -324,7 +324,7 @@ def _position_limits(system: System) -> tuple[Array, Array]:
 
 
 def start_joint_positions_as_array(system: System, posture: Mapping[str, float]) -> Array:
-    """Start positions (nc,) of the moved joints, given by name; `ConfigError` if one is missing or out of range."""
+    """Start positions (nc,) of the moved joints from a mapping; `ConfigError` if one is missing or out of range."""
     where = "plan.start_joint_positions"
     for name in posture:
         if name not in system.prescribed:
@@ -345,7 +345,7 @@ def start_joint_positions_as_array(system: System, posture: Mapping[str, float])
 
 
 def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, guess: Array | None = None) -> Equilibrium:
-    """Solve for the equilibrium at which a motion begins, near a configuration where one is given.
+    """Solve for the equilibrium at which a motion begins, near the configuration `guess` if one is given.
 
     Raises `ModelError` where there is none, for example because a grasp cannot be closed.
     """
@@ -358,7 +358,7 @@ def solve_start_equilibrium(step: Step, theta: Array, configuration: Array, gues
 
 
 def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits: PlanLimits, when: str) -> None:
-    """Raise `ConfigError` where efforts or spring angles exceed their limits although the arms stand still."""
+    """Raise `ConfigError` if efforts or spring angles exceed their limits at the equilibrium `rest`."""
     system, joints = step.system, step.system.mechanism.joints
     efforts = zip(system.prescribed_coordinate_indices, simulate(step, theta, rest.state, 1).effort[0], strict=True)
     springs = sorted({system.mechanism.joint_index(spring.joint_name) for spring in system.elastic_joints})
@@ -377,7 +377,7 @@ def check_standstill_limits(step: Step, theta: Array, rest: Equilibrium, limits:
 def solve_equilibrium_at_target(
     step: Step, theta: Array, start: Equilibrium, point: FramePositionFunction, place: Array, tolerance: float
 ) -> Equilibrium:
-    """Solve for the equilibrium near the start, joints within their limits, at which the point rests at its target.
+    """Solve for an equilibrium near the start, within joint limits, at which a point rests at its target.
 
     Raises `ConfigError` where no joint moves the point, or where it cannot rest there.
     """
@@ -423,7 +423,7 @@ def solve_equilibrium_at_target(
 
 
 def memoize_last_call(function: Callable[[Array], _Value]) -> Callable[[Array], _Value]:
-    """The function with its latest value cached: searches ask for residual and Jacobian of one point in turn."""
+    """The function with its latest value cached, for searches that ask for residual and Jacobian at one point."""
     last: list[tuple[Array, _Value]] = []
 
     def at(x: Array) -> _Value:

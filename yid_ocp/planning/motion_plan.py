@@ -36,7 +36,7 @@ _CONVERGED_TOLERANCE_FRACTION = 0.1  # change by halving it, in parts of the tol
 
 @dataclass(frozen=True)
 class ParameterCovariance:
-    """Covariance of uncertain model parameters, shape (len(parameter_names), len(parameter_names))."""
+    """Names of uncertain model parameters and their covariance matrix, in the order of the names."""
 
     parameter_names: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))

@@ -52,7 +52,7 @@ def _limit_units_and_scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array,
 
 @dataclass(eq=False)
 class PlanResidualsAndLimits:
-    """Goal residuals and limited quantities of a planned motion, for one set of model parameters."""
+    """Goal residuals and limited quantities of a planned motion as functions of it, for one set of model parameters."""
 
     simulator: PathSimulator
     options: PlanOptions
@@ -71,7 +71,7 @@ class PlanResidualsAndLimits:
 
     @property
     def point_reference_trajectory(self) -> Array | None:
-        """Reference position of the point at every node, shape (N + 1, 3) [m]; None where only the end counts."""
+        """Reference position of the point at every node, shape (N + 1, 3) [m]; None if only the end position counts."""
         if self.options.goal != "path":
             return None
         begin = self.simulator.start_configuration[None]
@@ -109,7 +109,7 @@ class PlanResidualsAndLimits:
     def limited_quantity_values(self, rollout: Rollout, w: Array) -> tuple[Array, Array | None]:
         """Values (rows,) of the limited quantities along a motion, in the order of `limit_rows` and in their own units.
 
-        With their Jacobian (rows, K nc) by the spline coefficients where the rollout has sensitivities.
+        The second result is their Jacobian (rows, K nc) by the coefficients; None if the rollout has no sensitivities.
         """
         mover, size, every = self.simulator, w.size, slice(None, None, _LIMIT_NODE_STRIDE)
         n, moved, pushed = mover.step.system.n_coordinates, rollout.state_sensitivity, rollout.effort_sensitivity
@@ -150,12 +150,12 @@ class PlanResidualsAndLimits:
         return found
 
     def split_values_by_limit_kind(self, value: Array) -> Iterator[tuple[_LimitRows, Array]]:
-        """Pairs of the limit rows of a kind and their values, from values in the order of `limit_rows`."""
+        """Pairs of limit rows and their values, one pair for each kind of limit; `value` is ordered as `limit_rows`."""
         ends = np.cumsum([len(rows.row_names) for rows in self.limit_rows])
         return zip(self.limit_rows, np.split(value, ends[:-1]), strict=True)
 
     def worst_violated_row_by_limit(self, value: Array) -> dict[str, tuple[str, float, float]]:
-        """The worst violated row of each kind of limit: its name, value and bound."""
+        """Name, value and bound of the worst violated row, by kind of limit; kinds without violation are absent."""
         found = {}
         for rows, own in self.split_values_by_limit_kind(value):
             over = np.maximum(own - rows.upper, rows.lower - own) / rows.unit
@@ -190,7 +190,7 @@ _FAILED_ROLLOUT_RESIDUAL = 1e4  # residual of a motion that cannot be stepped: t
 
 @dataclass(frozen=True)
 class PlanShootingResult:
-    """Result of a search for a planned motion: coefficients w (K, nc), converged only if within the limits."""
+    """Result of a search for a planned motion: coefficients w (K, nc), and whether it converged within the limits."""
 
     w: Array
     is_converged: bool
@@ -199,7 +199,7 @@ class PlanShootingResult:
 
 
 class PlanShootingProblem:
-    """Shooting problem with the residuals of several parameter cases and the limits of the first case."""
+    """Shooting problem for a motion: goal residuals of several parameter cases, and limits of the first case."""
 
     def __init__(self, cases: Sequence[PlanResidualsAndLimits], shape: tuple[int, int]) -> None:
         self._cases, self._shape = list(cases), shape
@@ -220,7 +220,7 @@ class PlanShootingProblem:
         return value, slope, limited / self._unit, by_w / self._unit[:, None]
 
     def solve(self, start: Array, lower: Array, upper: Array, iterations: int) -> PlanShootingResult:
-        """Optimise a motion from initial coefficients within bounds, all of shape (K, nc).
+        """Optimise the spline coefficients of a motion from `start` within bounds, all of shape (K, nc).
 
         Rockafellar (1973), doi:10.1007/BF01580138; Branch, Coleman and Li (1999), doi:10.1137/S1064827595289108.
         """
@@ -277,7 +277,7 @@ def _prior(columns: int, bounded: Sequence[int]) -> Array:
 
 @dataclass(frozen=True)
 class DOptimalityCriterion:
-    """Minus half the log determinant of the covariance of chosen parameters, all others and nuisances eliminated.
+    """Criterion -1/2 log det of the covariance of chosen parameters, with all other unknowns eliminated.
 
     D-optimality, with some of the parameters chosen D_s-optimality: Atkinson, Donev and Tobias (2007), Optimum
     Experimental Designs, with SAS, sections 10.2 and 10.3.
@@ -287,7 +287,7 @@ class DOptimalityCriterion:
     parameter_columns: tuple[int, ...]
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] at sensitivities (nr, columns) to relative changes, and its gradient by them if asked for."""
+        """Criterion [nat] at sensitivities (nr, columns), and its gradient in them, empty if `slope` is False."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
         whole = np.asarray(scipy.linalg.inv(information))
@@ -302,7 +302,7 @@ class DOptimalityCriterion:
 
 @dataclass(frozen=True)
 class EffectDiscriminationCriterion:
-    """Criterion of how far the readings' change by each effect is from all that another effect can imitate.
+    """Criterion for distances between each effect's change of the readings and the changes another effect can imitate.
 
     d_ij^2 = min_b |J_i a - J_j b|^2, over what j and the nuisances can do; the smaller distances count most:
     -1/2 log sum_ij 1 / (1 + d_ij^2).
@@ -314,14 +314,14 @@ class EffectDiscriminationCriterion:
     parameter_columns: tuple[int, ...]  # with a prior: of the nominal parameters and of the effects
 
     def pairwise_effect_distances(self, rows: Array) -> Array:
-        """Distances of effect i's (row) changes from what effect j can imitate [data stds]; diagonal infinite."""
+        """Distances [data stds] of effect i's (row) changes from all that effect j can imitate; infinite diagonal."""
         found = np.full((len(self.amplitude_columns),) * 2, np.inf)
         for i, j in itertools.permutations(range(len(found)), 2):
             found[i, j] = np.sqrt(self._apart(rows, i, j)[0])
         return found
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] at sensitivities (nr, columns) to relative changes, and its gradient by them if asked for."""
+        """Criterion [nat] at sensitivities (nr, columns), and its gradient in them, empty if `slope` is False."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)
@@ -357,7 +357,7 @@ _MAX_LIMIT_CORRECTIONS = 2  # of the linear limits where a step passes the true 
 
 @dataclass(frozen=True)
 class MotionSearchResult:
-    """Result of a motion search: final spline coefficients w (K, nc), initial and final criterion [nat]."""
+    """Result of a search for an informative motion: coefficients w (K, nc), initial and final criterion [nat]."""
 
     w: Array
     initial_criterion: float
@@ -368,7 +368,7 @@ class MotionSearchResult:
 
 
 class InformativeMotionSearch:
-    """Search for the motion of an experiment that maximises a criterion within limits."""
+    """Search for the motion of a planned experiment that maximises an optimality criterion within limits."""
 
     def __init__(
         self, experiment: PlannedExperiment, limits: PlanResidualsAndLimits, criterion: OptimalityCriterion
@@ -385,7 +385,7 @@ class InformativeMotionSearch:
         return value, bool(within and np.all((flat <= self.upper) & (flat >= self.lower)))
 
     def shrink_to_limits(self, w: Array) -> Array:
-        """Spline coefficients (K, nc) of the motion, scaled down until it keeps the limits."""
+        """Spline coefficients `w` (K, nc), scaled down until the motion keeps its limits."""
         for _ in range(60):
             if self._limited_values(w)[1]:
                 return w
@@ -398,7 +398,7 @@ class InformativeMotionSearch:
         return -np.inf if rows is None else self.criterion.value_and_gradient_by_sensitivities(rows, False)[0], rows
 
     def improve_motion(self, start: Array, rounds: int, progress: Progress = NULL_PROGRESS) -> MotionSearchResult:
-        """Maximise the criterion from spline coefficients (K, nc) that keep the limits, until convergence."""
+        """Maximise the criterion from coefficients `start` (K, nc) that keep the limits, in at most `rounds` rounds."""
         w, radius = start, _INITIAL_TRUST_RADIUS
         value, rows = self._value_and_rows(w)
         first, finished, done = value, False, 0

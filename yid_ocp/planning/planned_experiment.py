@@ -48,7 +48,7 @@ _SPLINE_DIFFERENCE_STEP = 1e-5  # of an unknown of the motion [rad or m]
 
 @dataclass(frozen=True, eq=False)
 class PlannedExperiment:
-    """A planned experiment: predicted recording and parameter sensitivities as functions of spline coefficients."""
+    """A planned experiment: predicted recording and parameter sensitivities as functions of spline coefficients w."""
 
     configured_problem: EstimationProblem  # of the settings; its first recording defines sensors, noise and rates
     parameter_values: Mapping[str, float]  # at which the sensitivities are taken
@@ -59,9 +59,9 @@ class PlannedExperiment:
     def from_options(
         problem: EstimationProblem, values: Mapping[str, float], options: PlanOptions, names: Sequence[str] = ()
     ) -> PlannedExperiment:
-        """The experiment described by a plan's options, at values of some parameters, with some of them free.
+        """Planned experiment from a plan's options at parameter `values`, with the parameters `names` free.
 
-        `ConfigError` or `ModelError`: no joint moves, or clamps follow measured points; there is no rest to begin from.
+        Raises `ConfigError` if no joint moves or clamps follow measured points, `ModelError` without an equilibrium.
         """
         system, episode = problem.system, problem.episodes[0]
         if problem.options.clamp_pose_definitions or not (system.driven or system.prescribed):
@@ -162,11 +162,11 @@ class PlannedExperiment:
 
     @property
     def zero_coefficients(self) -> Array:
-        """Zero spline coefficients, with which the arms stay where they start, shape (K, nc)."""
+        """Zero spline coefficients, shape (K, nc), with which the arms stay where they start."""
         return np.zeros((self.simulator.path.n_coefficients, len(self.simulator.moved_joint_indices)))
 
     def planned_estimation_problem(self, w: Array) -> EstimationProblem:
-        """The configured estimation problem with the planned recording in place of its own, at `parameter_values`."""
+        """The configured estimation problem with the planned recording (coefficients w) in place of its recordings."""
         return self._problem(self.configured_problem.step, self._noise_free_recording(w), self._options())
 
     def _problem(self, step: Step, recording: Recording, options: ProblemOptions) -> EstimationProblem:
@@ -176,7 +176,7 @@ class PlannedExperiment:
         return problem.with_compiled_parameters_free(self.free_parameters)
 
     def configured_problem_sensitivities(self, w: Array) -> Array:
-        """As `existing_recording_sensitivities`, of the planned one; `SolverError` if its torques do not follow it."""
+        """Whitened sensitivities of the planned recording to relative changes; `SolverError` if its rollout fails."""
         return self._weighted(self.planned_estimation_problem(w))
 
     @property
@@ -220,12 +220,12 @@ class PlannedExperiment:
 
     @cached_property
     def unknown_scales(self) -> Array:
-        """Size of every unknown of the search problem to which its relative change refers, in column order."""
+        """Size of every unknown of the search problem, to which relative changes refer, in column order."""
         return _sizes(self._known)
 
     @cached_property
     def column_names(self) -> tuple[str, ...]:
-        """Columns of `search_problem_sensitivities`: parameters, other unknowns, constant errors of torques."""
+        """Column names of `search_problem_sensitivities`: parameters, other unknowns, constant torque errors."""
         return (*self._known.unknown_names, *(f"offset of {name}" for name in self._offset_std))
 
     @cached_property
@@ -251,7 +251,7 @@ class PlannedExperiment:
         return np.vstack([found, np.eye(len(std))])
 
     def search_problem_sensitivities(self, w: Array) -> Array | None:
-        """Whitened sensitivities (nr, columns) of all measurements and nuisance priors to relative changes, or None."""
+        """Whitened sensitivities (nr, columns) to relative changes of the unknowns; None if the rollout fails."""
         moved, evaluation = self._evaluated(np.asarray(self.simulator.joint_positions(w)))
         if not evaluation.ok:
             return None
@@ -303,7 +303,7 @@ class PlannedExperiment:
         return u, 1.0 - np.sqrt(np.clip(1.0 - s**2, 0.0, 1.0))
 
     def sensitivity_derivatives_by_coefficients(self, w: Array, rows: Array) -> Array | None:
-        """Forward differences of `search_problem_sensitivities` by the spline coefficients, (w.size, nr, columns)."""
+        """Forward differences (w.size, nr, columns) of `search_problem_sensitivities` in w; None if one fails."""
 
         def one(i: int) -> Array | None:
             moved = w.ravel().copy()

@@ -57,7 +57,7 @@ class Status(str, Enum):
 
 @dataclass(frozen=True)
 class Iterate:
-    """One accepted iterate of a solver; evaluations and wall time are counted from the start."""
+    """One accepted iterate of a solver: unknowns, cost, gradient norm, and evaluations and seconds since the start."""
 
     iteration: int
     cost: float
@@ -125,12 +125,12 @@ class Solution(ReprMixin):
 
     @property
     def std(self) -> dict[str, float]:
-        """Standard deviation of every shared free parameter."""
+        """Standard deviation of every shared free parameter, by name."""
         return {name: entry.std for name, entry in self.parameters.items() if entry.free}
 
     @cached_property
     def episode_predictions(self) -> tuple[EpisodePrediction | str, ...]:
-        """Prediction of each recording from its recorded torques minus their offsets, or why its rollout fails."""
+        """Prediction of each recording from its torques minus their offsets, or a message why the rollout fails."""
         if self.evaluation is None or self.problem is None or not self.problem.has_process_noise:
             return () if self.evaluation is None else self.evaluation.episode_predictions
         problem = problem_whitened_by_sensor_noise(self.problem)
@@ -142,7 +142,7 @@ class Solution(ReprMixin):
         return tuple(predict(episode, *parts(self.x, i), False) for i, episode in pairs)
 
     def channel_measurements_and_predictions(self) -> tuple[ChannelPrediction, ...]:
-        """Measured and predicted samples of every channel of the recordings at the estimate; empty without one."""
+        """Measured and predicted samples of every channel of the recordings at the estimate; empty if not evaluated."""
         pairs = zip(() if self.problem is None else self.problem.episodes, self.episode_predictions, strict=False)
         known = [(episode, result) for episode, result in pairs if not isinstance(result, str)]
         return tuple(sample for pair in known for sample in channel_predictions(*pair))
@@ -168,7 +168,7 @@ IterationCallback = Callable[[Iterate], None]
 
 @dataclass(frozen=True)
 class SolverResult:
-    """Raw result of a solver: its best unknown vector, and the equilibria there where they are known."""
+    """Raw result of a solver: status, best unknown vector, history, and the equilibria there (None if unknown)."""
 
     status: Status
     message: str
@@ -196,7 +196,7 @@ class Solver(Protocol):
     def minimize_cost(
         self, problem: EstimationProblem, start: Array, callback: IterationCallback | None
     ) -> SolverResult:
-        """Minimise the problem's cost from `start`."""
+        """Minimise the problem's cost from the unknown vector `start`; `callback` receives each accepted iterate."""
         ...
 
 
@@ -215,7 +215,7 @@ _DEFAULT_SOLVER = "gauss_newton"
 
 @dataclass
 class AcceptedIterateRecorder:
-    """Records accepted iterates, counts evaluations and time, and calls the callback."""
+    """Recorder of a solver's accepted iterates, number of evaluations and time; it passes iterates to a callback."""
 
     callback: IterationCallback | None
     start_time: float = field(default_factory=time.perf_counter)
@@ -223,7 +223,7 @@ class AcceptedIterateRecorder:
     history: list[Iterate] = field(default_factory=list)
 
     def record_iterate(self, cost: float, x: Array, gradient: float, note: str = "") -> None:
-        """Record an accepted iterate."""
+        """Append an accepted iterate to the history and pass it to the callback."""
         seconds = time.perf_counter() - self.start_time
         self.history.append(Iterate(len(self.history), cost, x.copy(), gradient, self.n_evaluations, seconds, note))
         if self.callback is not None:

@@ -44,7 +44,7 @@ _LOWEST = "the cost cannot be lowered any further"
 @SOLVERS.register("gauss_newton")
 @dataclass(frozen=True)
 class GaussNewton(SolverWithCheckedSettings):
-    """Minimise 1/2 |r(x)|^2 by bounded, damped linear least-squares steps.
+    """Gauss-Newton method: minimise 1/2 |r(x)|^2 by bounded, damped linear least-squares steps.
 
     Every iteration solves  min |J d + r|^2 + mu |d/s|^2  with  lower <= x + d <= upper, and accepts d when the cost
     falls by a fair part of what the linear model promised (Nocedal and Wright 2006, Numerical Optimization, chapter 10,
@@ -75,7 +75,7 @@ class GaussNewton(SolverWithCheckedSettings):
         callback: IterationCallback | None,
         evaluate: EvaluateFunction | None = None,
     ) -> SolverResult:
-        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may replace its evaluation."""
+        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` replaces `problem.evaluate`."""
         evaluate = evaluate or problem.evaluate
         (lower, upper), scale = problem.bounds, problem.unknown_scales
         recorder, x = AcceptedIterateRecorder(callback), start.copy()
@@ -149,7 +149,7 @@ def _saved(problem: EstimationProblem, history: Sequence[Iterate], now: Evaluati
 @SOLVERS.register("single_shooting")
 @dataclass(frozen=True)
 class SingleShooting(SolverWithCheckedSettings):
-    """Minimise the cost by SciPy's L-BFGS-B on unknowns scaled to order one.
+    """Single shooting: minimise the cost with SciPy's L-BFGS-B on unknowns scaled to order one.
 
     Zhu, Byrd, Lu, Nocedal (1997), ACM Trans. Math. Softw. 23(4):550, doi:10.1145/279232.279236.
     """

@@ -50,7 +50,7 @@ class UnknownsAndNodeStateGuess:
 def guess_unknowns_and_node_states(
     problem: EstimationProblem, nodes: Sequence[IntArray], x: Array, misfit: _MisfitFunction
 ) -> UnknownsAndNodeStateGuess:
-    """Guess node states near a solution, at an unknown vector or, where that fits poorly, at multiples of it.
+    """Guess unknowns and node states near a solution, from `x` or, if that fits poorly, from multiples of `x`.
 
     A recording's states are the rollout under the tracking filter, which has no defects, or, where that fails or strays
     from what was measured, every node (`nodes`, (K + 1,) of every recording) at rest at the posture that the arms had
@@ -144,7 +144,7 @@ def _resting(
 
 
 def unknowns_with_active_effects(problem: EstimationProblem, x: Array) -> Array:
-    """An initial unknown vector at which every free effect is slightly active, shape (nx,).
+    """Initial unknown vector (nx,) at which every free effect is slightly active.
 
     At its neutral value an effect's shape (where a spring is relaxed, how fast a branch creeps) moves nothing, and the
     slope by its amplitude is that of whatever shape the settings name: a spring that would have to push from there

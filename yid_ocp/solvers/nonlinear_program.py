@@ -73,7 +73,7 @@ class ProgramVectorLayout:
         return np.arange(self.size - len(values), self.size)
 
     def register_block(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
-        """Register indices of the vector as a named block, unless there are none."""
+        """Register indices of the vector as a named block; no indices register nothing."""
         if index.size:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
@@ -150,7 +150,7 @@ class NonlinearProgram(ReprMixin):
         return ca.reshape(vector[block.index.T.ravel().tolist()], *block.index.shape)
 
     def variable_names(self) -> tuple[str, ...]:
-        """Names of all unknowns: block, row and column."""
+        """Names of all unknowns w, made of block, row and, if there are several, column."""
         named = np.full(self.w.numel(), "", dtype=object)
         for name, block in self.variables.items():
             for row, places in zip(block.row_names, block.index, strict=True):
@@ -159,7 +159,7 @@ class NonlinearProgram(ReprMixin):
         return tuple(named)
 
     def constraint_names(self) -> tuple[str, ...]:
-        """Names of all rows of `g`: term, row and place; `added.I` for those of `with_user_terms`."""
+        """Names of all constraint rows of `g`: term, row and place; `added.I` for rows of `with_user_terms`."""
         places = ((t, k) for t in self.constraint_terms for k in range(len(t.variable_indices)))
         terms = [f"{t.name}.{row}.{k}" for t, k in places for row in t.row_names]
         return (*terms, *(f"added.{i}" for i in range(sum(len(extra.lower) for extra in self.user_terms))))
@@ -177,12 +177,12 @@ class NonlinearProgram(ReprMixin):
 
     @property
     def nlp(self) -> dict[str, ca.MX]:
-        """The program as `casadi.nlpsol` takes it."""
+        """The program as the dictionary (x, p, f, g) that `casadi.nlpsol` takes."""
         return {"x": self.w, "p": self.p, "f": self.f, "g": self.g}
 
     @property
     def solver_arguments(self) -> dict[str, Array]:
-        """Arguments for calling a solver: initial guess, parameter values and bounds."""
+        """Arguments for calling a CasADi solver: initial guess, parameter values and bounds."""
         zero = np.zeros(sum(term.n_values for term in self.constraint_terms))
         low, high = ([zero, *(getattr(extra, side) for extra in self.user_terms)] for side in ("lower", "upper"))
         bounds = {"lbx": self.lower, "ubx": self.upper, "lbg": np.concatenate(low), "ubg": np.concatenate(high)}
@@ -207,12 +207,12 @@ class NonlinearProgram(ReprMixin):
 
     @ThreadSafeCachedProperty
     def jac_r(self) -> ca.MX:
-        """Jacobian of all residuals r by the unknowns w, sparse."""
+        """Jacobian of all residuals r with respect to the unknowns w, sparse."""
         return ca.vertcat(ca.MX(0, self.w.numel()), *self._slopes)
 
     @ThreadSafeCachedProperty
     def jac_g(self) -> ca.MX:
-        """Jacobian of the constraints g by the unknowns w, sparse."""
+        """Jacobian of the constraints g with respect to the unknowns w, sparse."""
         entries, rows, columns, at = [ca.MX(0, 1)], [np.zeros(0, int)], [np.zeros(0, int)], 0
         for term in self.constraint_terms:
             row, column = term.jacobian_nonzero_indices()
@@ -226,7 +226,7 @@ class NonlinearProgram(ReprMixin):
 
     @ThreadSafeCachedProperty
     def grad_f(self) -> ca.MX:
-        """Gradient of the objective f by the unknowns w, shape (nw, 1)."""
+        """Gradient of the objective f with respect to the unknowns w, shape (nw, 1)."""
         own = sum((extra.objective for extra in self.user_terms), ca.MX(0))
         total = ca.gradient(own, self.w) if self.user_terms else ca.MX.zeros(self.w.numel(), 1)
         for term, r, slope in zip(self.residual_terms, self._residuals, self._slopes, strict=True):
@@ -235,12 +235,12 @@ class NonlinearProgram(ReprMixin):
 
     @ThreadSafeCachedProperty
     def lam_f(self) -> ca.MX:
-        """Factor on the objective in the Lagrangian, of which `hessian` is an expression."""
+        """Symbolic factor on the objective f in the Lagrangian, in which `hessian` is expressed."""
         return ca.MX.sym("lam_f")
 
     @ThreadSafeCachedProperty
     def lam_g(self) -> ca.MX:
-        """Multipliers of the constraints in the Lagrangian, shape (ng, 1)."""
+        """Symbolic multipliers of the constraints g in the Lagrangian, shape (ng, 1)."""
         return ca.MX.sym("lam_g", self.g.numel())
 
     @ThreadSafeCachedProperty
@@ -248,7 +248,7 @@ class NonlinearProgram(ReprMixin):
         return {}
 
     def hessian(self, kind: HessianKind = "gauss_newton") -> ca.MX:
-        """Hessian of lam_f f + lam_g . g, exact or Gauss-Newton, sparse and symmetric.
+        """Hessian of the Lagrangian lam_f f + lam_g . g, exact or Gauss-Newton, sparse and symmetric.
 
         Gauss-Newton leaves out the curvature of residuals and of `constraint_terms`, not of what was added.
         """
@@ -306,7 +306,7 @@ class NonlinearProgram(ReprMixin):
         lower: ArrayLike = 0.0,
         upper: ArrayLike = 0.0,
     ) -> NonlinearProgram:
-        """The program with a further scalar objective term and further constraint rows, expressions of `w` and `p`.
+        """The program with an additional objective term and constraint rows, which are expressions of `w` and `p`.
 
         Rows without bounds are equalities to zero. Raises `SolverError` for expressions of other symbols, or bounds of
         another number than rows.

@@ -20,7 +20,7 @@ from yid_ocp.parallel import CASADI_LOCK
 
 
 class ThreadSafeCachedProperty(cached_property[Any]):
-    """A cached property that one thread computes, under CasADi's lock, while others wait."""
+    """Cached property that one thread computes under CasADi's lock while other threads wait."""
 
     def __get__(self, instance: Any, owner: type[Any] | None = None) -> Any:
         with CASADI_LOCK:
@@ -28,7 +28,7 @@ class ThreadSafeCachedProperty(cached_property[Any]):
 
 
 class LocalVariableFunction:
-    """Function y(v; d, s) of the columns v (local variables), d (data) and s (shared data), with its derivatives.
+    """Symbolic function y(v; d, s) of local variables v, data d and shared data s (columns), with its derivatives.
 
     The `jacobian` dy/dv, shape (ny, nv), is differentiated from the value where it is not given. Derivatives may be
     compiled; the value stays CasADi's own, so that whoever builds upon it can differentiate it.
@@ -76,7 +76,7 @@ class LocalVariableFunction:
 
 @dataclass(frozen=True)
 class ProgramTerm:
-    """A function of a few unknowns, evaluated at K places of a nonlinear program, such as at every step."""
+    """Function of a few unknowns that a nonlinear program evaluates at K places, for example at every time step."""
 
     name: str
     row_names: tuple[str, ...]  # of the ny outputs
@@ -87,7 +87,7 @@ class ProgramTerm:
 
     @property
     def n_values(self) -> int:
-        """At all places."""
+        """Number of output values at all places together, ny K."""
         return len(self.row_names) * len(self.variable_indices)
 
     def _map_over_places(self, function: ca.Function, w: ca.MX, p: ca.MX, *more: ca.MX) -> ca.MX:
@@ -102,17 +102,17 @@ class ProgramTerm:
         return ca.vec(self._map_over_places(self.local_function.value, w, p))
 
     def jacobian_nonzero_values(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Nonzero entries of the Jacobian, in the order of `jacobian_nonzero_indices`."""
+        """Nonzero entries of the Jacobian with respect to w, in the order of `jacobian_nonzero_indices`."""
         return _nonzero_values(self._map_over_places(self.local_function.jacobian, w, p))
 
     def jacobian_nonzero_indices(self) -> tuple[IntArray, IntArray]:
-        """Row and column indices of the nonzeros of the Jacobian of all values by w."""
+        """Row and column indices of the nonzero entries of the Jacobian of all values with respect to w."""
         row, column = (np.array(x, np.int64) for x in self.local_function.jacobian.sparsity_out(0).get_triplet())
         first = len(self.row_names) * np.arange(len(self.variable_indices))[:, None]
         return (first + row).ravel(), self.variable_indices[:, column].ravel()
 
     def weighted_hessian_triplets(self, w: ca.MX, p: ca.MX, weight: ca.MX) -> tuple[ca.MX, IntArray, IntArray] | None:
-        """Hessian of weight . values by w as entries, rows, columns (positions may repeat); None where it is zero."""
+        """Entries, rows and columns (some may repeat) of the Hessian of weight . values in w; None if it is zero."""
         function = self.local_function._weighted_hessian_function
         if function is None:
             return None
@@ -138,7 +138,7 @@ class ResidualTerm:
         return self.term.n_values if self.combination is None else self.combination.size1()
 
     def residual_jacobian_by_term_values(self, p: ca.MX) -> ca.MX | None:
-        """Jacobian of the residuals r by the program term's values, sparse; None for the identity."""
+        """Jacobian of the residuals r with respect to the program term's values, sparse; None for the identity."""
         if self.combination is None and self.weight_indices is None:
             return None
         combination = ca.DM.eye(self.n_residuals) if self.combination is None else self.combination
@@ -158,7 +158,7 @@ class ResidualTerm:
         return result - (target if self.weight_indices is None else p[self.weight_indices.tolist()] * target)
 
     def jacobian(self, w: ca.MX, p: ca.MX) -> ca.MX:
-        """Jacobian of the residuals r by the program's unknowns w, shape (nr, nw), sparse."""
+        """Jacobian (nr, nw) of the residuals r with respect to the program's unknowns w, sparse."""
         entries, shape = self.term.jacobian_nonzero_values(w, p), (self.term.n_values, w.numel())
         placed = sparse_matrix_from_entries(entries, *self.term.jacobian_nonzero_indices(), shape)
         matrix = self.residual_jacobian_by_term_values(p)
@@ -172,12 +172,12 @@ class ResidualTerm:
         return ca.sum1(ca.if_else(size <= limit, r**2 / 2, limit * (size - limit / 2)))
 
     def loss_gradient_by_residual(self, r: ca.MX) -> ca.MX:
-        """Gradient of the loss by the residuals r, shape (nr, 1)."""
+        """Gradient of the loss with respect to the residuals r, shape (nr, 1)."""
         limit = self.huber_threshold
         return r if math.isinf(limit) else ca.fmax(ca.fmin(r, limit), -limit)
 
     def loss_hessian_residual_weights(self, r: ca.MX, exact: bool) -> ca.MX | None:
-        """Weight of each residual in the Hessian of the loss; None for ones.
+        """Weight of each residual in the Hessian of the loss; None if all weights are one.
 
         Exactly it is one or zero; Gauss-Newton's, that of weighted squares with the same gradient, is never zero.
         """

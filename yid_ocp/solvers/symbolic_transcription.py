@@ -92,7 +92,7 @@ def _about_zero(problem: EstimationProblem) -> EstimationProblem:
 
 
 def check_no_effect_changes_inputs(problem: EstimationProblem, where: str) -> None:
-    """Raise `SolverError` where an effect changes recorded inputs, which nodes do not carry."""
+    """Raise `SolverError` if an effect changes recorded inputs or times; solvers with node states do not support it."""
     if not problem.uses_inputs_as_recorded:
         message = "an effect changes recorded inputs, times or what the tracking filter follows"
         allowed = "effects of the mechanics and of what sensors read"
@@ -115,7 +115,7 @@ def _check_transcribable(problem: EstimationProblem) -> None:
 
 
 def problem_unknowns_from_program(problem: EstimationProblem, program: NonlinearProgram, w: Array) -> Array:
-    """Unknown vector of the estimation problem that the program's variables `w` stand for, shape (nx,)."""
+    """Unknown vector (nx,) of the estimation problem that corresponds to the program's variables `w`."""
     x = problem.initial_unknowns.copy()
     shared, own = len(problem.shared_parameters), len(problem.local_parameters)
     x[:shared] = w[program.variables["theta"].index.ravel()] if shared else 0.0
