@@ -328,7 +328,7 @@ def _load_torque_ensemble() -> Mapping[str, Mapping[str, Mapping[str, Sequence[f
 def explain_paper_estimates(
     experiment: str, estimates: Mapping[str, ParameterEstimate], truth: Mapping[str, float]
 ) -> tuple[str, ...]:
-    """One sentence for each published estimate of an experiment (`PAPER_ESTIMATES`), on its difference from ours.
+    """One sentence for each published estimate of an experiment (`PAPER_ESTIMATES`) on why it differs from ours.
 
     `estimates` are those of the parameters from recordings of such an experiment, `truth` their values where known.
     Empty where the model does not explain the recordings. The reason, judged by synthetic recordings, is the first of

@@ -40,7 +40,7 @@ class FrictionLawFit:
 
 
 def recording_names_by_name_stem(problem: EstimationProblem) -> dict[str, tuple[str, ...]]:
-    """Recording names grouped by the name without its number, or singly if groups are few; none with motors off."""
+    """Recording names grouped by name without number, or singly if groups are few; motors-off ones are omitted."""
     joints = {e.name: e.recording.joints for e in problem.episodes}
     commanded = {name for name, own in joints.items() if own is not None and own.position_command is not None}
     names = [name for name in joints if not problem.system.servos or name in commanded]

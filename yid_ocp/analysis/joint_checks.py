@@ -58,7 +58,7 @@ class RecordedJointsModel:
         return RecordedJointsModel(system, theta, names) if names else None
 
     def has_all_angles_recorded(self, recording: Recording) -> bool:
-        """Whether a recording has the angles of all joints; those of clamps that follow points are not recorded."""
+        """Whether a recording has the angles of all joints; clamps that follow measured points have none recorded."""
         return all(name in recording.joint_names for name in self.joint_names)
 
     @property

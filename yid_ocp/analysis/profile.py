@@ -68,7 +68,7 @@ class ParameterProfileLikelihood:
 def compute_profile_likelihood_interval(
     problem: EstimationProblem, x: Array, index: int, std: float, evaluation: Evaluation
 ) -> ParameterProfileLikelihood:
-    """Profile likelihood of one unknown and its 95 % interval, at whose ends chi2, others refitted, is up by 3.84.
+    """Profile likelihood of one unknown and its 95 % interval, within which chi2 rises by less than 3.84.
 
     Each value is reached from the last one, the others first moved along the tangent and then by Gauss-Newton.
     Unknowns that are positive by nature move in their logarithm. The weak prior does not count. An end is open where

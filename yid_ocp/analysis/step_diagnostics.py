@@ -281,7 +281,7 @@ _ZERO_RTOL = 1e-14  # of the largest entry: rounding
 
 
 class NamedIndexRange(NamedTuple):
-    """A named range of row or column indices."""
+    """Name of a block of matrix rows or columns, with its first index and the index after its last."""
 
     name: str
     start: int
@@ -303,7 +303,7 @@ class SparsityPattern:
     mark_label: str = ""  # what that means
 
     def with_numerical_nonzeros_marked(self, values: Array, where: str) -> SparsityPattern:
-        """The pattern with the numerically nonzero entries of one matrix highlighted."""
+        """Copy of the pattern in which the numerically nonzero entries of the matrix `values` are marked."""
         marked = np.abs(values) > _ZERO_RTOL * np.max(np.abs(values), initial=0.0)
         return replace(self, marked_mask=marked, mark_label=f"not zero at {where}")
 

@@ -309,7 +309,7 @@ class StepSymbols(ReprMixin):
         return slice(ends[at], ends[at + 1])
 
     def equation_or_derivative(self, text: str) -> EquationOrDerivativeFormula:
-        """The equation with a given name or, for `ROW, COLUMN`, its derivative by a variable.
+        """The equation with a given name or, for `ROW, COLUMN`, its derivative with respect to a variable.
 
         `text` is such as `del[T1_0_x]`, `del[T1_0_x], q1[T1_0_x]` or `constraint[left.x], T2.length`. Raises
         `ConfigError` for neither one name nor two, or one that does not exist.

@@ -47,8 +47,8 @@ class ExperimentChange:
     name: str
     description: str
     mechanical_change: str = ""  # key of `MECHANICAL_CHANGE_DESCRIPTIONS`, empty where only sensors change
-    camera_frame: str = ""  # that the camera sees besides; empty for none
-    arm_frame: str = ""  # that an arm measures besides; empty for none
+    camera_frame: str = ""  # additional frame that the camera sees; empty for none
+    arm_frame: str = ""  # additional frame that an arm measures; empty for none
     camera_rate: float | None = None  # [Hz]
 
 

@@ -39,14 +39,14 @@ class BlindCaseScore:
     multiple: float
     gap: bool  # whether a gap was reported
     kind_first: bool  # the true kind at the true place is the first candidate
-    kind_second: bool  # or among the first two
+    kind_second: bool  # whether the true kind is among the first two candidates
     location_first: bool
     confusable: tuple[str, ...]  # set that was named as not separable
     # as the verdict asks: no_gap of a clean one, the true effect alone or in a set of at most three, each of a
     # pair likewise, unknown at the right place outside the library
     right: bool
-    closure: float  # held out, of what was added
-    best: float  # and of the true effects refitted
+    closure: float  # fraction of the held-out gap closed by the effects added
+    best: float  # the same by a refit of the true effects
     # relative error of every parameter of the true effect where it was added, and whether its 95 % interval has it
     errors: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
     seconds: float = math.nan

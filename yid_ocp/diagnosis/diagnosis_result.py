@@ -388,7 +388,7 @@ def held_out_truncation_message(cut: TruncatedHeldOutRecording) -> str:
 
 
 def diagnosis_summary_text(finding: DiagnosisResult) -> str:
-    """Return the summary text of a diagnosis."""
+    """Return a text that summarises a diagnosis: gap, locations, effects, events and the next experiment."""
     text = [_gap(finding)]
     if finding.verdict not in ("insufficient_data", "no_gap"):
         text.append(_places(finding))

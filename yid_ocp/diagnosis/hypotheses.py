@@ -110,7 +110,7 @@ class TruncatedHeldOutRecording:
 
 @dataclass(frozen=True)
 class AllCandidatesProblem:
-    """Estimation problem of a system with all candidates, any of which can be freed without recompiling.
+    """Estimation problem of a system with all candidate effects, any of which can be freed without recompiling.
 
     Sensors, statics and corrections are differentiated by everything once, recordings are placed on the nodes once, and
     the tracking filter is that of the nominal start, the same for every hypothesis."""
@@ -153,7 +153,7 @@ class AllCandidatesProblem:
     def truncate_held_out_recordings(
         self, values: Mapping[str, float], margin: float
     ) -> tuple[AllCandidatesProblem, tuple[TruncatedHeldOutRecording, ...]]:
-        """Truncate held-out recordings where the rollout fails; return the problem and the truncated recordings.
+        """Truncate held-out recordings where the rollout fails; return the new problem and the truncated recordings.
 
         `margin` is the part that is kept of what the nominal model follows. Where nothing worth predicting is left,
         recordings to estimate on are split in blocks. Weights are those of the sensors' noise; see `whitened_at`.

@@ -120,7 +120,7 @@ def gap_locations_by_effect_closure(
 def smoothed_unknown_z_scores(
     smoothed: SmootherResult, recording: int = 0, informed_fraction: float = DEFAULT_THRESHOLDS.informed_fraction
 ) -> tuple[Array, tuple[str, ...], Array]:
-    """Return interval edges (J + 1,) [s], names and z scores (J, nd), mean over posterior std, of the unknowns.
+    """Return interval edges (J + 1,) [s], unknowns' names, and z scores (J, nd): posterior mean over posterior std.
 
     Scores are NaN unless 1 - posterior/prior variance is above `informed_fraction`.
     """

@@ -171,7 +171,7 @@ class DetectedForcePulse:
     peak_value: float  # largest value, with its sign, in the history's unit
     is_flat_topped: bool  # whether it stays at its size for half of the time; else it is a sine squared
     peak_std: float  # standard deviation of the size, counting the rest
-    p_value: float  # of an evidence raised so far by chance in one window
+    p_value: float  # probability that chance raises the evidence this far in one window
 
     @property
     def impulse_per_unit_peak(self) -> float:

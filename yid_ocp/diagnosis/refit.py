@@ -123,7 +123,7 @@ class RefitContext:
     thresholds: Thresholds
     progress: Progress
     store: RefitStore | None = None
-    deadline: float = math.inf  # of `time.perf_counter`, from which on nothing more is tried [s]
+    deadline: float = math.inf  # value of `time.perf_counter` after which nothing more is tried [s]
     skipped: list[str] = field(default_factory=list)  # what was not tried, of all copies of this context
     left_by: dict[str, str] = field(default_factory=dict)  # held-out chi2/n of all refits by their effects, likewise
 

@@ -336,7 +336,7 @@ def confusability_matrix(everything: AllCandidatesScoreModel) -> ConfusabilityMa
 
 @dataclass(frozen=True)
 class ScreeningResult:
-    """Detectability, scores and confusability of all candidates at one point."""
+    """Detectability, score tests and confusability of all candidate effects at one point, with their joint model."""
 
     detectability: tuple[DetectableAmplitudes, ...]
     candidate_scores: tuple[CandidateScore, ...]  # best first

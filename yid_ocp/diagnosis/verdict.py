@@ -203,7 +203,7 @@ def find_unknown_verdict_reason(
 def explained_fraction_of_smoother_chi2(
     nominal: RefittedModel, added: Sequence[SelectedEffect], smoothed: SmootherResult | None
 ) -> float:
-    """Return the effects' decrease of r'r over the smoother's, less degrees of freedom each; 1 if not defined."""
+    """Return the effects' decrease of r'r divided by the smoother's, each less degrees of freedom; 1 if undefined."""
     if smoothed is None or not added:
         return 1.0
     last = added[-1].refitted_model

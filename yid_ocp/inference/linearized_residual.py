@@ -206,7 +206,7 @@ def achievable_cost_reduction(problem: EstimationProblem, x: Array, evaluation: 
 def solve_step_within_unknown_sizes(
     problem: EstimationProblem, x: Array, jacobian: Array, residual: Array, mu: float
 ) -> Array:
-    """Least-squares step (nx,) within bounds; no unknown moves by more than its value or typical size."""
+    """Least-squares step (nx,) within bounds; each unknown moves by at most max(its value, its typical size)."""
     lower, upper = problem.bounds
     size = np.maximum(np.abs(x), problem.unknown_scales)
     low, high = np.maximum((lower - x) / size, -1.0), np.minimum((upper - x) / size, 1.0)

@@ -183,7 +183,7 @@ def _windows(
 
 
 def benjamini_hochberg_mask(p_values: Sequence[float], tries: float, level: float) -> list[bool]:
-    """One flag per p-value: significant at the false-discovery rate `level` among `tries` tests, passed here or not.
+    """Whether each p-value is significant at the false-discovery rate `level` among `tries` tests, listed here or not.
 
     Benjamini and Hochberg (1995), doi:10.1111/j.2517-6161.1995.tb02031.x.
     """

@@ -252,10 +252,10 @@ class LinearResidualModel:
     unknown_names: tuple[str, ...]  # coordinate, grasp or channel of each unknown
     unknown_groups: tuple[SmoothedUnknownGroup, ...]
     reference_std: Array  # shape (nd,): the matrices are by unknowns in this unit
-    initial_state_jacobian: Array  # how the first state follows the first unknowns, shape (ns, nd)
-    initial_state_std: Array  # of the first state beside that, shape (ns,)
+    initial_state_jacobian: Array  # of the first state by the first interval's unknowns, shape (ns, nd)
+    initial_state_std: Array  # of the first state's remaining error, shape (ns,)
     interval_correlation: float  # of an unknown with itself one interval later
-    torque_noise_variance: Array  # that each has whatever its group's is, shape (nd,) [squared reference]
+    torque_noise_variance: Array  # added to the group's variance, shape (nd,) [squared reference]
 
     def unknown_variances_from_groups(self, group_variance: Mapping[SmoothedUnknownGroup, float]) -> Array:
         """Variances (nd,) [squared reference] of all unknowns: the variance of the group plus that of torque noise."""
@@ -269,7 +269,7 @@ def recording_models_with_unknown_forces(
     limits: SmootherThresholds = DEFAULT_SMOOTHER_THRESHOLDS,
     interval: float = _MIN_INTERVAL,
 ) -> tuple[LinearResidualModel, ...]:
-    """Return the linear residual model of every recording at `x`, with unknown forces, offsets and biases.
+    """Return a residual model of every recording that is linear in unknown forces, offsets and biases, about `x`.
 
     `evaluation` is that at `x`, with its Jacobian; unknowns are constant over `interval` [s] at the least.
     """

@@ -52,7 +52,7 @@ def _limit_units_and_scaled_bounds(limits: Sequence[_LimitRows]) -> tuple[Array,
 
 @dataclass(eq=False)
 class PlanResidualsAndLimits:
-    """Goal residuals and limited quantities of a planned motion as functions of it, for one set of model parameters."""
+    """Functions for goal residuals and limited quantities of a planned motion, for one set of model parameters."""
 
     simulator: PathSimulator
     options: PlanOptions
@@ -287,7 +287,7 @@ class DOptimalityCriterion:
     parameter_columns: tuple[int, ...]
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] at sensitivities (nr, columns), and its gradient in them, empty if `slope` is False."""
+        """Criterion [nat] at sensitivities (nr, columns), and its gradient, which is empty if `slope` is False."""
         information, chosen = rows.T @ rows, list(self.chosen_columns)
         information[np.diag_indices_from(information)] += _prior(len(information), self.parameter_columns)
         whole = np.asarray(scipy.linalg.inv(information))
@@ -321,7 +321,7 @@ class EffectDiscriminationCriterion:
         return found
 
     def value_and_gradient_by_sensitivities(self, rows: Array, slope: bool = True) -> tuple[float, Array]:
-        """Criterion [nat] at sensitivities (nr, columns), and its gradient in them, empty if `slope` is False."""
+        """Criterion [nat] at sensitivities (nr, columns), and its gradient, which is empty if `slope` is False."""
         total, by_rows = 0.0, np.zeros_like(rows)
         for i, j in itertools.permutations(range(len(self.amplitude_columns)), 2):
             square, rest, others, used = self._apart(rows, i, j)

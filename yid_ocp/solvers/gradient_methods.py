@@ -75,7 +75,7 @@ class GaussNewton(SolverWithCheckedSettings):
         callback: IterationCallback | None,
         evaluate: EvaluateFunction | None = None,
     ) -> SolverResult:
-        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` replaces `problem.evaluate`."""
+        """Minimize the problem's cost from `start` by Gauss-Newton steps; `evaluate` may replace `problem.evaluate`."""
         evaluate = evaluate or problem.evaluate
         (lower, upper), scale = problem.bounds, problem.unknown_scales
         recorder, x = AcceptedIterateRecorder(callback), start.copy()

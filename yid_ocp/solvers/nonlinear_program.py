@@ -73,7 +73,7 @@ class ProgramVectorLayout:
         return np.arange(self.size - len(values), self.size)
 
     def register_block(self, name: str, index: IntArray, rows: Sequence[str], unit: str = "") -> None:
-        """Register indices of the vector as a named block; no indices register nothing."""
+        """Register indices of the vector as a named block; do nothing if there are no indices."""
         if index.size:
             self.blocks[name] = _VectorBlock(index, tuple(rows), unit)
 
