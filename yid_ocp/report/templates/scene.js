@@ -163,7 +163,7 @@ class Viewer {
       for (const [a, b, radius, own] of motion.sticks) {
         const [from, to] = [at(a), at(b)];
         if (!from || !to) continue;
-        const [p, q] = [see(from), see(to)], wide = Math.max(own ? 2 : 1.5, radius * (p[3] + q[3]));
+        const [p, q] = [see(from), see(to)], wide = Math.max(own ? 2 : 1.5, (own ? radius : Math.min(radius, 0.08 * this.reach)) * (p[3] + q[3]));
         strokes.push([(p[2] + q[2]) / 2, () => this.stick(pen, p, q, wide, own || ghost ? color : this.softer(color, card), ghost)]);
       }
     }
