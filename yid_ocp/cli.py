@@ -362,7 +362,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def build_argument_parser() -> argparse.ArgumentParser:
-    """The argument parser of all commands; its errors are `ConfigError`."""
+    """Return the argument parser of all commands; invalid arguments raise `ConfigError`."""
     from yid_ocp import __version__
 
     top = _Parser(prog="yid-ocp", description="Stiffness of flexible objects from robot recordings.")

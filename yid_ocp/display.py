@@ -18,7 +18,7 @@ class ReprSummary:
 
 
 class ReprMixin:
-    """Mixin for `__repr__` and a notebook table from `_summary`; a dataclass needs `repr=False`."""
+    """Mixin that makes `__repr__` and a notebook table from the method `_summary`; a dataclass needs `repr=False`."""
 
     def _summary(self) -> ReprSummary:
         raise NotImplementedError

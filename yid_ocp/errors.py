@@ -20,7 +20,7 @@ class YidError(Exception):
         super().__init__(what)
 
     def four_parts(self) -> dict[str, str]:
-        """What, where, allowed and hint as they are shown, with general texts for parts that were not given."""
+        """The error's what, where, allowed and hint as the user sees them; missing parts have general texts."""
         said = {
             "what": self.what,
             "where": self.where or "the command as it was given",
@@ -105,7 +105,7 @@ def nearest_name_hint(name: str, known: Iterable[str]) -> str:
 
 
 def unknown_name_details(name: str, known: Iterable[str]) -> dict[str, str]:
-    """Allowed names and hint for an error about an unknown name, as its arguments; long lists are cut."""
+    """Arguments `allowed` and `hint` for an error about an unknown name; a long list of names is shortened."""
     names = [str(entry) for entry in known]
     return {"allowed": _listed(name, names) or "none", "hint": _meant(name, names)}
 

@@ -30,7 +30,7 @@ _MEMORY_OF_READING = 7 << 28  # address space that a library may take to read a 
 
 
 def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
-    """Return the path of a file from outside; `DataError` unless it is a regular file, of at most `max_bytes`.
+    """Return `path` after checks; `DataError` unless it is a regular file of at most `max_bytes` bytes.
 
     Pipes, devices and what never ends are refused before anything is read. Every file that the package did not write or
     ship is opened after this check.
@@ -58,7 +58,7 @@ def check_input_file(path: Path, max_bytes: int | None = None) -> Path:
 
 @contextlib.contextmanager
 def limited_memory() -> Iterator[None]:
-    """Context manager in which this process cannot take more than 1.75 GiB beside what it has, on Linux.
+    """Context manager that limits this process to 1.75 GiB of memory beyond its present use; on Linux only.
 
     It is for libraries that unpack what a file from outside holds; what is more becomes a MemoryError.
     """
@@ -79,7 +79,7 @@ def limited_memory() -> Iterator[None]:
 
 
 def check_number_count(count: int, where: str) -> None:
-    """Raise `DataError` where a file from outside holds, or declares, more numbers than can be meant."""
+    """Raise `DataError` if an input file holds or declares more than `MAX_INPUT_NUMBERS` numbers."""
     if count > MAX_INPUT_NUMBERS:
         allowed = f"at most {MAX_INPUT_NUMBERS / 1e6:.0f} million numbers"
         what = f"the file holds {count / 1e6:.0f} million numbers, more than can be meant"
@@ -87,7 +87,7 @@ def check_number_count(count: int, where: str) -> None:
 
 
 def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
-    """Text of a UTF-8 file from outside; errors as `check_input_file`, and `DataError` where it is no such text."""
+    """Text of an input file; `DataError` as in `check_input_file`, or if the file is not UTF-8 text."""
     check_input_file(path, max_bytes)
     try:
         return path.read_text(encoding="utf-8")
@@ -98,7 +98,7 @@ def read_input_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_input_json(path: Path) -> Any:
-    """Data of a JSON file from outside; errors as `read_input_text`, and `DataError` where it is no JSON."""
+    """Data of a JSON input file; `DataError` as in `read_input_text`, or if the text is not valid JSON."""
     text = read_input_text(path)
     try:
         return json.loads(text)
@@ -138,12 +138,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_strict_json(path: Path, data: Any) -> None:
-    """Write plain data, without conversion, as JSON atomically; as `atomic_write`, ValueError for infinity and NaN."""
+    """Write plain data as a JSON file, atomically; ValueError for infinity and NaN, else errors as `atomic_write`."""
     write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 
 def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Path:
-    """Make a folder and those above it where they are absent; OutputError where that is refused."""
+    """Make a folder and its missing parents and return its path; `OutputError` if that fails."""
     path = Path(folder)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -153,12 +153,12 @@ def make_folder(folder: str | os.PathLike[str], what: str = "the folder") -> Pat
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file of that name; False for names that are too long or invalid."""
+    """Whether the path is an existing file; False also for names that are too long or invalid."""
     return os.path.isfile(path)
 
 
 def file_sha256(path: Path) -> str:
-    """SHA-256 of a file, or of all files in a folder by name, in hexadecimal; `DataError` where it cannot be read."""
+    """SHA-256 of a file, or of all files in a folder by name, in hexadecimal; `DataError` if unreadable."""
     digest = hashlib.sha256()
     for entry in sorted(item for item in path.rglob("*") if item.is_file()) if path.is_dir() else [path]:
         with check_input_file(entry).open("rb") as file:
@@ -203,13 +203,13 @@ def to_lossless_plain_data(value: Any) -> Any:
 
 
 def named_attributes(value: Any, names: str) -> dict[str, Any]:
-    """Some attributes of an object, by name or as `key=name`, separated by blanks."""
+    """Dict of the attributes in the blank-separated list `names`; `key=name` stores an attribute under `key`."""
     pairs = [name.partition("=") for name in names.split()]
     return {key: getattr(value, name or key) for key, _, name in pairs}
 
 
 def attributes_to_json(value: Any, names: str) -> dict[str, Any]:
-    """Some attributes of an object as JSON data, named as in `named_attributes`."""
+    """Dict of an object's attributes as JSON data; `names` as for `named_attributes`."""
     return dict(to_json_types(named_attributes(value, names)))
 
 
@@ -244,6 +244,6 @@ def _value(hint: Any, value: Any) -> Any:
 
 
 def os_error_reason(error: Exception) -> str:
-    """Reason of an error of the operating system or HDF5, in words."""
+    """Text with the reason of an operating system's or HDF5 error."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error).strip("'\"")

@@ -19,10 +19,7 @@ _MAX_STEP = 0.5  # by which a component moves at most in one step
 
 @dataclass(frozen=True)
 class LocalQuadraticModel:
-    """A local quadratic model of a cost, for costs that are not a plain sum of squares or have many residuals.
-
-    The Hessian (n, n) is positive definite, that of Gauss and Newton for example.
-    """
+    """Quadratic model of a cost about one point: value, gradient (n,), positive definite Hessian (n, n) there."""
 
     cost: float
     gradient: Array
@@ -65,7 +62,7 @@ def levenberg_marquardt(
     initial_guess: Array,
     projection: Callable[[Array], Array] = lambda x: x,
 ) -> _Minimum[_SumOfSquares]:
-    """Minimise |r(x)|^2 by damped Gauss-Newton steps, the damping in units of the columns' norms.
+    """Return the minimum of |r(x)|^2 by Gauss-Newton steps; the damping is scaled by the Jacobian's column norms.
 
     The residual function gives r (m,) and its Jacobian (m, n); a projection brings a trial point back to where it may
     be.
@@ -91,7 +88,7 @@ def minimize_by_damped_newton(
     cost_tolerance: float = 1e-10,
     min_damping: float = 1e-9,
 ) -> _Minimum[_Model]:
-    """Minimise a cost given by local models, as `levenberg_marquardt`.
+    """Return the minimum of a cost by damped Newton steps on the local models that `model_at` returns.
 
     It has converged when no component would move by more than `step_tolerance`, or when the cost falls by less than the
     part `cost_tolerance`. No step is damped less than `min_damping`: some damping keeps a search on a robust cost from

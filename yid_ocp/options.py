@@ -44,7 +44,7 @@ class OptionInfo:
 
 @dataclass(frozen=True)
 class RegistryChoice:
-    """Annotation of a type: the user chooses a class of a registry by `selector_key`, or by a mapping's key."""
+    """Annotation of a type: the setting names a registered class, under `selector_key` or as a mapping entry's key."""
 
     registry: Registry[Any]
     default_name: str = ""
@@ -136,7 +136,7 @@ def _words(hint: Any) -> str:
 
 
 def check_option_bounds(options: Any, where: str) -> None:
-    """Raise `ConfigError` where a number of an options object is not within its bounds."""
+    """Raise `ConfigError` if a number in an options dataclass is outside its annotated bounds."""
     kind: Any = type(options)
     for name, option in dataclass_options(kind).items():
         value = getattr(options, option.field_name)

@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Progress:
-    """Receiver of progress reports, called by one thread at a time; this one ignores them."""
+    """Base class of receivers of progress reports, called by one thread at a time; it ignores all reports."""
 
     def begin_stage(self, text: str, work: float = 0.0, ahead: float | None = None) -> None:
         """Report that a new stage of the work begins.
@@ -20,13 +20,13 @@ class Progress:
         """
 
     def report_iterate(self, entry: Any) -> None:
-        """Report that a search accepted a point: a `solvers.base.Iterate`."""
+        """Report the point that a search accepted, a `solvers.base.Iterate`."""
 
     def report_parts_done(self, done: int, total: int, text: str) -> None:
         """Report that `done` of `total` parts of the stage are finished; `text` names the last or next one."""
 
     def report_table(self, rows: Sequence[Sequence[str]]) -> None:
-        """Report all results so far, header first and then the best, in place of those reported before."""
+        """Report a table of all results so far, header first, then best first; it replaces the previous table."""
 
 
 NULL_PROGRESS = Progress()
@@ -48,7 +48,7 @@ class LoggingProgress(Progress):
 
 
 class ParallelProgress:
-    """Counter of a stage's `total` parallel parts, `first` to begin with; reports each count to a progress receiver."""
+    """Thread-safe counter of a stage's `total` parallel parts; reports every count, the first with the text `first`."""
 
     def __init__(self, progress: Progress, total: int, first: str) -> None:
         self._progress, self._total, self._count, self._lock = progress, total, 0, threading.Lock()

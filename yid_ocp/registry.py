@@ -11,7 +11,7 @@ _Entry = TypeVar("_Entry")
 
 
 class Registry(Generic[_Entry]):
-    """A table from name to implementation, filled by decorators; `entry_noun` is for error messages."""
+    """A table from name to implementation, filled by decorators; `entry_noun` names an entry in error messages."""
 
     def __init__(self, entry_noun: str) -> None:
         self.entry_noun = entry_noun

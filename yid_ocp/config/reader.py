@@ -40,7 +40,7 @@ _ALLOWED_YAML = "keys with numbers, text, true or false, [lists] and sections"
 def load_config(
     path: str | Path | None = None, overrides: Sequence[str] = (), default: str = DEFAULT_CONFIG_FILE
 ) -> RunSettings:
-    """Read and check a configuration file, the embedded `default` when none is given.
+    """Return the checked settings of a configuration file; without `path`, of the embedded file `default`.
 
     Overrides are `a.b=c` each: the key and a value in YAML that replaces or adds to the file's. A section merges with
     the one that stands there, key by key, unless it chooses another kind or method, or is empty.
@@ -61,10 +61,7 @@ def load_config(
 
 
 def settable_keys_with_prefix(prefix: str, path: str | Path | None = None) -> list[str]:
-    """Dotted keys that `overrides` may set and that begin with a prefix, with the names used in a given file.
-
-    `ConfigError` where the file cannot be read.
-    """
+    """Dotted setting keys that begin with `prefix`, with the entries of file `path`; `ConfigError` if unreadable."""
     data = {} if path is None else _parse(_read(Path(path)), str(path))[0]
     return list(schema.iter_settable_key_completions(RunSettings, prefix, data))
 

@@ -26,12 +26,12 @@ class SectionVariants:
     is_nullable: bool = False
 
     def selected_variant_name(self, raw: Any) -> Any:
-        """Value of the selector key in a raw section; the default where the key is absent."""
+        """Value of the selector key in an unchecked section; `default_variant` where the key is absent."""
         given = raw if self.selector_key and isinstance(raw, dict) else {}
         return given.get(self.selector_key, self.default_variant)
 
     def variant_options(self, word: Any = "") -> Mapping[str, options.Option]:
-        """Options by key of the class that `word` selects; of the first class where it selects none."""
+        """Options, by key, of the settings class that `word` selects, or of the first class if it selects none."""
         known = isinstance(word, str) and word in self.classes
         own = options.dataclass_options(self.classes[word] if known else next(iter(self.classes.values())))
         if self.selector_key in ("", *own):
@@ -39,7 +39,7 @@ class SectionVariants:
         return {self.selector_key: options.Option(Literal[tuple(self.classes)], self.default_variant), **own}
 
     def variants_for_mapping_key(self, name: str, where: str) -> SectionVariants:
-        """The settings classes allowed under one key of a mapping: the class registered by that name, or all."""
+        """Settings classes allowed for a mapping's entry `name`: the class registered by that name, or all classes."""
         if self.selector_key != "name":
             return self
         if name not in self.classes:
@@ -178,6 +178,6 @@ def _section_schema(sections: SectionVariants, word: str) -> dict[str, Any]:
 
 
 def option_info_from_annotation(hint: Any) -> options.OptionInfo:
-    """The `OptionInfo` in a type annotation (meaning and unit); an empty one where there is none."""
+    """`OptionInfo` (meaning and unit) in a type annotation; an empty one if the annotation has none."""
     markers = reversed(options.split_annotated(hint)[1])
     return next((marker for marker in markers if isinstance(marker, options.OptionInfo)), options.OptionInfo())

@@ -127,7 +127,7 @@ class JointActuationSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class FrictionSettings:
-    """Ordinary friction in the robot's joints, whose size is estimated."""
+    """Friction law of the robot's joints; the amount of friction is estimated."""
 
     law: Annotated[
         FrictionLawName,
@@ -467,7 +467,7 @@ class RunSettings:
 
 
 def config_yaml_with_defaults(run: RunSettings) -> str:
-    """YAML text of a run's settings, with every default, that `load_config` reads back to the same run."""
+    """YAML text of a run's settings with every default; `load_config` reads the same run back from it."""
     stream = io.StringIO()
     yaml = YAML()
     yaml.width = 120

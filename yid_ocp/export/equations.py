@@ -83,7 +83,7 @@ def _exported_step_functions(symbols: StepSymbols) -> tuple[ca.Function, ...]:
 def export_step_functions(
     symbols: StepSymbols, folder: str | os.PathLike[str], theta: Array, time_step: float
 ) -> tuple[Path, ...]:
-    """Write `NAME.casadi` for each of `_exported_step_functions`, all of them as `equations.c`, and `names.json`.
+    """Write a step's CasADi functions as `NAME.casadi` files and as `equations.c`, with `names.json`.
 
     `names.json` gives the values of theta beside the parameters' names, and the time step [s]. Returns the files
     written; `OutputError` where the folder, made if absent, or a file cannot be written.

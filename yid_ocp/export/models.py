@@ -126,7 +126,7 @@ def _add_numbers(element: Element, values: Mapping[str, float]) -> None:
 
 @dataclass(frozen=True)
 class FormatSupport:
-    """Whether an export format can express one parameter or effect, and by what element or why not."""
+    """Whether an export format can express a parameter or effect: by which element, or the reason why not."""
 
     status: _SupportStatus
     how: str
@@ -207,7 +207,7 @@ def format_support_by_effect(system: System, values: Mapping[str, float], form: 
 def format_support_by_parameter(
     system: System, effects: Mapping[str, FormatSupport], form: str
 ) -> dict[str, FormatSupport]:
-    """Support of an export format for each parameter, by name; that of an effect's is the effect's."""
+    """Support of an export format for each parameter, by name; a parameter of an effect has its effect's support."""
     found = {}
     for entry in system.parameters:
         owner, aspects = entry.name.rpartition(".")[0], sorted(model_aspects_depending_on_symbols(system, entry.symbol))

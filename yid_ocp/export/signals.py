@@ -30,7 +30,7 @@ _WORLD_FRAME = "world"
 
 @dataclass(frozen=True)
 class RosTopicTimeSeries:
-    """Time series of one ROS topic at times t (M,) [s]; messages without a number are left out.
+    """Time series of one ROS topic at times t (M,) [s]; times without any finite value get no message.
 
     `values` are each (M, n): of joints `position`, `velocity` and `effort`, with as many columns as there are `names`;
     of all else `xyz`, n = 3, the forces of a wrench.
@@ -45,7 +45,7 @@ class RosTopicTimeSeries:
 
 
 def export_mcap(signals: Sequence[RosTopicTimeSeries], path: str | os.PathLike[str]) -> float:
-    """Write signals into one MCAP file, with the definitions of their messages, in the order of time.
+    """Write ROS time series to one MCAP file with message definitions, sorted by time.
 
     Returns the shift added to all times because stamps cannot be negative: whole seconds, usually zero [s]. Raises
     `OutputError` when `rosbags` is not installed, there is nothing to write, or the file cannot be written.

@@ -64,7 +64,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """The workers of a run: processes here, or those of a Dask scheduler (address or file); `ConfigError` for both."""
+    """Workers of a run: local processes or a Dask scheduler's (address or file); `ConfigError` if both are given."""
 
     n_processes: int | None = None
     scheduler_address: str = ""
@@ -78,7 +78,7 @@ class WorkerConfig:
             raise ConfigError(what, where=where, allowed="one of the two", hint=hint)
 
     def check_available(self) -> None:
-        """Raise `WorkerError` before long work where no scheduler answers, or a worker is not fit for it."""
+        """Raise `WorkerError` if the scheduler does not answer or a worker is unsuitable; for use before long work."""
         if self.scheduler_address:
             with _dask_executor(self.scheduler_address):
                 pass
@@ -96,7 +96,7 @@ def run_tasks(
     progress: TaskProgressCallback | None = None,
     code: str | None = None,
 ) -> list[TaskResult]:
-    """Results of a function for all tasks, in their order; those already stored in the folder are not computed again.
+    """Results of a function for all tasks, in order of the tasks; results already stored in `folder` are reused.
 
     A task that raises leaves `HASH.error.json` and a warning, and the others go on; the next run tries it again. An
     interruption leaves the results that are finished. A worker of other sources than these does nothing.
@@ -141,7 +141,7 @@ def run_tasks(
 
 
 def require_task_values(results: Sequence[TaskResult]) -> list[Any]:
-    """Values of tasks, none of which may have failed: `WorkerError` if that can be mended, else `RuntimeError`."""
+    """Values of the tasks; `WorkerError` if the first failure is an error of this package, else `RuntimeError`."""
     failed = [entry for entry in results if entry.error]
     if not failed:
         return [entry.value for entry in results]

@@ -65,7 +65,7 @@ CASADI_LOCK = threading.RLock()
 
 
 class CasadiLockedCache(Generic[_Key, _Value]):
-    """Cached values by key, each computed once under the CasADi lock; `compute_value` depends on the key alone."""
+    """Cache of values by key; `compute_value` computes each once, under the CasADi lock, from the key alone."""
 
     def __init__(self, compute_value: Callable[[_Key], _Value]) -> None:
         self._make = compute_value
@@ -161,7 +161,7 @@ def _answer(requests: Sequence[_Request]) -> None:
 
 
 def batched_call(function: Callable[[list[_Query]], list[_Answer]], questions: list[_Query]) -> list[_Answer]:
-    """Answers of a function to questions, in one call with those of other `map_with_batched_calls` items."""
+    """Answers of a function to `questions`, in one call with those of concurrent `map_with_batched_calls` items."""
     march = getattr(_THREAD_SHARE, "march", None)
     if march is None:
         return function(questions)
@@ -170,7 +170,7 @@ def batched_call(function: Callable[[list[_Query]], list[_Answer]], questions: l
 
 
 def map_with_batched_calls(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """Results of a function for all items, which wait for each other wherever one calls `batched_call`.
+    """Results of a function for all items, run concurrently; their simultaneous `batched_call`s become one call.
 
     As many run as there are threads to use. Which questions meet depends on the items alone. No item may hold a lock
     while it asks.

@@ -153,7 +153,7 @@ def _shown_frames(system: System) -> list[str]:
 def animation_of_trajectories(
     title: str, told: Sequence[ConfigurationTrajectory], recording: Recording | None = None
 ) -> Animation:
-    """Animation of model trajectories, the first of which fixes clock and joints, and of the recorded motion.
+    """Animation of model trajectories and of the recorded motion; the first trajectory sets the times and joints.
 
     Of a recording its points are shown, and its arms where it recorded their angles; at most `_MAX_FRAMES` frames.
     """

@@ -85,16 +85,13 @@ def solution_cost_history_figure(costs: Sequence[float], notes: Sequence[str]) -
 
 @dataclass(frozen=True)
 class TimePlotData:
-    """Data of one plot over time: points measured (M,) at t (M,), predicted lines (t, value), and shades.
-
-    `band_half_height` is half the height of what is shaded about zero.
-    """
+    """Data of one plot over time: measured values (M,) at t (M,), predicted lines (t, value), shaded intervals."""
 
     axis_title: str
     lines: Mapping[str, tuple[Array, Array]]
     t: Array = field(default_factory=lambda: np.zeros(0))
     measured: Array = field(default_factory=lambda: np.zeros(0))
-    band_half_height: float | None = None
+    band_half_height: float | None = None  # half the height of a shaded band about zero; None: no band
     marked_intervals: Sequence[tuple[float, float]] = ()
     is_low_row: bool = False
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def interval_and_p_value_calibration_rates(result: Mapping[str, Any]) -> dict[str, dict[float, Mapping[str, float]]]:
-    """Rates by promised level of a blind validation: of intervals of effects' parameters, and of p-values."""
+    """Observed rates by nominal level in a blind validation: coverage of effect parameters, and p-values."""
     labels = {"intervals": "intervals of effects' parameters", "p_values": "p-values of clean recordings"}
     rates = {label: result["calibration"][key] for key, label in labels.items()}
     return {label: {entry["level"]: entry for entry in own if entry["of"]} for label, own in rates.items()}

@@ -486,7 +486,7 @@ def _track_summary(result: Mapping[str, Any]) -> SummaryBlocksAndTexts:
 
 @register_summary("yid-export/1")
 def export_summary(manifest: Mapping[str, Any]) -> SummaryBlocksAndTexts:
-    """Summary of a manifest: what of a model a format cannot express, and its replay."""
+    """Summary of an export: what of the model the format cannot express, and errors of the replay in MuJoCo."""
     effects = {name.rpartition(".")[0] for name in manifest["parameters"] if "@" in name}
     changed = {
         name: entry

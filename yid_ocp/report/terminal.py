@@ -64,7 +64,7 @@ SUMMARY_BY_FORMAT: dict[str, _Summary] = {}
 
 
 def register_summary(result_format: str) -> Callable[[Callable[[Mapping[str, Any]], SummaryBlocksAndTexts]], _Summary]:
-    """Decorator that registers the summary of a result format, and turns its parts into a list of blocks.
+    """Decorator that registers a function as summary of a result format and makes its output a list of blocks.
 
     Texts without a word and tables without a row below the header are left out.
     """
@@ -93,12 +93,12 @@ def format_error_value_and_unit(value: float | None, unit: str) -> tuple[str, st
 
 
 def p_value_text(p_value: float) -> str:
-    """A p-value, as a bound where it vanishes."""
+    """Text of a p-value, `< 1e-12` for smaller ones."""
     return f"{p_value:.2g}" if p_value > 1e-12 else "< 1e-12"
 
 
 def channel_or_group_unit(units: Mapping[str, str], channel: str) -> str:
-    """Unit of a channel, or of the first member of a group; empty where it is not known."""
+    """Unit of a channel, or of the first member of a group; an empty text if it is unknown."""
     return next((unit for name, unit in units.items() if name == channel or name.startswith(f"{channel}.")), "")
 
 
@@ -208,7 +208,7 @@ def _note_lines(notes: Sequence[str]) -> list[str]:
 
 
 def aligned_table_lines(rows: TableRows) -> list[str]:
-    """Rows as aligned lines, the first one as head; columns without an entry are left out."""
+    """Text lines of a table with aligned columns, header first; columns without any entry are left out."""
     columns = [column for column in zip(*rows, strict=True) if any(column)]
     widths = [max(map(len, column)) for column in columns]
     lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in zip(*columns, strict=True)]

@@ -59,7 +59,7 @@ def baxter_foam_y_system(arms: int) -> System:
 
 @dataclass(frozen=True)
 class ArmSensorNoise:
-    """Standard deviations of the noise on what the arm measures, drawn anew for every sample but for the bias.
+    """Standard deviations of the arm's sensor noise; noise is drawn per sample, the effort bias per recording.
 
     Of a joint's reading [rad], [rad/s], of a recorded (not the applied) torque, white and constant, one or nj [N m],
     and of each coordinate of a grasped point [m]. The recording always states the others, torques' where
@@ -135,7 +135,7 @@ def run_virtual_experiment(
 def record_simulation(
     system: System, values: Mapping[str, float] | None, experiment: VirtualExperiment, run: SimulationResult
 ) -> Recording:
-    """Recording of a simulation that was made with an experiment's motion, as `run_virtual_experiment` returns it."""
+    """Return the recording of a finished simulation `run` with the experiment's sensors and noise."""
     chosen, streams = experiment, _random_generators(experiment.seed)
     held, visible = _held_and_visible_points(system)
     groups = [_arm_points(system, held, run, chosen.arm_noise, streams)] if held else []
@@ -259,7 +259,7 @@ _JOINT_SENSOR_ERRORS: Mapping[str, tuple[str, Callable[[Array, Array, Mapping[st
 def recording_with_sensor_error(
     recording: Recording, system: System, kind: str, place: str, values: Mapping[str, float]
 ) -> Recording:
-    """Copy of a recording as it would be if its sensors had one error, a sensor effect of the library."""
+    """Copy of a recording with one sensor error: the sensor effect `kind` at `place` with parameters `values`."""
     if kind.startswith("camera") or kind == "surface_offset":
         last = recording.duration
         points = (g if g.pose is None else _camera_error(g, system, kind, values, last) for g in recording.points)

@@ -408,7 +408,7 @@ OUT_OF_LIBRARY_EFFECTS: Mapping[str, _ForceBuilder] = {
 
 @dataclass(frozen=True)
 class InjectedEffect:
-    """An effect in the data but not in the model, of `INJECTABLE_EFFECT_KINDS` or `OUT_OF_LIBRARY_EFFECTS`.
+    """An effect in the simulated data that the model lacks: kind, location and parameter values.
 
     `values` are as in the vocabulary; for kinds outside it `size`, in the unit of the force that it makes.
     """
@@ -419,7 +419,7 @@ class InjectedEffect:
 
     @property
     def label(self) -> str:
-        """`kind@location`."""
+        """Name of the effect, `kind@location`."""
         return f"{self.kind}@{self.location}"
 
 
@@ -429,7 +429,7 @@ def run_experiment_with_effects(
     effects: Sequence[InjectedEffect],
     experiment: VirtualExperiment | None = None,
 ) -> Recording:
-    """Simulate a virtual experiment with effects that are absent from the system's description.
+    """Return the recording of a virtual experiment with effects that the system's description lacks.
 
     `system` is nominal, with driven joints; `true_parameters` of the recording are those `values`, and the experiment's
     own `injected_terms` are replaced. `ConfigError` of a kind that cannot be done here, `ModelError` of a payload that

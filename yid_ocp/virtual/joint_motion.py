@@ -33,7 +33,7 @@ class JointMotion(Protocol):
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Names of the joints."""
+        """Names of the nj joints that the motion moves."""
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
         """Offset from the initial angles, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
@@ -54,7 +54,7 @@ class MultisineMotion:
     ramp_time: float = 1.0  # [s]
 
     def offset_and_derivatives(self, t: float) -> tuple[Array, Array, Array]:
-        """As `JointMotion` has it."""
+        """Offset from the initial angles, velocity and acceleration at time t [s], three arrays of shape (nj,)."""
         omega = 2 * math.pi * self.frequency
         angle = omega * t + self.phase
         sine, cosine = self.amplitude * np.sin(angle), self.amplitude * np.cos(angle)

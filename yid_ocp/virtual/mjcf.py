@@ -88,7 +88,7 @@ class JointDynamicsTerms:
 
 
 class ParameterEvaluator:
-    """Evaluator of expressions in a system's parameters, nominal where absent; values are flattened by columns."""
+    """Evaluator of CasADi expressions at parameter values, else nominal values; matrices are flattened by columns."""
 
     def __init__(self, system: System, values: Mapping[str, float] | None = None) -> None:
         self._symbols, self._theta = system.parameters.symbols, system.parameters.vector(values)
@@ -107,7 +107,7 @@ class ParameterEvaluator:
 
 
 def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[str]:
-    """Keys of `MODEL_ASPECT_DESCRIPTIONS` for the parts of the description that depend on given parameters."""
+    """Keys of `MODEL_ASPECT_DESCRIPTIONS` whose part of the system's description depends on `symbols`."""
     tree, held = system.mechanism, system.grasps
     bodies = [body for joint in tree.joints for body in joint.bodies]
     placements = [*(joint.placement for joint in tree.joints), *(frame.placement for frame in tree.frames.values())]
@@ -138,7 +138,7 @@ def model_aspects_depending_on_symbols(system: System, symbols: ca.SX) -> set[st
 def effect_joint_terms_and_changed_aspects(
     system: System, effect: Effect, value: ParameterEvaluator
 ) -> tuple[dict[str, JointDynamicsTerms], set[str]]:
-    """Terms that a system's effect adds at single joints, and the `MODEL_ASPECT_DESCRIPTIONS` it changes."""
+    """Terms by joint that an effect adds, and `MODEL_ASPECT_DESCRIPTIONS` keys of the aspects that it changes."""
     aspects = model_aspects_depending_on_symbols(system, effect.parameters.symbols)
     terms: dict[str, JointDynamicsTerms] = {}
     if effect.kind in _DRY_FRICTION_KINDS:
@@ -163,7 +163,7 @@ def effect_joint_terms_and_changed_aspects(
 
 
 def joint_dynamics_terms(system: System, value: ParameterEvaluator) -> dict[str, JointDynamicsTerms]:
-    """Springs, dampers, rotor inertia and friction by joint, from the description and from such effects."""
+    """Springs, dampers, rotor inertia and friction by joint, from the description and from effects at one joint."""
     found: dict[str, JointDynamicsTerms] = {}
 
     def add(joint: str, own: JointDynamicsTerms) -> None:

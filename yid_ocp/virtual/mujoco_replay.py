@@ -32,7 +32,7 @@ _INERTIA_EVERY = 20  # steps; an arm's inertia hardly changes meanwhile
 
 @dataclass(frozen=True)
 class ReplayMismatch:
-    """Deviation of a replayed model from the recording in one channel or group, in `unit`; of points the distance.
+    """RMS error of a replayed model against the recording in one channel or group; for points, of the distance.
 
     `noise_rms` is expected from sensor noise alone, zero if the recording does not state it.
     """

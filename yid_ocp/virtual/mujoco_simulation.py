@@ -37,13 +37,13 @@ _INSTABILITY_WARNINGS = ("mjWARN_BADQPOS", "mjWARN_BADQVEL", "mjWARN_BADQACC")
 
 
 class InjectedSimulatorTerms(Protocol):
-    """Forces and model changes in the simulator that are not in the system's description."""
+    """Base class of forces and model changes in the simulator that the system's description lacks."""
 
     def edit_model(self, model: Any) -> None:
         """Edit the compiled `mujoco.MjModel`."""
 
     def start_motion(self, data: Any) -> None:
-        """Called once when the motion begins, at rest."""
+        """Prepare for the motion; called once when it begins, at rest."""
 
     def add_forces(self, model: Any, data: Any) -> None:
         """Add generalized forces to `data.qfrc_passive`; called at every inner step."""
@@ -93,7 +93,7 @@ class SimulationOptions:
 
 @dataclass(frozen=True)
 class SimulationResult:
-    """Noise-free trajectories of a simulation.
+    """Noise-free result of a simulation: q, v, efforts and points at times `t`, and points at camera frame times.
 
     `effort` is the torque at t_k, or its mean from t_k to t_{k+1}, as `effort_kind` says [N m], or what servos were
     commanded at t_k; its last row was computed and not applied. Points are `system.point_frames` in the world.
@@ -242,7 +242,7 @@ def _lost(scene: MujocoScene) -> bool:
 
 
 class TrackingController:
-    """Computed-torque controller: the arms' inverse dynamics along the motion, the grasps' load at rest, feedback.
+    """Computed-torque controller: inverse dynamics along the motion, plus the grasps' load at rest, plus feedback.
 
     The scene is at rest, before the motion; `balance` (nu,) are the torques that hold it there [N m].
     """

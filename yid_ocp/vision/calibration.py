@@ -56,7 +56,7 @@ _MAX_CLOCK_STEP = 0.05  # of an offset in one iteration [s]
 
 @dataclass(frozen=True)
 class CameraClockOptions:
-    """Settings of the comparison of the camera's clock with the joints' clock."""
+    """Settings of the estimation of the camera clock's offset and drift relative to the joints' clock."""
 
     initial_offset: Annotated[float, OptionInfo("stamp minus joint time, as far as known", "s")] = 0.0
     search_half_width: Annotated[
@@ -92,7 +92,7 @@ class _StampDelay(NamedTuple):
 def stamp_delay_beyond_clock_offset(
     arm: ArmSurface, state: CameraState, stamp: float, points: Array, rng: np.random.Generator, usual: float = 0.0
 ) -> _StampDelay | None:
-    """Delay of one frame's stamp [s] beyond the common offset, from world points (N, 3), the robot's among them [m].
+    """Delay of a frame's stamp [s] beyond the common clock offset, from the robot among world points (N, 3) [m].
 
     None where the arm is not in view. Where the misfit is not much larger than the `usual` one of other frames [m^2],
     the offset is looked for nearby only.
@@ -212,7 +212,7 @@ class CameraCalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """Calibrated camera of a sequence."""
+    """Result of a camera calibration: camera state with covariance, prior state, arm visibility, message."""
 
     camera_state: CameraState  # what is used: pose, depth, clock
     prior_state: CameraState
@@ -230,7 +230,7 @@ class CameraCalibration:
         return self.camera_state.pose[:3, 3]
 
     def point_std_from_calibration(self, points: Array, velocity: Array, stamps: Array) -> Array:
-        """Standard deviations of points (N, 3) by the uncertain pose, depth and clock of the camera, (N, 3) [m].
+        """Standard deviations (N, 3) [m] of points due to the camera's uncertain pose, depth and clock.
 
         The same error for all of them, as far as they stand at one place; `velocity` (N, 3) [m/s], `stamps` (N,) [s].
         """
@@ -263,7 +263,7 @@ def calibrate_camera(
     clock: CameraClockOptions,
     source: str = "sequence",
 ) -> CameraCalibration:
-    """Calibrate the camera of a sequence, told to stand at a pose (4, 4), from some of its frames.
+    """Estimate a camera's pose, depth and clock from frames that show the arm, from a given pose (4, 4).
 
     The frames are thinned, the robot and what is about it among the points; `source` says where they come from.
     `DataError` where the arm is not seen, does not lie where the camera sees something, or moves too little to tell the

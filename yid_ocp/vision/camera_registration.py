@@ -162,7 +162,7 @@ class ArmSurface:
         return self.robot_surfaces.part_poses_at(self.configuration_at(t))
 
     def visible_surface_points(self, state: CameraState, stamp: float) -> tuple[Array, IntArray]:
-        """Points of moving surfaces that the camera sees if nothing is before the robot, in the world; their parts."""
+        """World points of moving surfaces that an unobstructed camera sees, and the surface part of each."""
         q = self.configuration_at(float(state.stamps_to_joint_clock(stamp)))
         depth, cosine, part = self.robot_surfaces.render_depth_image(_START_INTRINSICS, state.pose, q)
         seen = np.isfinite(depth) & (cosine > _MIN_INCIDENCE_COSINE) & (part >= 0) & self._moving[part]
@@ -363,7 +363,7 @@ def _add_costs(
 
 @dataclass(frozen=True)
 class SurfaceVisibility:
-    """Shares of the arm's surface in view that a cloud contains, that is occluded, or that is seen through."""
+    """Shares of the arm's surface in view that a cloud contains, that are occluded, or that are seen through."""
 
     there: float  # a cloud has it
     covered: float  # something is before it
@@ -374,7 +374,7 @@ class SurfaceVisibility:
 def surface_visibility(
     arm: ArmSurface, glimpses: Sequence[CalibrationFrame], state: CameraState, within: float
 ) -> SurfaceVisibility:
-    """Shares of the arm's surface in view with a point of the frames within a distance [m], or with none, and why."""
+    """Shares of the arm's surface in view that clouds contain within `within` [m], occlude, or see through."""
     counts = np.zeros(4)
     for glimpse in glimpses:
         points, _ = arm.visible_surface_points(state, glimpse.stamp)

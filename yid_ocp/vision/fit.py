@@ -102,7 +102,7 @@ class ShapeFitOptions:
 
 
 class ShapeFitter:
-    """Fitter of the shape of a system's object to a camera's points, at parameter values; nominal where absent.
+    """Fitter of an object's configuration to camera points; parameters that are not given are nominal.
 
     Beside the bends, `loose` joints are sought with next to no prior: see `initial_shapes.system_with_free_root`.
     `DataError` for a system without an object.
@@ -181,7 +181,7 @@ class ShapeFitter:
         return np.array(self._corners(q)[0]).reshape(-1, 2, 3)
 
     def fit_frame(self, sight: ProcessedFrameCloud, q_known: Array, starts: Sequence[Array] = ()) -> FrameShapeFit:
-        """Fit the shape in one frame, with the robot's part of a configuration (n,) and from starts of the object's.
+        """Fit the object's shape in one frame; `q_known` (n,) holds the robot's configuration, `starts` first guesses.
 
         The passes on the nodes, which cost little, run from all starts (rest where absent), the others from the best
         that was found. `DataError` where there is no point.
@@ -277,7 +277,7 @@ class ShapeFitter:
 
     @property
     def max_informative_surface_distance(self) -> float:
-        """Distance from the surface beyond which a point says nothing of the shape [m]."""
+        """Distance from the surface beyond which a point carries no information on the shape [m]."""
         return (self.options.surface_loss_scales or self.options.node_loss_scales)[-1] * _MAX_POINT_DISTANCE_SCALES
 
     def _tasks(

@@ -210,7 +210,7 @@ _CAMERA_FILE_KEYS = ("format", "pose", "frame", "unit", "intrinsics", "depth_uni
 def read_frame_folder(
     folder: str | os.PathLike[str], *, pose: ArrayLike | None = None, unit: str | None = None
 ) -> FrameSequence:
-    """Open a folder of clouds or depth images.
+    """Frame sequence of a folder of point clouds or depth images, loaded one frame at a time.
 
     The folder holds `camera.json` (`yid-frames/1`: `pose` 4x4, `frame` "camera" or "world" of the clouds, `unit` "m" or
     "mm" of the clouds, `intrinsics` and `depth_unit` [m] of depth images), `timestamps.csv` (columns `file`, `t` [s])

@@ -207,9 +207,9 @@ _BAG_SUFFIXES, _AZURE_KINECT_SUFFIX = (".bag", ".mcap", ".db3"), ".mkv"
 def read_frames(
     path: str | os.PathLike[str], *, pose: ArrayLike | None = None, unit: str | None = None, topic: str | None = None
 ) -> FrameSequence:
-    """Open the frames of a camera, which are then read one at a time.
+    """Frame sequence of a folder or file of a depth camera, loaded one frame at a time.
 
-    They are a folder (`read_frame_folder`), a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file, of which `topic`
+    `path`: a folder (`read_frame_folder`), a bag of ROS 1 or ROS 2, an MCAP file or a RealSense file, of which `topic`
     names the clouds or depth images, or an Azure Kinect's `.mkv`, where the build of Open3D reads it. The camera's
     `pose` (4, 4) in the world and the `unit` of clouds replace the folder's; others do not say them. `DataError` where
     what is there cannot be read, or lacks time stamps, pose or intrinsics.

@@ -149,7 +149,7 @@ def frame_rejection_reason(fit: FrameShapeFit, shape: ShapeFitter, options: Trac
 
 
 def drop_outlying_frames(frames: Sequence[FrameReport], options: TrackOptions) -> list[FrameReport]:
-    """Frames, with those that deviate from the other good frames marked as dropped."""
+    """All frames; those that deviate from the other good frames are marked as dropped."""
     fits = _good_fits(frames)
     if not fits:
         return list(frames)
@@ -181,7 +181,7 @@ def tracked_states_and_points(
     options: TrackOptions,
     source: str,
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Times, configurations, positions, their standard deviations and the shared part of these, as in `TrackResult`.
+    """Times, configurations, positions, their standard deviations and the shared part, as in `TrackResult`.
 
     Of the points in `columns` of the system's in the good frames. `DataError` without a good frame, or where no point
     is known well enough in any.
@@ -252,7 +252,7 @@ _HANGING_HEIGHT_FRACTION = 0.2  # of the length between the ends, by which one i
 
 
 def with_consistent_root_end(frames: Sequence[FrameReport], options: TrackOptions) -> tuple[list[FrameReport], str]:
-    """Frames with the same end as root in all of them, and the criterion in words.
+    """Frames whose fits have the same end of the object as root, and a text on how that end was chosen.
 
     Where a shape fits as well with its root at another end, the ends are followed from frame to frame first. Then the
     root is the one that stays in its place, if it is fixed, or the higher one.

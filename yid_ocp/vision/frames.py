@@ -40,7 +40,7 @@ _UNDISTORTION_TOLERANCE = 1e-3  # [pixels]
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """Intrinsics of a camera (x right, y down, z ahead); `DataError` for a lens's distortion that is not known.
+    """Intrinsics of a camera (x right, y down, z ahead); `DataError` for an unknown distortion model.
 
     Focal lengths and principal point [pixels] of  u = fx x/z + cx,  v = fy y/z + cy  without distortion.
     """
@@ -165,7 +165,7 @@ def import_open3d() -> ModuleType:
 
 @dataclass(frozen=True, eq=False)
 class FrameSequence:
-    """Sequence of clouds of one camera, loaded one at a time."""
+    """Point clouds of one camera with stamps, names and camera pose; each cloud is loaded on demand."""
 
     stamps: Array  # (M,), as the camera gave them, in the order of the frames: neither sorted nor unique [s]
     frame_names: tuple[str, ...]
@@ -235,7 +235,7 @@ _MIN_DEPTH = 0.05  # [m]; nearer to the camera's plane there is no picture
 
 @dataclass(frozen=True, eq=False)
 class OcclusionMap:
-    """Occlusion map of a frame, from all points that the camera saw."""
+    """Map of what the surfaces in a frame hide, made from all points that the camera measured."""
 
     points: Array  # (N, 3), in the world, before anything is left out [m]
     camera_pose: Array  # (4, 4), camera (x right, y down, z ahead) in the world

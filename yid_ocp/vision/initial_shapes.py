@@ -216,7 +216,7 @@ class _InitialShape(NamedTuple):
 
 
 def system_with_free_root(system: System, values: Mapping[str, float] | None = None) -> tuple[System, tuple[str, ...]]:
-    """System without grasps, its object on six free joints (place [m], turns about x, y, z [rad]), and their names."""
+    """System without grasps whose object has six free root joints (position [m], x-y-z angles), and their names."""
     tree = system.numeric_mechanism(values)
     q = ca.SX.sym("q", system.n_coordinates)
     base = tree.joint_index(next(s for s in system.segment_layouts if s.parent_segment is None).link_joints[0][0])
@@ -238,7 +238,7 @@ class _Link(NamedTuple):
 
 
 class InitialShapeFinder:
-    """Finder of initial shapes of an object that may bend some joints from rest (n,); `lengths` of its links [m]."""
+    """Finder of object shapes along a centerline, with some joints bent from rest (n,); `lengths` of links [m]."""
 
     def __init__(
         self, system: System, tree: Mechanism, rest: Array, bends: Sequence[int], lengths: Mapping[str, Sequence[float]]

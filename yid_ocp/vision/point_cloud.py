@@ -31,7 +31,7 @@ _MAD_TO_STD = 1.4826  # from the median absolute deviation of a normal distribut
 
 @dataclass(frozen=True, eq=False)
 class WeightedCloud:
-    """Point cloud in which each point stands for a number of the camera's points."""
+    """Point cloud whose weights are the numbers of camera points that each point represents."""
 
     points: Array  # (N, 3), in the world [m]
     point_weights: Array  # (N,), how many of the camera's points each one stands for
@@ -116,7 +116,7 @@ class CloudFilterOptions:
 
 
 class ReachableObjectRegion:
-    """Region that the object can reach, by its branches and the floor; by the options where its root is `anywhere`."""
+    """Region that the object can reach, by its branches and the floor; for a root `anywhere`, by the options."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class ReachableObjectRegion:
         self._base = np.mean(bases, axis=0) if bases else None
 
     def membership_test_at(self, q: ArrayLike, camera: ArrayLike) -> Callable[[Array], BoolArray]:
-        """Test whether points (N, 3) lie inside, the robot at a configuration (n,), seen from a camera at (3,) [m]."""
+        """Function: which points (N, 3) are in the region, for a configuration (n,) and camera position (3,) [m]."""
         centre = np.array(self._root(np.asarray(q, float))).ravel()
         ahead, limit = np.zeros(3), 0.0
         if self._behind is not None and self._base is not None:
@@ -194,7 +194,7 @@ def voxel_averages(points: Array, size: float) -> WeightedCloud:
 def is_statistical_inlier(
     cloud: WeightedCloud, neighbours: int, ratio: float, asked: BoolArray | None = None
 ) -> BoolArray:
-    """Whether points are inliers of statistical outlier removal, shape (N,); False for those that are not asked.
+    """Whether points are inliers of statistical outlier removal, shape (N,); False outside the mask `asked`.
 
     A point stays where the mean distance d to its nearest neighbours satisfies  d <= median(d) + ratio s,  with s the
     median absolute deviation turned into a standard deviation. Both are weighted, so that wrong points, each alone in

@@ -40,7 +40,7 @@ _MAD_TO_STD = 1.4826
 
 @dataclass(frozen=True, eq=False)
 class BackgroundPoints:
-    """Points of the static scene, which are left out of clouds, and the distance that counts as one of them."""
+    """Points of the static scene, and the distance within which a cloud's points are removed as background."""
 
     points: Array = field(default_factory=lambda: np.empty((0, 3)))  # (N, 3), in the world [m]
     match_distance: float = 0.0  # distance at which a point belongs to it [m]
@@ -64,7 +64,7 @@ class BackgroundPoints:
     def from_static_points(
         clouds: Sequence[Array], voxel: float, noise: float, shapes: Sequence[TubeLinks] | None = None, near: float = 0
     ) -> BackgroundPoints:
-        """Background from world points (N, 3) of an empty scene, or that stay in most frames away from fitted shapes.
+        """Background: world points (N, 3) of an empty scene, or points static in most frames and off fitted shapes.
 
         Counted in cubes of an edge `voxel`, with points of standard deviation `noise`; what ever was nearer than `near`
         to the surface of a tube may be the object's, all in [m].
@@ -83,7 +83,7 @@ class BackgroundPoints:
 
 @dataclass(frozen=True, eq=False)
 class ForeignObject:
-    """What is neither robot nor modelled object, seen in several frames: place, size, motion and advice."""
+    """Something seen in several frames that is neither robot nor modelled object: place, size, motion, advice."""
 
     centre: Array  # (3,), in the world, in the median frame [m]
     size: Array  # (3,) [m]
@@ -194,18 +194,18 @@ class TubeDimensionEstimates:
 
     @property
     def is_dimension_determined(self) -> BoolArray:
-        """Which dimensions the frames determine, shape (2 s,)."""
+        """Mask of the dimensions that the frames determine, shape (2 s,) for s tubes."""
         return np.asarray((self.dimension_log_ratio_std < _MAX_KNOWN_LOG_STD) & (self.n_frames > 0))
 
     @property
     def is_model_value_contradicted(self) -> BoolArray:
-        """Which of the model's values contradict the frames, shape (2 s,)."""
+        """Mask of the model's values that contradict the frames, shape (2 s,) for s tubes."""
         off = np.abs(self.log_ratio) > _DOUBTED_STDS * self.dimension_log_ratio_std
         return np.asarray(self.is_dimension_determined & off)
 
     @property
     def contradiction_message(self) -> str:
-        """Which of the model's values contradict the frames and have no estimate in their place; empty for none."""
+        """Text on model values that contradict the frames and are not estimated instead; empty if there are none."""
         values, fitting = 1e3 * self.model_values, 1e3 * self.model_values * np.exp(self.log_ratio)
         wrong = [
             f"{self.names[i]} {values[i]:.4g} mm where {fitting[i]:.4g} mm fits"
@@ -215,7 +215,7 @@ class TubeDimensionEstimates:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """One message for every dimension that is doubted or estimated: the value that fits, with its interval."""
+        """One message for every contradicted or estimated dimension: the value that fits, with its interval."""
         lines = []
         for i, name in enumerate(self.names):
             value = 1e3 * self.model_values[i] * math.exp(self.log_ratio[i])
@@ -230,7 +230,7 @@ class TubeDimensionEstimates:
         return tuple(lines)
 
     def point_std(self, points: Array) -> Array:
-        """Stds (np, 3) [m] of points due to wrong or uncertain tube dimensions, from the points' slopes (np, 3, 2 s).
+        """Stds (np, 3) [m] of points due to wrong or uncertain tube dimensions; `points`: derivatives (np, 3, 2 s).
 
         The whole displacement of what is doubted and yet used, and what remains uncertain of what is estimated.
         """

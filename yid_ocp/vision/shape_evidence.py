@@ -50,7 +50,7 @@ class TubeLinks:
 def tube_link_projections(
     corners: Array, radius: Array, points: Array, share: float = 1.0
 ) -> tuple[IntArray, Array, Array, Array]:
-    """Projections of points (N, 3), which lie at a share of the radius (K,) [m], on tubes of links (K, 2, 3).
+    """Projections of points (N, 3) on the nearest of links (K, 2, 3), nearest to `share` of the radius (K,) [m].
 
     Index of the link and place along it from 0 to 1, both (N,), unit vectors (N, 3) from the centre line to the points,
     and distances (N,) from it [m].
@@ -76,7 +76,7 @@ def link_axes(link_ends: Array) -> Array:
 
 
 def link_normals_perpendicular_to_sight(link_ends: Array, camera: Array) -> Array:
-    """Unit vectors at right angles to links (K, 2, 3) and to the sight of a camera at (3,), shape (K, 3)."""
+    """Unit vectors (K, 3) perpendicular to links (K, 2, 3) and to the sight of a camera at (3,)."""
     across = np.cross(link_ends[:, 1] - link_ends[:, 0], link_ends.mean(axis=1) - camera)
     return np.asarray(across / np.maximum(np.linalg.norm(across, axis=1), 1e-12)[:, None])
 
@@ -97,7 +97,7 @@ class ForeignCluster:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapeFitQuality:
-    """How well a shape suits a frame's points, and how much of the shape they cover."""
+    """Fit quality of a shape in one frame: noise, distances, coverage of links, end offsets, foreign clusters."""
 
     noise_std: float  # standard deviation of the points on the shape from its surface [m]
     mean_distance: float  # mean distance from the surface of points near it that are no thing's [m]
@@ -109,14 +109,14 @@ class ShapeFitQuality:
     foreign_clusters: tuple[ForeignCluster, ...]  # things beside the shape, the largest first
 
     def length_weighted_coverage(self, lengths: Array) -> float:
-        """Share of the visible length of links, of lengths (K,) [m], that has own points; 0 where none is visible."""
+        """Share of the visible length of links, lengths (K,) [m], with points of their own; 0 if none is visible."""
         filled, empty = float(lengths @ self.covered_fraction), float(lengths @ self.visibly_empty_fraction)
         return filled / max(filled + empty, 1e-12)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapePointClassification(ShapeFitQuality):
-    """Classification of a frame's points by a shape, and how much of the shape they cover."""
+    """Fit quality of a shape, and which of the frame's points are its own, contested or foreign."""
 
     # (N,), points on the shape that are surely its own; points there that may be a thing's; points of things
     is_own: BoolArray
@@ -157,7 +157,7 @@ class ProcessedFrameCloud:
 
 
 def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near: float) -> ShapePointClassification:
-    """Classify a frame's points by a fitted shape and assess its coverage; points beyond `near` [m] say nothing."""
+    """Classify a frame's points by a fitted shape and assess its coverage; points beyond `near` [m] are ignored."""
     link, along, normal, distance = tube_link_projections(tubes.link_ends, tubes.radius, seen.points)
     away = _faces_away_from_camera(normal, seen.points - seen.camera_position)
     size = np.abs(np.where(away, -distance, distance) - tubes.radius[link])
@@ -211,7 +211,7 @@ def assess_shape_against_cloud(tubes: TubeLinks, seen: ProcessedFrameCloud, near
 
 
 def tube_like_node_and_point_masks(sight: ProcessedFrameCloud, radius: float) -> tuple[BoolArray, BoolArray]:
-    """Which nodes (K,), and points (N,) nearest to them, lie where the surface is as narrow as a tube of a radius [m].
+    """Masks of skeleton nodes (K,) and of points by nearest node (N,): the cloud there is as narrow as the tube.
 
     About a tube points spread by its length in one direction and by r/sqrt(3) across; on a table, a wall or a body they
     spread as far in two.
@@ -327,7 +327,7 @@ class _SurfaceResiduals(NamedTuple):
 def nearest_surface_residuals(
     corners: Array, radius: Array, points: Array, camera: Array, share: float = 1.0
 ) -> _SurfaceResiduals:
-    """Residuals along the nearest way to the surface,  e = |p - c| - f r, of points (N, 3) that lie at a share f.
+    """Residuals e = |p - c| - f r of points p (N, 3) at `share` f of a link's radius r; c: nearest axis point.
 
     Links are (K, 2, 3), radii (K,), the camera (3,) [m]. A point that only the far side of a tube is near to counts
     from the near side.
@@ -342,7 +342,7 @@ def nearest_surface_residuals(
 
 
 def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera: Array) -> _SurfaceResiduals:
-    """Depth errors of points, along the sight, from the tubes' surface; parameters as of `nearest_surface_residuals`.
+    """Errors of points along the line of sight from the tubes; parameters as of `nearest_surface_residuals`.
 
     Across the sight a point stands where its pixel does, by u from the axis; towards the camera the surface lies at
     sqrt(r^2 - u^2). The nearest way turns with the noise, which does little to where a tube is found, but makes it
@@ -367,7 +367,7 @@ def surface_depth_residuals(corners: Array, radius: Array, points: Array, camera
 
 @dataclass(frozen=True, eq=False)
 class FrameTubeDimensionCost:
-    """Quadratic cost  g'x + x'Sx/2  of the tubes' sizes in one frame, minimised over the joint bends.
+    """Quadratic cost g'x + x'Sx/2 of tube dimensions x in one frame, minimised over the joint angles.
 
     The sizes x are the logarithms of all lengths and then of all radii, segment by segment, relative to the fit's.
     """

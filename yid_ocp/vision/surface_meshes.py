@@ -92,7 +92,7 @@ class TriangleMesh:
 
     @staticmethod
     def concatenate(parts: Sequence[TriangleMesh]) -> TriangleMesh:
-        """Several meshes as one."""
+        """One mesh with the triangles of all given meshes."""
         shifts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
         faces = [part.faces + shift for part, shift in zip(parts, shifts, strict=True)]
         return TriangleMesh(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
@@ -128,7 +128,7 @@ class TriangleMesh:
 
 
 class ArticulatedSurfaces:
-    """Meshes by joint (-1: the world), in the joints' frames, of a numeric mechanism, with ray and distance queries.
+    """Surface meshes on the joints of a numeric mechanism (-1: the world), with ray and distance queries.
 
     Every joint keeps one scene in its own frame, to which rays and points are brought: nothing is rebuilt as it moves.
     """
@@ -179,7 +179,7 @@ class ArticulatedSurfaces:
         return result
 
     def moving_surface_distance(self, points: Array, q: ArrayLike, within: float) -> tuple[Array, Array, IntArray]:
-        """Distance [m], unit normal towards the point and surface part; infinite, zero and -1 beyond `within` [m]."""
+        """Distance [m] to the nearest moving surface, normal towards the point, part; inf, 0, -1 beyond `within`."""
         distance, normal = np.full(len(points), np.inf), np.zeros((len(points), 3))
         owner = np.full(len(points), -1)
         for part, pose in enumerate(self.part_poses_at(q)):
@@ -267,7 +267,7 @@ def _tensor(values: NDArray[Any]) -> Any:
 
 
 def load_robot_meshes(urdf: str | Path, mechanism: Mechanism, kind: UrdfMeshKind = "visual") -> dict[int, TriangleMesh]:
-    """Meshes of a robot's links by the joint that carries them, -1 for what does not move, in the joint's frame.
+    """Meshes of a robot's links by the joint that carries them (-1: immobile), in that joint's frame.
 
     The numeric mechanism was read from the URDF file, or `package:baxter`, alone or joined with others. `ModelError`
     where there is no such file, a mesh is missing or cannot be read, or there is no mesh at all.
@@ -372,7 +372,7 @@ def _resolve_mesh_path(name: str, urdf: Path) -> Path:
 def tube_link_lengths_and_radii(
     system: System, values: Mapping[str, float] | None = None
 ) -> dict[str, tuple[Array, float]]:
-    """Lengths of the links and radius of every tube, by segment [m]."""
+    """Link lengths and radius of every tube [m], by segment name."""
     segments, theta = system.segment_layouts, system.parameters.vector(values)
     sizes = [ca.densify(ca.vertcat(*segment.link_lengths, segment.radius)) for segment in segments]
     numbers = [
@@ -509,7 +509,7 @@ class VirtualCamera:
 
 
 def render_virtual_frames(scene: CameraScene, t: ArrayLike, q: ArrayLike, camera: VirtualCamera) -> VirtualFrames:
-    """Render the frames that a virtual camera takes of a motion, when they are loaded and the same every time.
+    """Frames that a virtual camera takes of a motion; each is rendered on loading, the same every time.
 
     Configurations (N, n) at times (N,) [s] come from whatever simulator; between them a cubic spline interpolates.
     Where there is a robot, the paper's Y stands on a floor, and a wall stands behind Baxter. `DataError` or

@@ -101,7 +101,7 @@ class _Look(NamedTuple):
 
 
 class FrameTracker:
-    """Tracker of single frames of a sequence, in any process; parameters as of `track_object`.
+    """Tracker that processes the frames of a sequence one by one, in any process; arguments of `track_object`.
 
     `frame_order` are all frames by their stamps, `calibration_frames` those from which the camera is calibrated.
     """

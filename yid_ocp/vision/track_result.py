@@ -107,7 +107,7 @@ class TrackResult:
         return PointGroup(_CAMERA_POINT_GROUP, self.point_names, self.t, self.position, self.std, words, pose=pose)
 
     def recording_with_points(self, recording: Recording | None) -> Recording:
-        """A recording, or one of nothing else, with these points as `points_camera`; errors as `validate_recording`."""
+        """A recording (None: an empty one) with these points as `points_camera`; errors as `validate_recording`."""
         recording = Recording(source="depth camera", name="camera") if recording is None else recording
         others = tuple(group for group in recording.points if group.name != _CAMERA_POINT_GROUP)
         count = f"Points of {len(self.t)} of {len(self.frame_reports)} frames"
@@ -134,7 +134,7 @@ class _Picture(NamedTuple):
 
 
 def draw_frame_processing_stages(stages: FrameProcessingStages, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write one picture for every stage that a frame came to: cloud, filtered, skeleton, graph, fit.
+    """Write a picture of every stage that a frame reached: cloud, filtered, skeleton, graph, fit.
 
     They are `NAME_1_cloud.png` to `NAME_5_fit.png` in the folder, which is made; the title of the last one says why the
     frame was dropped. `OutputError` where the folder or a file cannot be written.

@@ -47,7 +47,7 @@ class _BatchRun:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `batch` and return its exit code."""
     members = batch_runs_from_configs(arguments.configs, arguments.recordings, arguments.overrides)
     workers = workers_from_arguments(arguments) or LOCAL_WORKER_CONFIG
     out = arguments.out or Path("runs") / f"batch-{time.strftime('%Y%m%d-%H%M%S')}"

@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `blind` and return its exit code."""
     runs = [
         load_config(path, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE) for path in arguments.configs or [None]
     ]
@@ -351,7 +351,7 @@ EXPERIMENT_VARIATIONS: Mapping[str, _ExperimentVariation] = {
 
 @dataclass(frozen=True)
 class BlindExperiment:
-    """One experiment of an ensemble, as plain data and paths."""
+    """A virtual experiment of a blind ensemble: configuration file, variation of it, seed and purpose."""
 
     config_file: Path
     variation: str

@@ -40,7 +40,7 @@ _OTHER_SIDE = {"left": "right", "right": "left"}
 
 
 def build_system(run: RunSettings, link_division: int = 1) -> System:
-    """The mechanical model of a run, its parameters at the values and bounds of the settings.
+    """Return the mechanical model of a run; its parameters have the values and bounds of the settings.
 
     Each of the object's links is divided into `link_division`, the stiffness and damping of a tube kept; a cable's
     edges stay as they are. `ConfigError` or `ModelError`, which name the setting, for names that do not exist and
@@ -224,7 +224,7 @@ def settings_by_parameter_name(run: RunSettings, parameters: Parameters) -> dict
 
 
 def friction_joints(run: RunSettings, system: System) -> tuple[str, ...]:
-    """Joints that have the friction of the settings: those named, or all of the arms; none without that section."""
+    """Joints with friction by `model.friction`: those named, or all of the arms; empty without that section."""
     if run.model.friction is None:
         return ()
     known = tuple(name for name in arm_joint_names(system) if name in system.joint_damping)
@@ -235,7 +235,7 @@ def friction_joints(run: RunSettings, system: System) -> tuple[str, ...]:
 
 
 def friction_parameter_names(run: RunSettings, parameters: Parameters) -> list[str]:
-    """Names of the amplitudes of a run's ordinary friction, damping of its joints included."""
+    """Names of the parameters for the amount of a run's joint friction, joint damping included."""
     if run.model.friction is None:
         return []
     wanted = run.model.friction.joints

@@ -52,7 +52,7 @@ _MAX_QUOTED_ISSUES = 3  # doubts that an error quotes
 
 
 def problem_options(run: RunSettings, system: System, recordings: Sequence[Recording] = ()) -> ProblemOptions:
-    """`ProblemOptions` of a run.
+    """Options of the estimation problem that a run's settings describe.
 
     Values that differ from recording to recording (a cable's edges, places of markers) are those of `recordings`.
     """
@@ -100,7 +100,7 @@ def problem_options(run: RunSettings, system: System, recordings: Sequence[Recor
 def build_problem(
     run: RunSettings, step: Step | None = None, reference_recordings: Sequence[Recording] = ()
 ) -> EstimationProblem:
-    """The estimation problem of a run; its options say as well where markers sit in reference recordings.
+    """Estimation problem of a run; its options also hold marker positions of `reference_recordings`.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def build_problem(
 
 
 def initial_closure_error_by_grasp(problem: EstimationProblem, episode: Episode) -> dict[str, float]:
-    """Least distance between the two frames of every grasp at a recording's first arm angles, by grasp name [m]."""
+    """Least possible distance [m] between each grasp's two frames at a recording's first arm angles, by name."""
     system = problem.system
     if not system.grasps:
         return {}
@@ -179,7 +179,7 @@ def _check_sensors(run: RunSettings, recordings: Sequence[Recording]) -> None:
 
 
 def load_problem(path: str | Path | None = None, overrides: Sequence[str] = ()) -> EstimationProblem:
-    """The estimation problem of a configuration file, of the embedded one when absent; errors as `build_problem`."""
+    """Estimation problem of a configuration file, or of the embedded one for None; errors as `build_problem`."""
     return build_problem(load_config(path, overrides))
 
 
@@ -215,7 +215,7 @@ def _check_recordings(
 
 
 def single_recording_issues(run: RunSettings, system: System, recording: Recording) -> list[Issue]:
-    """All issues of one recording, which is not cut; errors as `build_problem`."""
+    """All data quality issues of one uncut recording; errors as `build_problem`."""
     found = recording_quality_issues(recording, _choice(run))
     _raise_for_issues(run, found)
     arm = RecordedJointsModel.from_system(system, system.parameters.vector())

@@ -36,7 +36,7 @@ _N_MODES = 3
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `check` and return its exit code."""
     code = command_with_settings(_run_check)(arguments)
     return EXIT_WRONG_INPUT if code == EXIT_FAILED else code
 

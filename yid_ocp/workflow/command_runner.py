@@ -45,7 +45,7 @@ class CommandResultAndOutput(Generic[_CommandOutput]):
 def command_with_settings(
     work: Callable[..., CommandResultAndOutput[Any]], *names: str
 ) -> Callable[[argparse.Namespace], int]:
-    """A command that runs `work(settings, out, progress, ...)`, at the end the arguments of these names."""
+    """Return a command that calls `work(settings, out, progress, ...)`, where `...` are the arguments `names`."""
 
     def run(arguments: argparse.Namespace) -> int:
         settings = load_config(arguments.config, arguments.overrides)
@@ -173,7 +173,7 @@ def _format_iterate(entry: Iterate) -> str:
 
 
 class StderrLogLinesProgress(Progress):
-    """Progress as lines on standard error: for every stage, iterate, tenth of a stage, and some seconds of silence."""
+    """Progress as lines on standard error: one per stage, iterate, tenth of a stage, and after some silence."""
 
     def __init__(self, import_time: float = _USUAL_IMPORT_TIME) -> None:
         self._tenths, self._last, self._left = 0, 0.0, _RemainingTime(import_time)

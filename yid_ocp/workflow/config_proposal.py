@@ -296,7 +296,7 @@ def _speeds(t: Array, values: Array, time: float, window: float) -> tuple[Array,
 
 
 def held_out_split_time(recording: Recording, joints: Sequence[str]) -> float | None:
-    """Time at rest in a recording's later part, from which it is held out; None if there is none [s].
+    """Time [s] of rest in a recording's later part at which the held-out part begins; None if it never rests.
 
     What comes after it can be predicted from rest, so that it shows, held out, whether a model is right.
     """

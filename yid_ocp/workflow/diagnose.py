@@ -47,7 +47,7 @@ _STORE_FORMAT = "yid-refits/1"
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `diagnose` and return its exit code."""
     settings = load_config(arguments.config, arguments.overrides, DEFAULT_DIAGNOSIS_CONFIG_FILE)
     if arguments.baseline:
         said = tuple(str(Path(folder).expanduser().resolve()) for folder in arguments.baseline)

@@ -48,7 +48,7 @@ _UNKNOWN_SHAPES: Mapping[str, Any] = {"push": "wrench", "offset": "vector", "bia
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `export` and return its exit code."""
     source, form, out = Path(arguments.source), arguments.format, arguments.out
     if source.is_dir() and form not in ("csv", _MCAP):
         with stderr_progress_display(arguments) as progress:

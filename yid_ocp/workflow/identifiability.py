@@ -68,7 +68,7 @@ class IdentifiabilityOptions:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `identifiability` and return its exit code."""
     names = [name for name in arguments.intervals.split(",") if name]
     asked = IdentifiabilityOptions(
         evaluation_point="initial" if arguments.initial else "solution",

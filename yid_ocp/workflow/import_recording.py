@@ -38,7 +38,7 @@ _SWITCHES = {("header", False): "--no-header", ("skip_bad_lines", True): "--skip
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `import` and return its exit code."""
     file, asked = arguments.file, reader_options_from_arguments(arguments)
     if arguments.preview:
         with stderr_progress_display(arguments) as progress:

@@ -31,7 +31,7 @@ _SCHEMA_FILE = "yid-ocp.schema.json"
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `init` and return its exit code."""
     out, robot = Path(arguments.out), arguments.robot
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"the configuration is called '{out.name}'", where="--out", allowed="NAME.yaml")

@@ -36,7 +36,7 @@ _FULL_HINT = "choose a folder on a disk with room, with --out"
 
 @dataclass
 class RunFolder:
-    """A run folder while it is being written."""
+    """A run folder that is being written: its paths, log and hashes of inputs."""
 
     final_path: Path  # its name when complete
     path: Path  # where it is now
@@ -63,7 +63,7 @@ class RunFolder:
         self.log_event("start", command=words[0], versions=software_and_plugin_versions(), inputs=self.input_hashes)
 
     def write_result(self, result: Mapping[str, Any], name: str = "result.json") -> dict[str, Any]:
-        """Write a result with command, date, inputs and versions; infinities become null, and `notes` says where."""
+        """Write a result with command, date, inputs and versions; infinities become null and are listed in `notes`."""
         made = {"command": self._command_line, "date": local_time_text(), "inputs": self.input_hashes}
         notes: list[str] = []
         clean: dict[str, Any] = to_json_types({**result, **made, "versions": software_and_plugin_versions()}, notes)
@@ -75,7 +75,7 @@ class RunFolder:
     def write_result_and_report(
         self, run: RunSettings, shown: Progress, result: Mapping[str, Any], name: str = "result.json", /, **known: Any
     ) -> dict[str, Any]:
-        """`write_result`, and report.html unless the settings want none; `known`: more attributes of `ReportData`."""
+        """Write result.json and, if the settings want it, report.html; `known`: more attributes of `ReportData`."""
         written = self.write_result(result, name)
         if run.output.write_report:
             shown.begin_stage("writing the report", 1.5)

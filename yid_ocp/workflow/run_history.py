@@ -78,7 +78,7 @@ def effect_parameter_values_by_label(parameters: Mapping[str, float]) -> dict[st
 
 
 def settings_with_effect_values(run: RunSettings, effects: Mapping[str, Mapping[str, float]]) -> RunSettings:
-    """Settings with these effects, by label, added to the model at these values; effects already in it are kept."""
+    """Settings with the given effects (by label) added to the model at their values; existing effects are kept."""
     present = {f"{effect.kind}@{effect.location}" for effect in run.model.effects}
     parts = [(label.partition("@"), values) for label, values in effects.items() if label not in present]
     added = [EffectSettings(kind=kind, location=location, values=values) for (kind, _, location), values in parts]
@@ -99,7 +99,7 @@ def read_estimation_result(folder: str | Path) -> dict[str, Any]:
 
 
 def read_result_file(file: Path) -> dict[str, Any]:
-    """Contents of a result.json of whatever command; `DataError` where it cannot be read or is of an old version."""
+    """Contents of any command's result.json; `DataError` if it cannot be read or is of an old version."""
     if not is_file(file):
         hint = "give the run folder that `solve` or `diagnose` printed"
         raise DataError(f"there is no finished run in {file.parent}", where=str(file), hint=hint)
@@ -200,7 +200,7 @@ def settings_with_baseline_effects(run: RunSettings, runs: Sequence[RunEstimates
 
 
 def load_reference_or_baseline_recordings(run: RunSettings) -> tuple[tuple[Recording, ...], str]:
-    """Recordings made without the sought effect, those of the settings or of the baseline; why there are none."""
+    """Recordings without the sought effect, from settings or baseline, and a text on why there are none."""
     found: list[Recording] = []
     for i, path in enumerate(run.recordings.reference_recordings):
         file = given_or_shipped_recording_path(path)
@@ -234,7 +234,7 @@ def require_recordings_not_in_baseline(
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `report` and return its exit code."""
     paths = [Path(folder) for folder in arguments.runs]
     return run_command_and_print(arguments, lambda shown: _run_report(paths, arguments.out, shown))
 

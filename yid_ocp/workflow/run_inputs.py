@@ -162,7 +162,7 @@ def given_or_shipped_recording_path(path: str) -> Path:
 
 
 def read_recordings_of_role(run: RunSettings, which: str = "estimate", count: int | None = None) -> list[Recording]:
-    """List of the first so many, or all, recordings under `recordings.estimate` or `held_out`, each named uniquely.
+    """The first `count` (None: all) recordings under `recordings.estimate` or `held_out`, uniquely named.
 
     Errors as `read_recording`, which name the setting.
     """

@@ -55,7 +55,7 @@ _CONFIG_FILE, _RESULTS_FOLDER = "config.yaml", "done"
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the command and return its exit code."""
+    """Run the command `track` and return its exit code."""
     return command_with_settings(partial(_run_track, workers=workers_from_arguments(arguments)))(arguments)
 
 

@@ -54,7 +54,7 @@ REPORT_SECTIONS: Registry[_ReportSection] = Registry("report section")
 
 
 def register_report_section(name: str, order: int, title: str) -> Callable[[_PrepareContext], _PrepareContext]:
-    """Decorator that registers a function as the section `name`, lower orders first.
+    """Decorator that registers a function as the report section `name`; sections of lower `order` come first.
 
     It returns what the template `NAME.html` needs, or pairs of title and figure, which need none; None, or no pair,
     where it has nothing to say.
@@ -70,7 +70,7 @@ def register_report_section(name: str, order: int, title: str) -> Callable[[_Pre
 def figures_by_unit(
     rows: Iterable[tuple[str, str, _Row]], draw: Callable[[Mapping[str, _Row], str], Any]
 ) -> list[tuple[str, Any]]:
-    """One figure without a title for all rows (name, unit, row) of one unit."""
+    """Pairs (empty title, figure): one figure per unit, drawn from all rows (name, unit, row) with that unit."""
     grouped: dict[str, dict[str, _Row]] = {}
     for name, unit, row in rows:
         grouped.setdefault(unit, {})[name] = row
