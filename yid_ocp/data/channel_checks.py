@@ -42,7 +42,7 @@ def _channels(recording: Recording, *wanted: str) -> Iterator[tuple[str, str, Ar
 
 
 def stuck_channel_issues(recording: Recording) -> Iterator[Issue]:
-    """Issues for channels that repeat one value although they are noisy elsewhere or their velocity is not zero."""
+    """Issues for channels stuck at one value, although they are noisy elsewhere or their velocity is not zero."""
     joints = recording.joints
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) <= QUALITY_LIMITS.min_stuck_samples:
@@ -100,7 +100,7 @@ def _repeated_stretches(same: BoolArray) -> list[tuple[int, int]]:
 
 
 def white_noise_std(t: Array, values: Array) -> float:
-    """Robust standard deviation of a channel's white noise; zero for long rests or an uneven clock."""
+    """Robust standard deviation of a channel's white noise; zero if the clock is uneven or the channel rests long."""
     if len(t) < NOISE_DIFFERENCE_ORDER + MIN_DIFFERENCES_FOR_NOISE_STD:
         return 0.0
     even = np.abs(np.diff(t) / max(median_sample_period(t), 1e-12) - 1) < 0.2
@@ -135,7 +135,7 @@ def _stated(recording: Recording, choice: SensorOptionsLookup, group: str, chann
 
 
 def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
-    """Issues for channels whose quantization or noise exceeds the stated noise; slow frame rates are skipped."""
+    """Issues for channels whose quantization or noise exceeds the stated noise; channels below 20 Hz are skipped."""
     for group, channel, t, values in _channels(recording, "position", "effort", "points"):
         if len(t) < 100 or median_sample_period(t) > 0.05:
             continue
@@ -166,7 +166,7 @@ def excess_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> It
 
 
 def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -> Iterator[Issue]:
-    """Issues for channels far less noisy than the recording states; channels of equal stated noise are pooled.
+    """Issues for channels whose noise is far below the stated noise; channels of equal stated noise are pooled.
 
     What settings state may stand for what a model misses, and only a fit can say whether it is too much. Noise need not
     be white: the largest of what all samples say, every other one, and so on up to `_MAX_SAMPLE_PERIOD` counts, and so
@@ -210,7 +210,7 @@ def overstated_noise_issues(recording: Recording, choice: SensorOptionsLookup) -
 
 
 def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
-    """Issues for efforts that repeatedly equal their extreme value exactly."""
+    """Issues for joints whose recorded effort saturates: it repeatedly equals its extreme value exactly."""
     if recording.joints is not None and recording.joints.effort_sampling_kind_or_default == "command":
         return  # what a controller asks for ends at its own bound
     for group, channel, t, values in _channels(recording, "effort"):
@@ -234,7 +234,7 @@ def saturated_effort_issues(recording: Recording) -> Iterator[Issue]:
 def typical_point_pair_distances(
     edges: Sequence[tuple[str, str]], recordings: Sequence[Recording], frames: int | None = None
 ) -> dict[tuple[str, str], float]:
-    """Distance between the points of every pair: mean over a recording's frames, median over recordings [m].
+    """Distance [m] between the two points of every edge: mean over a recording's frames, median over recordings.
 
     Only so many `frames` from the start of each count, where that is given. `DataError` where there is no recording, or
     an edge that none of them ever shows.

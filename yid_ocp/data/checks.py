@@ -40,7 +40,7 @@ class _RecordingParts(NamedTuple):
 
 
 def split_recording_at_gaps(recording: Recording, driving: Sequence[str], anywhere: bool) -> _RecordingParts:
-    """Parts between gaps in the joints, or else in the `driving` points that clamps follow, and one issue for each gap.
+    """Split a recording at gaps in its joints, or without joints in the `driving` points; return parts and issues.
 
     Where a rollout may not start `anywhere`, in motion too, later parts are kept only where they start at rest.
     """
@@ -103,7 +103,7 @@ def _doubt(recording: Recording, t: Array, gap: int, allowed: float, said: str) 
 
 
 def recording_quality_issues(recording: Recording, choice: SensorOptionsLookup, driving: bool = True) -> list[Issue]:
-    """Data quality issues of one recording as it was read, from all checks that need no model.
+    """Data quality issues of one recording, from all checks that need no model.
 
     `choice` says how a group is used, its stated noise above all; `driving`, whether joints drive the model, so that
     what lies between their samples matters.
@@ -317,7 +317,7 @@ def _log_chance_of_run(one: IntArray, other: IntArray, length: int) -> float:
 
 
 def duplicate_data_issue(one: Recording, other: Recording) -> Issue | None:
-    """Issue naming the second recording if both hold the same measurement at least in part, else None."""
+    """Issue of the second recording if both recordings hold the same samples, at least in part; else None."""
     others = {group.name: group for group in other.joint_and_point_groups}
     count = 0
     for group in one.joint_and_point_groups if one.joints is None else (one.joints,):

@@ -47,7 +47,7 @@ QUALITY_LIMITS = _QualityLimits()
 
 @dataclass(frozen=True)
 class Issue:
-    """One data quality issue of a recording."""
+    """One data quality issue of a recording: cause, severity, evidence, advice, and where and when it occurs."""
 
     cause: str  # what is wrong, in one word of `ISSUE_CAUSE_DESCRIPTIONS`
     what: str  # the same in one sentence, with numbers
@@ -71,12 +71,12 @@ class Issue:
 
     @property
     def certainty_word(self) -> str:
-        """Certainty in one word: perhaps, likely or certain."""
+        """Certainty of the issue in one word: `perhaps`, `likely` or `certain`."""
         return "perhaps" if self.evidence_ratio < 1.5 else "likely" if self.evidence_ratio < 3 else "certain"
 
     @property
     def where(self) -> str:
-        """Recording, group, channel and time in one text."""
+        """Text that locates the issue: recording, group, channel and time."""
         place = "/".join(part for part in (self.recording, self.group, self.channel) if part)
         span = "" if self.begin is None or self.end is None else f", {self.begin:.4g} to {self.end:.4g} s"
         return place + span
@@ -127,5 +127,5 @@ SensorOptionsLookup = Callable[[str], SensorOptions]
 
 
 def median_sample_period(t: Array) -> float:
-    """Median time between samples [s]; zero for fewer than two."""
+    """Median time between samples [s] of the times `t`; zero for fewer than two samples."""
     return float(np.median(np.diff(t))) if len(t) > 1 else 0.0

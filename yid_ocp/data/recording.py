@@ -102,12 +102,12 @@ class JointGroup(ReprMixin):
 
     @property
     def channels(self) -> dict[str, Array]:
-        """The channels that were recorded: name to array, shape (N, nj), units in `JOINT_CHANNEL_UNITS`."""
+        """Arrays (N, nj) of the recorded channels by name, such as `position`; units as in `JOINT_CHANNEL_UNITS`."""
         return {name: getattr(self, name) for name in JOINT_CHANNEL_UNITS if getattr(self, name) is not None}
 
     @property
     def effort_sampling_kind_or_default(self) -> EffortSamplingKind:
-        """`effort_kind`, or `sample` if it is not stated, which is what robot drivers publish."""
+        """`effort_kind`, or `sample` (as robot drivers publish) if the recording does not state it."""
         return self.effort_kind or "sample"
 
     def _summary(self) -> ReprSummary:
@@ -171,7 +171,7 @@ class PointGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SensorChannelGroup(ReprMixin):
-    """Values of channels that sensors declare (`sensors.ChannelKind`), on one clock.
+    """Samples of a further sensor, such as a wrist or current sensor, on one clock; channels as in `ChannelKind`.
 
     Arrays are copied, made float64 and read-only.
 
@@ -216,7 +216,7 @@ class SensorChannelGroup(ReprMixin):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording(ReprMixin):
-    """One recording of a robot or of a virtual experiment, in SI units; only `validate_recording` checks it.
+    """One recording of a robot or a virtual experiment, in SI units; unchecked until `validate_recording`.
 
     Attributes
     ----------
@@ -262,17 +262,17 @@ class Recording(ReprMixin):
 
     @property
     def joint_and_point_groups(self) -> tuple[JointGroup | PointGroup, ...]:
-        """Groups of joints and points, joints first."""
+        """The joint group (if any), followed by the point groups."""
         return ((self.joints,) if self.joints is not None else ()) + self.points
 
     @property
     def all_groups(self) -> tuple[JointGroup | PointGroup | SensorChannelGroup, ...]:
-        """All groups: joints first, then points, then channels of further sensors."""
+        """All groups of the recording: joints first, then points, then channels of further sensors."""
         return (*self.joint_and_point_groups, *self.channel_groups)
 
     @property
     def sensor_setting_keys(self) -> tuple[str, ...]:
-        """Keys that the settings may have under `sensors` for this recording, such as `joints.effort`."""
+        """Keys allowed under `sensors` in the settings for this recording, such as `joints.effort`."""
         own = [f"joints.{quantity}" for quantity in ("effort", "position") if self.joints is not None]
         own += [group.name for group in self.points]
         own += [f"{group.name}.{quantity}" for group in self.channel_groups for quantity in group.values_by_quantity]
@@ -280,27 +280,27 @@ class Recording(ReprMixin):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the recorded joints, length nj."""
+        """Names of the recorded joints, length nj; empty without a joint group."""
         return () if self.joints is None else self.joints.names
 
     @property
     def point_names(self) -> tuple[str, ...]:
-        """Names of the points of all groups, each once, in order of appearance."""
+        """Names of the points of all groups, without repetitions, in order of appearance."""
         return tuple(dict.fromkeys(name for group in self.points for name in group.names))
 
     @property
     def duration(self) -> float:
-        """Time from the first sample of any group to the last of any [s]."""
+        """Time [s] from the earliest to the latest sample of all groups."""
         return float(max(group.t[-1] for group in self.all_groups) - min(group.t[0] for group in self.all_groups))
 
     def with_effort_sampling_kind(self, kind: EffortSamplingKind | None) -> Recording:
-        """The recording with the given effort kind; unchanged for None."""
+        """The recording with `effort_kind` replaced; unchanged if `kind` is None or there are no joints."""
         if kind is None or self.joints is None:
             return self
         return replace(self, joints=replace(self.joints, effort_kind=kind))
 
     def time_slice(self, start: float, stop: float) -> Recording:
-        """Cut out the samples with start <= t <= stop [s], without groups that have none; times stay as they are.
+        """The recording's samples with start <= t <= stop [s]; times are kept, and groups without samples are dropped.
 
         `DataError` where nothing was recorded in between, or `start` is not before `stop`.
         """
@@ -317,7 +317,7 @@ class Recording(ReprMixin):
 
 
 def validate_recording(recording: Recording, *, allow_nan_effort: bool = False, where: str = "") -> Recording:
-    """Check shapes, clocks, names, values and units of a recording, which is returned.
+    """Check shapes, clocks, names, values and units of a recording, and return it unchanged.
 
     `allow_nan_effort` says whether `effort` and `external_effort` may hold NaN, `where` what errors call the recording,
     its file for example; its name where empty.
@@ -361,13 +361,13 @@ def _sampled(t: Array) -> str:
 
 
 def require_data(condition: object, what: str, where: str, allowed: str = "", hint: str = "") -> None:
-    """Raise a `DataError` unless a condition holds."""
+    """Raise a `DataError` with the given texts unless a condition holds."""
     if not condition:
         raise DataError(what, where=where, allowed=allowed, hint=hint)
 
 
 def read_only_array(value: ArrayLike, where: str) -> Array:
-    """A read-only copy as float64; `DataError` where that is not possible."""
+    """A read-only copy of an array as float64; `DataError` if it cannot be converted."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

@@ -50,7 +50,7 @@ _POINT_ATTRIBUTES = ("names", "sensor", "frame", "pose", "clock", "std")
 
 
 def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = False) -> Recording:
-    """Read and check a `yid-recording/1` file, whose `effort` and `external_effort` may hold NaN where that is allowed.
+    """Read and check a `yid-recording/1` file; with `allow_nan_effort`, `effort` and `external_effort` may hold NaN.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def read_recording(path: str | os.PathLike[str], *, allow_nan_effort: bool = Fal
 
 
 def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Check a recording, whose efforts may hold NaN, and write it as `yid-recording/1`, whole or not at all.
+    """Check a recording and write it atomically as a `yid-recording/1` file; efforts may hold NaN.
 
     Errors as `validate_recording`, and `OutputError` where the file cannot be written; an older one is left as it was.
     """
@@ -220,7 +220,7 @@ _MAX_GROUP_DEPTH = 10
 
 
 def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: str) -> None:
-    """Check in a forked process that a file can be read.
+    """Check in a forked process that a file can be read, so that a crash of the library cannot end this process.
 
     A fork, as a new process would take a second and a process of a pool may have no children. In it, `complaint` reads
     the file and says what stands against it, nothing where all of it can be read. `DataError` where the file is no
@@ -265,7 +265,7 @@ def check_readable_in_fork(path: Path, complaint: Callable[[Path], str], noun: s
 
 @contextlib.contextmanager
 def create_hdf5_atomically(path: str | os.PathLike[str]) -> Iterator[h5py.File]:
-    """Context manager of a new HDF5 file in memory, written when the block ends well; errors as `atomic_write`."""
+    """Context manager of a new HDF5 file in memory, written if the block succeeds; errors as in `atomic_write`."""
     with files.atomic_write(Path(path)) as temporary:
         with h5py.File(str(temporary), "w", driver="core", backing_store=False) as file:
             yield file

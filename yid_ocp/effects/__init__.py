@@ -26,7 +26,7 @@ for _family in iter_modules(__path__):
 
 
 def make_effect(kind: str, location: str, system: System, values: Mapping[str, float] | None = None) -> EffectBase:
-    """An effect of a kind at a location, to be added with `System.with_effects`; see `candidate_kinds_and_locations`.
+    """Make an effect of the given kind at a location; `System.with_effects` adds it to a system.
 
     Its parameters are named `kind@location.parameter`. `values` holds what is not neutral, by parameter; a compliance
     may be given as its `stiffness`. `ConfigError` of no such kind or parameter or a value outside its bounds,
@@ -41,12 +41,12 @@ def make_effect(kind: str, location: str, system: System, values: Mapping[str, f
 
 
 def signal_kinds_required_by_any_effect() -> frozenset[str]:
-    """Kinds of recorded signals that effects can require, such as `joints.effort`, plug-in effects included."""
+    """Kinds of recorded signals, such as `joints.effort`, that registered effects can require, plug-ins included."""
     return frozenset(_SENSOR_KINDS).union(*(EFFECTS[kind].required_sensors for kind in EFFECTS))
 
 
 def candidate_kinds_and_locations(system: System, recorded_sensors: Collection[str]) -> list[tuple[str, str]]:
-    """Every pair (effect kind, location) possible in a system and visible in its recorded signals, ordered by kind.
+    """All pairs (effect kind, location) that the system allows and the recorded signals can reveal, ordered by kind.
 
     The system is without the effects in question, the signals are among `signal_kinds_required_by_any_effect`, or a
     sensor on a frame such as `wrist:FRAME`. What works only on prescribed joints is left out where no effort was

@@ -87,7 +87,7 @@ class _DistortedReading(EffectBase):
 
 @EFFECTS.register("encoder_offset")
 class EncoderOffset(_DistortedReading):
-    """Measured angle = true angle + offset, which is taken off paths, start postures and what a filter follows."""
+    """Encoder offset: measured angle = true angle + offset; path, start and tracked angles are corrected for it."""
 
     equation = "measured angle = true + offset"
     required_excitation = "how it stands against gravity"
@@ -102,7 +102,7 @@ class EncoderOffset(_DistortedReading):
 
 @EFFECTS.register("series_elasticity")
 class SeriesElasticity(_DistortedReading):
-    """An elastic gear with the encoder on the motor's side: measured angle = q + effort/stiffness."""
+    """Elastic gear with the encoder on the motor side: measured angle = q + effort/stiffness."""
 
     equation = "measured angle = q + effort/stiffness"
     required_excitation = "how hard it pulls at its ends"
@@ -117,7 +117,7 @@ class SeriesElasticity(_DistortedReading):
 
 @EFFECTS.register("backlash")
 class Backlash(_DistortedReading):
-    """A gear with backlash, encoder on the motor's side: measured angle = q + width/2 tanh(effort/`_PLAY_TORQUE`).
+    """Gear backlash with the encoder on the motor side: measured angle = q + width/2 tanh(effort/`_PLAY_TORQUE`).
 
     A servo acts on what its encoder reads: there the play z that is taken up solves z = width/2 tanh(torque(q + z)/
     `_PLAY_TORQUE`) in every step, an internal coordinate without a memory.
@@ -130,7 +130,7 @@ class Backlash(_DistortedReading):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """`play`, the taken-up backlash, for a joint with a servo; none otherwise."""
+        """`play`, the taken-up backlash, for a joint with a servo; an empty tuple otherwise."""
         return ("play",) if location in system.servos else ()
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -173,7 +173,7 @@ class _DistortedEffort(_DistortedReading):
 
 @EFFECTS.register("effort_gain")
 class EffortGain(_DistortedEffort):
-    """Measured effort = scale x true effort; a negative scale is a flipped sign.
+    """Scale error of a joint's effort: measured effort = scale x true effort; a negative scale is a flipped sign.
 
     Kept inside as 1/scale, by which a recorded torque is multiplied, so that a driven joint's may go through zero.
     """
@@ -203,7 +203,7 @@ class EffortGain(_DistortedEffort):
 
 @EFFECTS.register("effort_offset")
 class EffortOffset(_DistortedEffort):
-    """Measured effort = true effort + offset."""
+    """Constant offset of a joint's recorded effort: measured effort = true effort + offset."""
 
     equation = "measured effort = true + offset"
     declared_parameters = (
@@ -231,7 +231,7 @@ class _LateTorque(EffectBase):
 
 @EFFECTS.register("effort_delay")
 class EffortDelay(_LateTorque):
-    """Torque acts late: what acts at t was recorded at t - delay, interpolated between samples.
+    """Delay of a joint's torque: the torque that acts at t was recorded at t - delay, interpolated between samples.
 
     For a prescribed arm the recorded effort at t is what the motion needs at t + delay; a negative delay means that the
     effort is recorded late.
@@ -249,7 +249,7 @@ class EffortDelay(_LateTorque):
 
 @EFFECTS.register("effort_lag")
 class EffortLag(_LateTorque):
-    """Torque follows its command: time_constant dz/dt = command - z, z the torque that acts.
+    """First-order lag of a joint's torque z behind its command: time_constant dz/dt = command - z.
 
     The recorded torque is the command, of a prescribed joint too: the effort that its motion needs follows the recorded
     one. A negative time constant there means that the recorded effort follows the one that is needed, as one behind a
@@ -261,7 +261,7 @@ class EffortLag(_LateTorque):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of time_constant [s]; negative values are allowed for prescribed joints."""
+        """Definition of the parameter `time_constant` [s]; it may be negative for prescribed joints only."""
         least, text = -0.5 if location in system.prescribed else 0.0, "with which torque follows its command"
         return (ParameterDefinition("time_constant", "s", 0.0, least, 0.5, (0.0, 0.05), text),)
 
@@ -286,7 +286,7 @@ class _ServoChange(EffectBase):
 
 @EFFECTS.register("servo_gain")
 class ServoGain(_ServoChange):
-    """A servo's demanded torque multiplied by scale: another gain, supply voltage or motor."""
+    """Scale factor on a servo's demanded torque, as from another gain, supply voltage or motor."""
 
     equation = "demand = scale (gain (u - q) - damping v)"
     declared_parameters = (
@@ -301,7 +301,7 @@ class ServoGain(_ServoChange):
 
 @EFFECTS.register("supply_voltage")
 class SupplyVoltage(_ServoChange):
-    """A direct-current motor's supply voltage multiplied by scale: the torque of its duty and the limit of that."""
+    """Scale factor on a direct-current motor's supply voltage: scales the torque per duty cycle and its limit."""
 
     equation = "torque = clip(scale gain (u - q), scale limit) - damping v"
     possible_locations = _dc_motor_joints
@@ -317,7 +317,7 @@ class SupplyVoltage(_ServoChange):
 
 @EFFECTS.register("back_emf")
 class BackEmf(_ServoChange):
-    """A direct-current motor's braking torque per speed (kt^2/R, from its counter-voltage) multiplied by scale."""
+    """Scale factor on a direct-current motor's back-EMF damping kt^2/R, its braking torque per speed."""
 
     equation = "torque = clip(gain (u - q)) - scale damping v"
     required_excitation = "how fast it moves"
@@ -332,7 +332,7 @@ class BackEmf(_ServoChange):
 
 @EFFECTS.register("current_limit")
 class CurrentLimit(_ServoChange):
-    """A limit of a direct-current motor's current, which is its torque over the published torque constant kt.
+    """Current limit of a direct-current motor; current = motor torque / published torque constant kt.
 
     Kept inside as limit^-16, as `ServoSaturation` has it; beyond the duty's limit it also takes from braking.
     """
@@ -342,7 +342,7 @@ class CurrentLimit(_ServoChange):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of tightness = limit^-16, reported as limit [A], from `_MIN_LIMIT_CURRENT`."""
+        """Definition of the parameter tightness = limit^-16, reported as `limit` [A], at least `_MIN_LIMIT_CURRENT`."""
         return (_limit_definition(_MIN_LIMIT_CURRENT, "A", "largest current"),)
 
     def _changes(self, servo: PositionServo) -> dict[str, Any]:
@@ -351,7 +351,7 @@ class CurrentLimit(_ServoChange):
 
 @EFFECTS.register("servo_delay")
 class ServoDelay(_ServoChange):
-    """Commands act later than the nominal servo delay."""
+    """Delay of a servo's commands in addition to the nominal servo delay."""
 
     equation = "the command that acts at t was given at t - servo_delay - delay"
     required_excitation = "when it is read"
@@ -365,7 +365,7 @@ class ServoDelay(_ServoChange):
 
 @EFFECTS.register("servo_saturation")
 class ServoSaturation(_ServoChange):
-    """An additional torque limit of a servo: demand / (1 + |demand/limit|^16)^(1/16).
+    """Additional smooth torque limit of a servo: torque = demand / (1 + |demand/limit|^16)^(1/16).
 
     Kept inside as limit^-16, which adds to the model's own limit, is neutral at zero and has a slope there.
     """
@@ -374,7 +374,7 @@ class ServoSaturation(_ServoChange):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of tightness = limit^-16, reported as limit, from `_MIN_LIMIT_FRACTION` of the effort limit."""
+        """Definition of tightness = limit^-16, reported as `limit`, at least `_MIN_LIMIT_FRACTION` x effort limit."""
         joint = system.mechanism.joints[system.mechanism.joint_index(location)]
         known = joint.effort_limit if 0 < joint.effort_limit < UNLIMITED_EFFORT_THRESHOLD else _DEFAULT_EFFORT_LIMIT
         torque = "N m" if joint.coordinate_unit == "rad" else "N"

@@ -32,14 +32,14 @@ _CLAMP_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 @dataclass(frozen=True)
 class ParameterDefinition:
-    """The definition of one parameter of an effect, neutral where the effect is absent."""
+    """Definition of one parameter of an effect: name, unit, neutral value, bounds, prior range and reported form."""
 
     name: str
     unit: str
-    neutral_value: float  # any value for a shape parameter, from which a search may start
+    neutral_value: float  # where the effect is absent; for a shape parameter a value to start a search from
     lower: float  # physical bounds
     upper: float
-    prior_range: tuple[float, float]  # that an engineer would expect
+    prior_range: tuple[float, float]  # range (low, high) that an engineer would expect
     description: str
     is_shape_parameter: bool = False  # no influence while the others are neutral (a relaxation time, a yield angle)
     # `name unit` under which 1/value is reported, for a stiffness whose neutral value is infinite, or a factor that
@@ -59,18 +59,18 @@ class ParameterDefinition:
 
     @property
     def reported_name_and_unit(self) -> tuple[str, str]:
-        """Name and unit under which the parameter is reported."""
+        """Name and unit of the parameter in reports, for example those of the stiffness for a compliance."""
         name, _, unit = self.reported_reciprocal.partition(" ")
         return (name, unit) if self.reported_reciprocal else (self.name, self.unit)
 
     def to_internal(self, value: float) -> float:
-        """The internal value for a nonzero reported value; the reported value itself where there is no reciprocal."""
+        """Internal value of a nonzero reported value: its reciprocal power, or the value itself if reported as is."""
         return value**-self.reciprocal_power if self.reported_reciprocal else value
 
 
 @dataclass(frozen=True)
 class ReportedParameter:
-    """A parameter as reported to users: value, standard deviation and unit."""
+    """An effect's parameter as reported to users: value, standard deviation and unit."""
 
     value: float
     std: float
@@ -79,16 +79,16 @@ class ReportedParameter:
 
 @dataclass(frozen=True)
 class EffectBase(Effect):
-    """Base class of all effects, which by default changes nothing; a kind overrides the methods of what it changes."""
+    """Base class of all effects: kind, location and parameters; a subclass overrides methods for what it changes."""
 
     definitions: tuple[ParameterDefinition, ...] = ()  # those of `parameters`, at this location
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
 
-    equation: ClassVar[str] = ""  # that the kind adds, as text
+    equation: ClassVar[str] = ""  # equation that the kind adds, as text
     # what a motion has to vary to distinguish the kind from others: one of `ORDERED_EXCITATION_DESCRIPTIONS`, or words
     # that continue "vary ..."
     required_excitation: ClassVar[str] = ""
-    required_sensors: ClassVar[frozenset[str]] = frozenset()  # without which the effect is not observable
+    required_sensors: ClassVar[frozenset[str]] = frozenset()  # signals without which the effect is not observable
     # whether its presence at one location says nothing about others, as for a mass; not so for friction
     is_local: ClassVar[bool] = False
     # whether a location is a sensor, `GROUP:FRAME`, which a diagnosis tries where recordings hold it
@@ -101,21 +101,21 @@ class EffectBase(Effect):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of the effect's parameters with the bounds and ranges of the location."""
+        """Definitions of the effect's parameters, with bounds and prior ranges scaled for the location."""
         return tuple(definition._at_location(system, location) for definition in cls.declared_parameters)
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """Names of the effect's internal coordinates, such as the joint that each belongs to; none by default."""
+        """Names of the effect's internal coordinates, its states besides the joints' motion; empty by default."""
         return ()
 
     @property
     def max_abs_unknown_initial_states(self) -> Mapping[str, float]:
-        """Largest absolute initial value by name, of internal coordinates whose initial value is estimated."""
+        """Largest absolute initial value of each internal coordinate whose initial value is estimated, by name."""
         return {}
 
     def alternative_start(self, start: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Values of a second starting point for a search that starts at `start`; None where one start is enough."""
+        """Parameter values of a second starting point for an estimation from `start`; None if one start is enough."""
         return None
 
     def __getitem__(self, parameter: str) -> ca.SX:
@@ -133,23 +133,23 @@ class EffectBase(Effect):
 
     @property
     def amplitude_names(self) -> tuple[str, ...]:
-        """Names of the parameters whose neutral values alone make the effect vanish."""
+        """Names of the amplitudes, the parameters whose neutral values suffice to make the effect vanish."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if not q.is_shape_parameter)
 
     @property
     def shape_parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters without influence while the amplitudes are neutral, such as a relaxation time."""
+        """Names of shape parameters, such as a relaxation time; they have no influence at neutral amplitudes."""
         return tuple(f"{self.label}.{q.name}" for q in self.definitions if q.is_shape_parameter)
 
     @property
     def prior_ranges(self) -> dict[str, tuple[float, float]]:
-        """Expected range (low, high) of every parameter, in the parameter's unit."""
+        """Expected range (low, high) of every parameter by its name, in the parameter's unit."""
         return {f"{self.label}.{q.name}": q.prior_range for q in self.definitions}
 
     def reported_parameters(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameter]:
-        """The parameters as reported to users, by reported name; a compliance is reported as stiffness.
+        """The parameters as reported to users, by reported name; for example, a compliance is reported as a stiffness.
 
         Values and standard deviations are nominal and NaN where absent; that of C^(-1/p) is C^(-1/p) std(C)/(p C).
         """
@@ -166,7 +166,7 @@ class EffectBase(Effect):
         return result
 
     def with_prior_ranges_for_angles(self, largest: Mapping[str, float]) -> EffectBase:
-        """The effect with prior ranges of its parameters for the largest joint angles by segment in the data [rad]."""
+        """The effect with prior ranges adapted to the largest joint angle of each segment in the data [rad]."""
         return self
 
 
@@ -174,7 +174,7 @@ EFFECTS: Registry[type[EffectBase]] = Registry("effect")
 
 
 def build_effect(kind: str, location: str, system: System, values: Mapping[str, float]) -> EffectBase:
-    """An effect of a registered kind at a valid location; `make_effect` also checks the location."""
+    """Build an effect of a registered kind at a location that the caller has checked (`make_effect` checks it)."""
     cls, label = EFFECTS[kind], f"{kind}@{location}"
     definitions = cls.parameter_definitions(location, system)
     names = {q.name: q for q in definitions} | {q.reported_name_and_unit[0]: q for q in definitions}
@@ -204,41 +204,41 @@ def build_effect(kind: str, location: str, system: System, values: Mapping[str, 
 
 
 def segment_names(system: System) -> tuple[str, ...]:
-    """Names of the object's segments."""
+    """Names of the flexible object's segments."""
     return tuple(segment.name for segment in system.segment_layouts)
 
 
 def object_joint_names(system: System) -> tuple[str, ...]:
-    """Names of the joints of the object's segments."""
+    """Names of the joints in all segments of the flexible object."""
     return tuple(joint for segment in system.segment_layouts for link in segment.link_joints for joint in link)
 
 
 def clamp_names(system: System) -> tuple[str, ...]:
-    """Names of floating clamps, each with six joints NAME_x ... NAME_rz."""
+    """Names of the floating clamps; a clamp NAME has the six joints NAME_x ... NAME_rz."""
     names = set(system.mechanism.joint_names)
     found = [name.removesuffix("_rz") for name in system.mechanism.joint_names if name.endswith("_rz")]
     return tuple(clamp for clamp in found if all(f"{clamp}_{axis}" in names for axis in _CLAMP_AXES))
 
 
 def arm_joint_names(system: System) -> tuple[str, ...]:
-    """Names of the arms' joints: all but those of the object, of clamps and of compliant mounts."""
+    """Names of the arms' joints: all joints except those of the object, the clamps and compliant mounts."""
     clamps = {f"{clamp}_{axis}" for clamp in clamp_names(system) for axis in _CLAMP_AXES}
     other = {*object_joint_names(system), *system.joint_compliances, *clamps}
     return tuple(name for name in system.mechanism.joint_names if name not in other)
 
 
 def servo_joint_names(system: System) -> tuple[str, ...]:
-    """Names of the arms' joints with a servo."""
+    """Names of the arm joints that have a servo."""
     return tuple(name for name in arm_joint_names(system) if name in system.servos)
 
 
 def grasp_names(system: System) -> tuple[str, ...]:
-    """Names of all grasps, those by clamps included."""
+    """Names of all grasps, including those of clamps."""
     return tuple(grasp.name for grasp in system.grasps)
 
 
 def joint_names_by_arm(system: System) -> dict[str, tuple[str, ...]]:
-    """Joint names of every arm, by the arm's name: its grasp, else the prefix left or right, else `gripper`."""
+    """Joint names by arm; an arm's name is that of its grasp, else its joints' prefix left or right, else `gripper`."""
     joints, tree = arm_joint_names(system), system.mechanism
     found: dict[str, tuple[str, ...]] = {}
     for grasp in system.grasps:
@@ -272,13 +272,13 @@ def _arm_tip_frames(system: System) -> tuple[str, ...]:
 
 
 def effort_limit_over_baxter(system: System, joint: str) -> float:
-    """A joint's effort limit divided by that of Baxter's joints; 1 for a smaller limit and for none."""
+    """A joint's effort limit divided by that of Baxter's joints, at least 1; also 1 for an unlimited joint."""
     limit = system.mechanism.joints[system.mechanism.joint_index(joint)].effort_limit
     return max(1.0, limit / _BAXTER_EFFORT_LIMIT) if limit < UNLIMITED_EFFORT_THRESHOLD else 1.0
 
 
 def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
-    """Names of frames at the ends of the arms' links: at the next joint or the tip, each point that moves once."""
+    """Names of frames at the ends of the arms' links (next joint or tip); fixed or coincident points are omitted."""
     tree = system.mechanism
     own = {tree.joint_index(name) for name in arm_joint_names(system)}
     if not own:
@@ -300,7 +300,7 @@ def arm_link_end_frame_names(system: System) -> tuple[str, ...]:
 
 
 def one_frame_name_per_arm_link(system: System) -> tuple[str, ...]:
-    """One frame name for every arm link with mass: the grasp's, else a gripper's, else the first.
+    """One frame name for every arm link with mass: that of a grasp, else of a gripper, else the link's first frame.
 
     A finger, what slides on a link and carries nothing else, counts as part of that link.
     """
@@ -330,7 +330,7 @@ def _paths(system: System, names: Sequence[str]) -> dict[str, np.ndarray]:
 
 
 def segment_name_of_frame(system: System, frame: str) -> str | None:
-    """Name of the segment whose link carries a frame; None for other frames."""
+    """Name of the segment whose link carries the frame; None if no segment does."""
     index = system.mechanism.frame(frame).joint_index
     if index < 0:
         return None
@@ -346,7 +346,7 @@ def segment_elastic_joints(system: System, segment: str) -> tuple[ElasticJoint, 
 def effort_scaled_parameter_definition(
     name: str, unit: str, upper: float, expected: float, description: str
 ) -> ParameterDefinition:
-    """Definition of an arm joint's parameter, from zero (neutral) to a bound that grows with the effort limit."""
+    """Definition of an arm joint's parameter: neutral at zero, with bound and range that grow with the effort limit."""
     prior, scale = (0.0, expected), effort_limit_over_baxter
     return ParameterDefinition(name, unit, 0.0, 0.0, upper, prior, description, range_scale=scale)
 
@@ -354,13 +354,13 @@ def effort_scaled_parameter_definition(
 def compliance_parameter_definition(
     unit: str, upper: float, prior: tuple[float, float], place: str, reported: str
 ) -> ParameterDefinition:
-    """Definition of a compliance parameter, neutral at zero, that is reported as a stiffness in another unit."""
+    """Definition of a compliance parameter, neutral at zero; `reported` is the unit of the stiffness in reports."""
     text, said = f"compliance of the {place}", f"stiffness {reported}"
     return ParameterDefinition("compliance", unit, 0.0, 0.0, upper, prior, text, reported_reciprocal=said)
 
 
 def generalized_force_at_joint(system: System, joint: str, value: ca.SX) -> ca.SX:
-    """Generalized force that is `value` at one joint and zero elsewhere, shape (n, 1)."""
+    """Generalized force (n, 1) with the entry `value` at one joint and zeros elsewhere."""
     force = ca.SX(system.n_coordinates, 1)
     force[system.mechanism.joint_index(joint)] = value
     return force

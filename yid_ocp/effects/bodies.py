@@ -61,7 +61,7 @@ class _ScaledBodies(EffectBase):
 
 @EFFECTS.register("density")
 class Density(_ScaledBodies):
-    """All masses and inertias of a segment multiplied by a factor."""
+    """Scale factor on all masses and inertias of a segment."""
 
     equation = "masses and inertias times scale"
     possible_locations = base.segment_names
@@ -80,7 +80,7 @@ def _joints_with_mass(system: System) -> tuple[str, ...]:
 
 @EFFECTS.register("link_mass")
 class LinkMass(_ScaledBodies):
-    """Mass and inertia of an arm joint's child link multiplied by a factor."""
+    """Scale factor on mass and inertia of the link that an arm joint moves."""
 
     equation = "mass and inertia of the child link times scale"
     is_local = True
@@ -103,7 +103,7 @@ def _tips_and_link_ends(system: System) -> tuple[str, ...]:
 
 @EFFECTS.register("point_mass")
 class PointMass(EffectBase):
-    """A point mass fixed to a frame: T += 1/2 mass |v|^2, V += -mass g.x."""
+    """Point mass fixed to a frame; it adds kinetic energy T += 1/2 mass |v|^2 and potential energy V += -mass g.x."""
 
     equation = "T += 1/2 mass |v|^2, V -= mass g.x"
     required_excitation = "how hard it accelerates"
@@ -113,7 +113,7 @@ class PointMass(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definition of mass [kg], up to the object's mass on the object and up to the arm's payload on an arm."""
+        """Definition of `mass` [kg]; its upper bound is the object's mass, or on an arm the arm's payload."""
         upper, expected = _bearable(system, location)
         return (ParameterDefinition("mass", "kg", 0.0, 0.0, upper, (0.0, expected), "mass of the point"),)
 
@@ -126,7 +126,7 @@ class PointMass(EffectBase):
 
 @EFFECTS.register("payload")
 class Payload(EffectBase):
-    """A mass at (mx, my, mz)/mass in a frame, moving with it; a negative mass removes excess mass of the model.
+    """Payload fixed to a frame at (mx, my, mz)/mass; a negative mass removes excess mass of the model.
 
     The place is within `_MAX_PAYLOAD_DISTANCE` of the frame: moments beyond L = sqrt((`_MAX_PAYLOAD_DISTANCE` mass)^2 +
     (`_MAX_COM_SHIFT` M)^2) do not grow any more, s = (mx, my, mz) (1 + (|(mx, my, mz)|/L)^8)^(-1/8), and s is what is
@@ -152,7 +152,7 @@ class Payload(EffectBase):
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Mass [kg], above -`_MAX_REMOVED_MASS_FRACTION` of the link's, first moments mx, my, mz [kg m]."""
+        """Definitions of mass [kg], at least -`_MAX_REMOVED_MASS_FRACTION` of the link's, and first moments [kg m]."""
         upper, expected = _bearable(system, location)
         lower = -_MAX_REMOVED_MASS_FRACTION * _carried_body(system, system.mechanism.frame(location).joint_index).mass
         far, near = (_MAX_PAYLOAD_DISTANCE * mass for mass in (upper, expected))
@@ -173,7 +173,7 @@ class Payload(EffectBase):
     def reported_parameters(
         self, values: Mapping[str, float] | None = None, stds: Mapping[str, float] | None = None
     ) -> dict[str, ReportedParameter]:
-        """Mass and acting first moments; the moments have no standard deviation where the position limit is active."""
+        """Reported mass and acting first moments; moments beyond the position limit have no standard deviation."""
         found = super().reported_parameters(values, stds)
         mass, *moments = (found[quantity.name].value for quantity in self.definitions)
         own = -self.definitions[0].lower / _MAX_REMOVED_MASS_FRACTION
@@ -241,7 +241,7 @@ def _segments_with_length(system: System) -> tuple[str, ...]:
 
 @EFFECTS.register("length_scale")
 class LengthScale(EffectBase):
-    """Link lengths of a segment multiplied by a factor; its mass is unchanged."""
+    """Scale factor on the link lengths of a segment; its mass is unchanged."""
 
     equation = "link lengths times scale"
     required_excitation = "how long it is"
@@ -255,7 +255,7 @@ class LengthScale(EffectBase):
 
 @EFFECTS.register("rotor_inertia")
 class RotorInertia(EffectBase):
-    """Inertia of a motor's rotor, reflected to its joint: T += 1/2 armature v^2."""
+    """Rotor inertia of a motor, reflected to its joint; it adds kinetic energy T += 1/2 armature v^2."""
 
     equation = "T += 1/2 armature v^2"
     required_excitation = "how hard it accelerates"
@@ -274,7 +274,7 @@ class RotorInertia(EffectBase):
 
 @EFFECTS.register("aerodynamic_drag")
 class AerodynamicDrag(EffectBase):
-    """Air drag on a segment's links: F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
+    """Quadratic air drag on a segment's links: F = -J_c' 1/2 rho_air cd 2 r l |v_n| v_n.
 
     v_n is the velocity of a link's centre normal to the link, r its radius, l its length; |v_n| is rounded off below
     `_ABS_SMOOTHING_SPEED`.
@@ -316,7 +316,7 @@ def _world(system: System) -> tuple[str, ...]:
 
 @EFFECTS.register("gravity_scale")
 class GravityScale(EffectBase):
-    """A fraction of the object's full weight added to its weight in the model; inertia is unchanged."""
+    """Additional weight of the object, as a fraction of its full weight; its inertia is unchanged."""
 
     equation = "V += -fraction x sum of m g.x over the object"
     required_excitation = "how it stands against gravity"
@@ -337,7 +337,7 @@ class GravityScale(EffectBase):
 
 @EFFECTS.register("gravity_tilt")
 class GravityTilt(EffectBase):
-    """The gravity vector rotated by rx about the world's x axis, then by ry about its y axis."""
+    """Rotation of the gravity vector by rx about the world's x axis, then by ry about the world's y axis."""
 
     equation = "g = Ry(ry) Rx(rx) g_0"
     required_excitation = "how it stands against gravity"

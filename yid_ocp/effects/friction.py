@@ -49,7 +49,7 @@ class _JointFriction(EffectBase):
 
 @EFFECTS.register("joint_viscous")
 class JointViscous(_JointFriction):
-    """Viscous friction F = -b v in addition to the model's damping."""
+    """Viscous friction F = -b v of an arm joint, in addition to the model's damping."""
 
     equation = "F = -b v"
     declared_parameters = (base.effort_scaled_parameter_definition("b", "N m s/rad", 10.0, 2.0, "viscous friction"),)
@@ -60,7 +60,7 @@ class JointViscous(_JointFriction):
 
 @EFFECTS.register("joint_coulomb")
 class JointCoulomb(_JointFriction):
-    """Coulomb friction F = -tau_c tanh(v/v_s), v_s = `_SIGN_SMOOTHING_SPEED`."""
+    """Coulomb friction F = -tau_c tanh(v/v_s) of an arm joint, smoothed below v_s = `_SIGN_SMOOTHING_SPEED`."""
 
     equation = "F = -tau_c tanh(v/v_s)"
     declared_parameters = (base.effort_scaled_parameter_definition("tau_c", "N m", 10.0, 2.0, "sliding friction"),)
@@ -71,7 +71,7 @@ class JointCoulomb(_JointFriction):
 
 @EFFECTS.register("joint_stribeck")
 class JointStribeck(_JointFriction):
-    """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), v_s as in Coulomb friction, which it adds to."""
+    """Stribeck friction F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s), added to Coulomb friction with the same v_s."""
 
     equation = "F = -tau_s exp(-(v/v_stribeck)^2) tanh(v/v_s)"
     declared_parameters = (
@@ -87,7 +87,7 @@ class JointStribeck(_JointFriction):
 
 @EFFECTS.register("joint_load_friction")
 class JointLoadFriction(_JointFriction):
-    """Friction that grows with the torque through a gear: F = -share |motor torque - torque from outside| sgn(v).
+    """Friction that grows with the torque through a gear: F = -share |motor torque - external torque| sgn(v).
 
     The torque from outside is that of weights and grasps beyond the joint. Both signs are rounded off: that of the
     speed below `_LOAD_SIGN_SMOOTHING_SPEED`, that of the torque below `_SMOOTHING_TORQUE`. From Duclusaud et al.
@@ -119,7 +119,7 @@ class JointLoadFriction(_JointFriction):
 
 @EFFECTS.register("joint_presliding")
 class JointPresliding(EffectBase):
-    """Friction that also holds at rest: F = -tau_c s, ds/dt = (v - |v| s) / yield_angle.
+    """Dahl friction, which also holds at rest: F = -tau_c s with the state ds/dt = (v - |v| s) / yield_angle.
 
     s follows the angle, not time: over a step of d = h v
 
@@ -144,12 +144,12 @@ class JointPresliding(EffectBase):
 
     @classmethod
     def internal_coordinate_names(cls, location: str, system: System) -> tuple[str, ...]:
-        """`s`, the acting fraction of tau_c, from -1 to 1."""
+        """`s`, the fraction of tau_c that acts, from -1 to 1."""
         return ("s",)
 
     @property
     def max_abs_unknown_initial_states(self) -> Mapping[str, float]:
-        """`s` with the largest absolute value 1: its value at the start of a recording is estimated."""
+        """Bound 1 on the initial |s|; the value of `s` at the start of a recording is estimated."""
         return dict.fromkeys(self.internal_coordinate_symbols, 1.0)
 
     def step_terms(self, state: MidpointState) -> StepTerms:
@@ -178,7 +178,7 @@ def _left(x: ca.SX) -> ca.SX:
 
 @EFFECTS.register("joint_spring")
 class JointSpring(EffectBase):
-    """A spring across an arm joint: V += 1/2 stiffness (q - rest_angle)^2."""
+    """Spring across an arm joint; it adds elastic energy V += 1/2 stiffness (q - rest_angle)^2."""
 
     equation = "V += 1/2 stiffness (q - rest_angle)^2"
     required_excitation = "how far it bends"

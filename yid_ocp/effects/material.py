@@ -62,7 +62,7 @@ class _SpringChange(_SegmentEffect):
 
 @EFFECTS.register("kelvin_voigt")
 class KelvinVoigt(_SegmentEffect):
-    """Damping in proportion to stiffness: F = -tau kappa v on all joints of a segment, beside the model's damping."""
+    """Kelvin-Voigt damping F = -tau kappa v, proportional to stiffness kappa, on all joints of a segment."""
 
     equation = "F = -tau kappa v"
     required_excitation = "how fast it moves"
@@ -77,7 +77,7 @@ class KelvinVoigt(_SegmentEffect):
 
 @EFFECTS.register("standard_linear_solid")
 class StandardLinearSolid(_SegmentMemory):
-    """A spring and a damper in series, parallel to every spring of a segment (bend and twist).
+    """Standard linear solid: a spring and a damper in series, parallel to every bend and twist spring of a segment.
 
     V += 1/2 ratio kappa (q - z)^2 with the massless z creeping after q: (q - z) = relaxation_time dz/dt.
     """
@@ -103,7 +103,7 @@ class StandardLinearSolid(_SegmentMemory):
 
 @EFFECTS.register("hysteresis")
 class Hysteresis(_SegmentMemory):
-    """A Dahl friction element parallel to every spring of a segment (bend and twist).
+    """Hysteresis of a segment: a Dahl friction element parallel to every bend and twist spring.
 
     F = -stiffness z, dz/dt = v - |v| z / yield_angle, with |v| rounded off below `_ABS_SMOOTHING_SPEED`. At the start
     of a recording z = 0: what came before is not known. From Dahl (1968), as in `joint_presliding`.
@@ -139,7 +139,7 @@ class Hysteresis(_SegmentMemory):
 
 @EFFECTS.register("cubic_stiffness")
 class CubicStiffness(_SegmentEffect):
-    """Springs of a segment that stiffen (k3 > 0) or soften (k3 < 0) with angle: V += 1/4 k3 q^4 on every joint.
+    """Springs that stiffen (k3 > 0) or soften (k3 < 0) with angle: V += 1/4 k3 q^4 on every joint of a segment.
 
     k3 is expected within -0.5 to 1 times stiffness over the squared largest angle, which is `_REFERENCE_ANGLE` until
     `with_prior_ranges_for_angles` is given the one in the data.
@@ -155,7 +155,7 @@ class CubicStiffness(_SegmentEffect):
     )
 
     def with_prior_ranges_for_angles(self, largest: Mapping[str, float]) -> CubicStiffness:
-        """The effect with the expected range of k3 scaled to the segment's largest angle in the data."""
+        """The effect with the prior range of k3 scaled to the segment's largest joint angle in the data."""
         if self.location not in largest:
             return self
         factor = (_REFERENCE_ANGLE / max(largest[self.location], _MIN_LARGEST_ANGLE)) ** 2
@@ -169,13 +169,13 @@ class CubicStiffness(_SegmentEffect):
 
 @EFFECTS.register("rest_curvature")
 class RestCurvature(_SpringChange):
-    """A segment that is bent at rest: V = 1/2 kappa (q - q_rest)^2 with equal rest angles at all its joints."""
+    """Rest curvature of a segment: V = 1/2 kappa (q - q_rest)^2 with equal rest angles at all its joints."""
 
     equation = "V = 1/2 kappa (q - q_rest)^2"
 
     @classmethod
     def parameter_definitions(cls, location: str, system: System) -> tuple[ParameterDefinition, ...]:
-        """Definitions of the rest angles qx and qy [rad] that are added at every joint that bends about x or y."""
+        """Definitions of qx and qy [rad], added to the rest angle of every joint that bends about x or y."""
         axes = {spring.axis for spring in segment_elastic_joints(system, location)}
         text = "rest angle of every joint about"
         return tuple(
@@ -197,7 +197,7 @@ def _doubly_bending_segments(system: System) -> tuple[str, ...]:
 
 @EFFECTS.register("bend_anisotropy")
 class BendAnisotropy(_SpringChange):
-    """A segment whose bending stiffness differs between x and y: kappa_y = kappa_x (1 + ratio)."""
+    """Anisotropic bending of a segment: stiffnesses about y and x differ, kappa_y = kappa_x (1 + ratio)."""
 
     equation = "kappa_y = kappa_x (1 + ratio)"
     possible_locations = _doubly_bending_segments

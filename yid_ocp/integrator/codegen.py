@@ -22,7 +22,7 @@ _Indices = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class StepFunctions:
-    """CasADi functions of one step, all with the arguments of `DiscreteEquations.arguments`, and the sparsity of parts.
+    """CasADi functions of one step, with the arguments of `DiscreteEquations.arguments`, and their sparsity patterns.
 
     What is at the midpoint and after it is empty where the constraints pull at the node.
     """
@@ -45,12 +45,12 @@ class StepFunctions:
 
     @property
     def all_functions(self) -> tuple[ca.Function, ...]:
-        """All functions, in the order of code generation."""
+        """All CasADi functions of the step, in the order in which C code is generated."""
         return tuple(value for value in vars(self).values() if isinstance(value, ca.Function))
 
 
 def step_functions(equations: DiscreteEquations) -> StepFunctions:
-    """The CasADi functions that the stepping kernel calls.
+    """Build the CasADi functions that the stepping kernel calls, from the symbolic step equations.
 
     The bodies' part of the Jacobians comes as vectors per joint, everything else from automatic differentiation.
     """
@@ -135,7 +135,7 @@ def _rest_jacobians(e: DiscreteEquations, bodies: ca.SX, bodies_p: ca.SX) -> tup
 
 
 def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[str]) -> ca.Function:
-    """CasADi function of the sparse derivatives of (residual, p1, prescribed effort) by the named parameters."""
+    """CasADi function: sparse derivatives of (residual, p1, prescribed effort) with respect to the named parameters."""
     e = equations
     chosen = ca.vertcat(*(e.system.parameters[name].symbol for name in names)) if names else ca.SX(0, 1)
     prescribed = list(e.system.prescribed_coordinate_indices)
@@ -147,7 +147,7 @@ def parameter_jacobian_function(equations: DiscreteEquations, names: Sequence[st
 
 @dataclass(frozen=True)
 class StepSparsityTables:
-    """Sparsity, elimination order and fill-in of a step's Jacobians, the same at every state."""
+    """Index tables of a step's Jacobians, valid at every state: sparsity, elimination order and fill-in."""
 
     unknown_rows: _Indices  # full row (balance, internal, constraint) of each unknown (free q1, z1, lam), (ny,)
     elimination_order: _Indices  # internal coordinates, tips before roots, multipliers last, (ny,)
@@ -160,7 +160,7 @@ class StepSparsityTables:
 
 
 def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
-    """The index tables of a step: sparsity, elimination order and fill-in."""
+    """Compute a step's index tables: sparsity, elimination order and fill-in of its Jacobians."""
     e = functions.equations
     system = e.system
     n, nz, m = system.n_coordinates, e.z0.numel(), e.lam.numel()
@@ -214,7 +214,7 @@ def step_sparsity_tables(functions: StepFunctions) -> StepSparsityTables:
 
 
 def kernel_c_source(functions: StepFunctions, tables: StepSparsityTables, batched: bool = False) -> str | None:
-    """C source of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables, then `kernel.c`.
+    """C source text of the stepping kernel: `simd.c`, CasADi's functions, sizes, tables, then `kernel.c`.
 
     With `batched` for several rollouts at once, as many as `yid_simd_width` returns; then None where a function has no
     SIMD form.
@@ -283,7 +283,7 @@ def _step_source(functions: Sequence[ca.Function]) -> str:
 
 
 def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
-    """C source that CasADi generates for functions; they keep their names."""
+    """C source text that CasADi generates for `functions`, which keep their names; `name` names the file."""
     generator = ca.CodeGenerator(name, {"with_header": False, "indent": 0})
     for function in functions:
         generator.add(function)
@@ -291,7 +291,7 @@ def casadi_c_source(name: str, functions: Sequence[ca.Function]) -> str:
 
 
 def nonzero_indices(sparsity: ca.Sparsity) -> tuple[IntArray, IntArray]:
-    """Row and column indices of the structural nonzeros of a sparsity pattern."""
+    """Row and column indices of a sparsity pattern's structural nonzeros, as two arrays."""
     row, column = sparsity.get_triplet()
     return np.array(row, np.int64), np.array(column, np.int64)
 

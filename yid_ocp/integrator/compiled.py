@@ -107,7 +107,7 @@ class _ThetaColumns:
 
 
 class CompiledKernel:
-    """Step kernel in generated C with the same methods as `InterpretedKernel`; threads may share it."""
+    """Stepping kernel in generated C, with the methods of `InterpretedKernel`; thread-safe."""
 
     def __init__(self, model: StepModel, library: ctypes.CDLL) -> None:
         self._model = model
@@ -119,17 +119,17 @@ class CompiledKernel:
         )
 
     def with_step_model(self, model: StepModel) -> CompiledKernel:
-        """A compiled kernel of the same library with another step model."""
+        """A kernel that shares this compiled library but uses another step model."""
         other = CompiledKernel(model, self._library)
         other._theta_columns, other._batched = self._theta_columns, self._batched
         return other
 
     def rollout(self, inputs: RolloutInputs) -> Rollout:
-        """Simulate one rollout in C."""
+        """Simulate one rollout in C and return its trajectory and derivatives."""
         return self._rolled_out(self._library, [inputs])[0]
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
-        """Simulate all members in C, in SIMD batches where that is faster."""
+        """Simulate several rollouts in C, one per entry of `members`, in SIMD batches where that is faster."""
         return batched_call(self._rollouts, list(members))
 
     def _rollouts(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
@@ -198,7 +198,7 @@ class CompiledKernel:
     def adjoint_gradient(
         self, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, names: tuple[str, ...], by: CostSlopes
     ) -> CostGradient:
-        """Gradient of a cost along a rollout, computed backwards in C."""
+        """Gradient of a cost along a rollout by the adjoint method in C; `by` holds the cost's derivatives."""
         sizes, steps = self._model.sizes, len(rollout.multipliers)
         shapes = (len(names),), (sizes["nx"],), (steps, sizes["nu"]), (steps + 1, sizes["nc"])
         gradient = CostGradient(*(np.zeros(shape) for shape in shapes))
@@ -214,7 +214,7 @@ class CompiledKernel:
     def linearize(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepEquationLinearizations:
-        """Residuals and Jacobians of many steps, evaluated in C."""
+        """Step residuals and, with `derivatives`, Jacobians along a trajectory, evaluated in C."""
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         # in the order of the struct
         matrices = [out.residual_by_new, out.residual_by_old, out.residual_by_input, out.p1_by_new, out.p1_by_old]
@@ -228,7 +228,7 @@ class CompiledKernel:
     def step_maps(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of a rollout's steps, evaluated in C, as `step.step_maps` says."""
+        """Derivatives of a rollout's steps, evaluated in C; arguments and shapes as in `step.step_maps`."""
         count, sizes, widths = len(along.torque), self._model.sizes, (inputs.shape[2], loads[0].shape[1])
         rows = sizes["nx"], sizes["nc"] + sizes["m"]
         after, effort = (np.empty((count, height, sizes["nx"] + sum(widths))) for height in rows)

@@ -142,7 +142,7 @@ def _machine() -> str:
 def compiled_shared_library(
     source: str, make: Callable[[], str] | None = None, level: str | None = None
 ) -> ctypes.CDLL | None:
-    """Load the shared library of a C source, compiled or from the cache; None if no compiler works.
+    """Compile a C source, or take it from the cache, and load the shared library; None if no compiler works.
 
     The cache key is the hash of this text, the flags, the compiler, the processor and CasADi's version. With `make`,
     which returns the C text and is called only if the library is not in the cache, `source` is what determines it.
@@ -159,7 +159,7 @@ def compiled_shared_library(
 
 
 def compiled_casadi_function(function: ca.Function) -> ca.Function:
-    """The function compiled to C, or unchanged if no compiler works; it cannot be differentiated.
+    """A CasADi function compiled to C, which cannot be differentiated; unchanged if no compiler works.
 
     Without optimisation: for functions of many operations with a total run time of seconds.
     """
@@ -254,7 +254,7 @@ def _is_ours(built: Path) -> bool:
 
 
 class MappedFunction:
-    """A CasADi function of dense columns evaluated at many points at once, compiled where possible.
+    """A CasADi function of dense columns that is evaluated at many points in one call, compiled where possible.
 
     `shared_inputs` are the positions of inputs that are the same at every point.
     """

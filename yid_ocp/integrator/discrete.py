@@ -71,7 +71,7 @@ class _ConstraintImpulses:
 
 @dataclass(frozen=True)
 class DiscreteEquations:
-    """Symbolic DEL equations of one step of a system.
+    """Symbolic discrete Euler-Lagrange (DEL) equations of one step of a system, with their symbols.
 
     Letters: n coordinates, nz internal coordinates, m constraints, nu inputs, ntheta parameters. 0 and 1 stand for the
     two nodes; coordinates q (n, 1), internal ones z (nz, 1), momenta p (n, 1) [N m s].
@@ -109,18 +109,18 @@ class DiscreteEquations:
 
     @property
     def arguments(self) -> list[ca.SX]:
-        """Arguments of every compiled function of the step, in order."""
+        """Symbols that are the arguments of every compiled function of the step, in order."""
         return [self.q0, self.q1, self.p0, self.z0, self.z1, self.lam, self.u, self.theta, self.time_step]
 
     @property
     def residual(self) -> ca.SX:
-        """Residual of the step, zero at its solution: free rows of the balance, internal and constraint equations."""
+        """Residual of the step: momentum balance of free coordinates, internal and constraint equations."""
         balance = self.momentum_balance[list(self.system.unprescribed_coordinate_indices), 0]
         return ca.vertcat(balance, self.internal_residual, self.constraint_residual)
 
     @property
     def closed_form_force_impulses(self) -> tuple[ca.SX, ca.SX] | None:
-        """Impulses of the closed-form force in `momentum_balance` and in `p1`, shape (n, 1) [N m s], or None."""
+        """Impulses (n, 1) [N m s] of the closed-form force in `momentum_balance` and `p1`; None without one."""
         if self.closed_form_force is None:
             return None
         force, (left, right) = self.closed_form_force.force, self.closed_form_force_shares
@@ -128,21 +128,21 @@ class DiscreteEquations:
 
     @property
     def end_of_step_constraint_violation(self) -> ca.SX:
-        """Constraint violation phi(q) - C lam / h at (q1, z1), without relaxation, shape (m, 1)."""
+        """Constraint violation phi(q) - C lam / h at the end of the step (q1, z1), without relaxation, shape (m, 1)."""
         if self.constraint_relaxation_gain is None:
             return self.constraint_residual
         return ca.substitute(self.constraint_residual, ca.vertcat(self.q0, self.z0), ca.vertcat(self.q1, self.z1))
 
     @property
     def newton_unknowns(self) -> ca.SX:
-        """Symbolic unknowns of a step: free coordinates of q1, internal coordinates z1, multipliers lam."""
+        """Symbols that Newton's method solves for: free coordinates of q1, internal coordinates z1, multipliers lam."""
         return ca.vertcat(self.q1[list(self.system.unprescribed_coordinate_indices), 0], self.z1, self.lam)
 
 
 def discrete_equations(
     system: System, force_split: ForceSplit = "symmetric", constraint_force: ConstraintForcePlacement = "midpoint"
 ) -> DiscreteEquations:
-    """The DEL equations of one step; arguments as in `compile_step`.
+    """Build the discrete Euler-Lagrange equations of one step of a system; arguments as in `compile_step`.
 
     `ModelError` for an unknown force split or constraint force, or an internal coordinate without an equation.
 
@@ -378,7 +378,7 @@ def _grasped(system: System, grasp: Grasp, side: str) -> Frame:
 
 @dataclass(frozen=True)
 class EquilibriumEquations:
-    """Equations of static equilibrium: driven joints held by torques and springs, prescribed joints given."""
+    """Symbolic equations of static equilibrium: torques and springs hold driven joints, prescribed joints are given."""
 
     # (unknowns: free coordinates, internal ones, forces of constraints), known coordinates (driven, then prescribed),
     # held torque, holding spring's stiffness, theta, time step
@@ -388,7 +388,7 @@ class EquilibriumEquations:
 
 
 def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
-    """The static equilibrium equations: a step from a configuration to itself with unchanged momentum."""
+    """Build the static equilibrium equations: a step from a configuration to itself with unchanged momentum."""
     system, h, nu = e.system, e.h, e.u.numel()
     free, fixed = list(system.unprescribed_coordinate_indices), list(system.prescribed_coordinate_indices)
     driven = list(system.driven_coordinate_indices)
@@ -411,7 +411,7 @@ def equilibrium_equations(e: DiscreteEquations) -> EquilibriumEquations:
 
 @dataclass(frozen=True, eq=False)
 class NlpStepConstraints:
-    """Symbolic equality constraints of one step in a nonlinear program, and their Jacobians.
+    """Symbolic equality constraints of one step in a nonlinear program (NLP), and their Jacobians.
 
     The latter are sparse derivatives of `residual` (nr, 1) and `prescribed_effort` (nc, 1) by `x0`, `x1`, `lam`, `u`.
     """
@@ -430,14 +430,14 @@ class NlpStepConstraints:
     effort_jacobians: dict[str, ca.SX]
 
     def parameter_jacobians(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:
-        """Derivatives of `residual` and of `prescribed_effort` by named parameters, sparse, shape (..., len(names))."""
+        """Sparse derivatives of `residual` and `prescribed_effort` with respect to `names`, (..., len(names))."""
         parameters = self.equations.system.parameters
         chosen = ca.vertcat(ca.SX(0, 1), *(parameters[name].symbol for name in names))
         return ca.jacobian(self.residual, chosen), ca.jacobian(self.prescribed_effort, chosen)
 
 
 def nlp_step_constraints(equations: DiscreteEquations, time_step: float) -> NlpStepConstraints:
-    """One step as constraint rows of a nonlinear program, and their derivatives, for a time step [s].
+    """Build one step's equality constraints for a nonlinear program, and their derivatives, at a time step [s].
 
     With x = (q, p, z) the rows are, all of order one,
 

@@ -36,7 +36,7 @@ _PointEvaluator = Callable[[Array], Array]
 
 
 class InterpretedKernel:
-    """Step kernel in CasADi's interpreter and NumPy with the same methods as `CompiledKernel`; threads may share it.
+    """Stepping kernel in CasADi's interpreter and NumPy, with the methods of `CompiledKernel`; thread-safe.
 
     A point is a column of all `DiscreteEquations.arguments`. The outputs are the rows of the balance, internal and
     constraint equations, then p1, then the effort of prescribed coordinates.
@@ -58,7 +58,7 @@ class InterpretedKernel:
         self._p1, self._effort = slice(self._rows, self._rows + sizes["n"]), slice(self._rows + sizes["n"], None)
 
     def with_step_model(self, model: StepModel) -> InterpretedKernel:
-        """An interpreted kernel of the same functions with another step model."""
+        """A kernel that shares the interpreted functions but uses another step model."""
         other = InterpretedKernel(model)
         other._functions = self._functions
         return other
@@ -124,7 +124,7 @@ class InterpretedKernel:
 
     @np.errstate(over="ignore", invalid="ignore")  # the status says what is not finite
     def rollout(self, inputs: RolloutInputs) -> Rollout:
-        """Simulate one rollout step by step."""
+        """Simulate one rollout step by step and return its trajectory and derivatives."""
         theta, torque, path = inputs.theta, inputs.torque, inputs.prescribed_path
         feedback, wanted = inputs.feedback, inputs.directions
         (value, slope, slopes), n, lam = self._evaluators(), self._model.sizes["n"], np.zeros(self._model.sizes["m"])
@@ -204,7 +204,7 @@ class InterpretedKernel:
     def step_maps(
         self, theta: Array, along: Rollout, feedback: TrackingFeedback | None, inputs: Array, loads: tuple[Array, Array]
     ) -> tuple[Array, Array]:
-        """Derivatives of the next states and efforts of a rollout's steps, as `step.step_maps` says."""
+        """Derivatives of the next states and efforts of a rollout's steps; arguments as in `step.step_maps`."""
         slopes, nx, extra = self._evaluators()[-1], along.state.shape[1], loads[0].shape[1]
         before = np.eye(nx, nx + inputs.shape[2] + extra)
         wanted = SensitivityDirections((), before, np.pad(inputs, ((0, 0), (0, 0), (nx, extra))))
@@ -218,13 +218,13 @@ class InterpretedKernel:
         return np.array([one[0] for one in found]), np.array([one[1] for one in found])
 
     def rollout_batch(self, members: Sequence[RolloutInputs]) -> list[Rollout]:
-        """Simulate all members, one after another."""
+        """Simulate several rollouts one after another, one per entry of `members`."""
         return [self.rollout(member) for member in members]
 
     def adjoint_gradient(
         self, theta: Array, rollout: Rollout, feedback: TrackingFeedback | None, names: tuple[str, ...], by: CostSlopes
     ) -> CostGradient:
-        """Gradient of a cost along a finished rollout by the adjoint (the paper's Lemma 1).
+        """Gradient of a cost along a finished rollout by the adjoint method; `by` holds the cost's derivatives.
 
         costate_N = dJ/dx_N, costate_k = costate_{k+1} A_k + dJ/dx_k, gradient = sum_k costate_{k+1} B_k.
         """
@@ -259,7 +259,7 @@ class InterpretedKernel:
     def linearize(
         self, theta: Array, state: Array, multipliers: Array, torque: Array, names: tuple[str, ...], derivatives: bool
     ) -> StepEquationLinearizations:
-        """Residuals of len(torque) steps along a trajectory and, with `derivatives`, their Jacobians, one by one."""
+        """Step residuals and, with `derivatives`, Jacobians along a trajectory of len(torque) steps, one by one."""
         (value, _, slopes), at = self._evaluators(), self._at
         out = allocate_linearization(self._model.sizes, len(torque), len(names), derivatives)
         new, old = np.concatenate([at["q1"], at["z1"], at["lam"]]), np.concatenate([at["q0"], at["z0"]])

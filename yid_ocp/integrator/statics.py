@@ -23,7 +23,7 @@ from yid_ocp.parallel import CASADI_LOCK, CasadiLockedCache
 
 @dataclass(frozen=True)
 class Equilibrium:
-    """A static equilibrium with its derivatives."""
+    """A static equilibrium: state, holding torque, constraint reactions, derivatives and convergence."""
 
     state: Array  # (q, p, z), (nx,); p is half a step's pull of the constraints, so that the next step stays at rest
     holding_torque: Array  # of the motors that hold the posture [N m], or command of its servos [rad or m], (nu,)
@@ -54,7 +54,7 @@ _MAX_HOLD_DEFLECTION = 0.02  # of a holding spring, by more than which the postu
 
 
 class EquilibriumSolver:
-    """Solver for the static equilibrium of a system with driven joints held and prescribed joints given.
+    """Newton solver for a system's static equilibrium; driven joints are held, prescribed joints are given.
 
     `known_coordinates` and `free_coordinates` are indices of those given (driven, then prescribed) and sought.
     """
@@ -75,7 +75,7 @@ class EquilibriumSolver:
 
     @property
     def equations(self) -> EquilibriumEquations:
-        """The symbolic equations."""
+        """The symbolic equilibrium equations that are solved."""
         return self._equations(None)
 
     def solve(
@@ -86,7 +86,7 @@ class EquilibriumSolver:
         guess: ArrayLike | None = None,
         names: Sequence[str] = (),
     ) -> Equilibrium:
-        """Find the equilibrium for given driven and prescribed coordinates; the best point where Newton fails.
+        """Find the equilibrium for given driven and prescribed coordinates; if Newton fails, return its best point.
 
         Parameters
         ----------
@@ -314,7 +314,7 @@ def _is_motor_off(system: System, command: Array) -> BoolArray:
 
 
 def driven_joint_holding_stiffness(system: System, known: bool) -> float:
-    """Stiffness of the springs that hold driven joints at measured angles, inputs known or not [N m/rad, or 1]."""
+    """Stiffness of the springs that hold driven joints at measured angles; `known`: torques or commands are given."""
     if not known:
         return _HOLD_STIFFNESS
     return _HOLD_STIFFNESS_WITH_COMMAND if system.servos else _HOLD_STIFFNESS_WITH_TORQUE
@@ -385,7 +385,7 @@ def _solved(matrix: Array, right: Array) -> Array:
 
 
 def relaxed_internal_coordinates(step: Step, q: ArrayLike, theta: ArrayLike) -> Array:
-    """Fully relaxed internal coordinates of an object held at a configuration, shape (nz,)."""
+    """Steady internal coordinates (nz,) of a system held at configuration `q` until they have fully relaxed."""
     e = step.equations
     nz = e.z0.numel()
     if nz == 0:

@@ -37,7 +37,7 @@ _ALL_STEPS = slice(None)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step(ReprMixin):
-    """Step map of a system over one time step; made by `compile_step`. `is_compiled`: by generated C code."""
+    """Step map of a system over one time step, made by `compile_step`; `is_compiled` if it runs generated C code."""
 
     model: StepModel
     kernel: CompiledKernel | InterpretedKernel
@@ -58,29 +58,29 @@ class Step(ReprMixin):
         return self.model.time_step
 
     def clock_scaled_time_step(self, theta: Array) -> float:
-        """Recorded time step times the clock scale at a theta (`System.recorded_time_scale`) [s]."""
+        """Time step [s] corrected for the recording's clock: h times `System.recorded_time_scale` at `theta`."""
         s = self.sizes
         none = [np.zeros(s[key]) for key in ("n", "n", "n", "nz", "nz", "m", "nu")]
         return float(self.functions.row_scale_and_time_step(*none, theta, self.time_step)[1])
 
     @property
     def force_split(self) -> ForceSplit:
-        """Distribution of the force of a step between its ends, `symmetric` or `left`."""
+        """Distribution of a step's forces between its two nodes: `symmetric` (half each) or `left`."""
         return self.model.equations.force_split
 
     @property
     def equations(self) -> DiscreteEquations:
-        """The symbolic equations of a step."""
+        """The symbolic equations that one step solves."""
         return self.model.equations
 
     @property
     def functions(self) -> codegen.StepFunctions:
-        """CasADi functions of the step equations."""
+        """CasADi functions that evaluate the step equations and their derivatives."""
         return self.model.functions
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Dimensions n, nz, m, nu, nc, nx and ntheta by name."""
+        """Dimensions by symbol, such as n (coordinates), nz (internal), m (constraints), nu (inputs) and ntheta."""
         return self.model.sizes
 
     def __call__(
@@ -118,7 +118,7 @@ class Step(ReprMixin):
         internal: ArrayLike | None = None,
         names: Sequence[str] | None = None,
     ) -> tuple[Array, Array, Array]:
-        """Derivatives of (q, p, z)_{k+1} by the implicit function theorem; arguments as of a step.
+        """Derivatives of the next state (q, p, z) with respect to state, input and parameters (implicit functions).
 
         Returns A (nx, nx) by (q, p, z)_k, B_u (nx, nu) and B_theta (nx, len(names)), by all of theta without `names`.
         """
@@ -169,7 +169,7 @@ def compile_step(
     use_compiler: bool = True,
     tolerance: float | None = None,
 ) -> Step:
-    """Build the step map of a system, compiled where possible.
+    """Build the step map of a system, as compiled C code where a compiler is found.
 
     Parameters
     ----------
@@ -199,13 +199,13 @@ def compile_step(
 
 
 def step_with_time_step(step: Step, time_step: float) -> Step:
-    """A copy of a step with another, positive, time step [s], from the same equations and compiled code."""
+    """A copy of a step with another (positive) time step [s] that shares equations and compiled code."""
     model = replace(step.model, time_step=_positive(time_step), tolerance=newton_correction_tolerance(time_step))
     return Step(model, step.kernel.with_step_model(model), step.is_compiled)
 
 
 def compile_step_like(step: Step, system: System, *, use_compiler: bool | None = None) -> Step:
-    """The step of another system with the time step, integration rules and, by default, kernel type of `step`."""
+    """Build the step of another system with the time step, integration rules and (by default) kernel type of `step`."""
     compiled = step.is_compiled if use_compiler is None else use_compiler
     rules = (step.force_split, step.equations.constraint_force)
     return compile_step(system, step.time_step, *rules, use_compiler=compiled)
@@ -218,7 +218,7 @@ def _positive(time_step: float) -> float:
 
 
 def checked_float_array(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """The values as a contiguous float array; `ModelError` with `name` if its shape is not `shape`."""
+    """Convert values to a contiguous float array; `ModelError` that names `name` if the shape is not `shape`."""
     array = np.ascontiguousarray(values, dtype=float)
     if array.size == 0 and 0 in shape:
         return np.zeros(shape)
@@ -240,7 +240,7 @@ def simulate(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> Rollout:
-    """Simulate a system, with forward sensitivities if directions are given; `simulate_batch` is faster for many.
+    """Simulate a system over `steps` steps, with forward sensitivities along `directions` if given.
 
     Parameters
     ----------
@@ -261,7 +261,7 @@ def simulate(
 
 
 def simulate_batch(step: Step, members: Sequence[RolloutInputs]) -> list[Rollout]:
-    """Simulate several `checked_rollout_inputs`, in batches where faster; equal to `simulate` but for rounding."""
+    """Simulate several rollouts, each from `checked_rollout_inputs`; equal to `simulate` except for rounding."""
     return step.kernel.rollout_batch(members)
 
 
@@ -275,7 +275,7 @@ def checked_rollout_inputs(
     feedback: TrackingFeedback | None = None,
     directions: SensitivityDirections | None = None,
 ) -> RolloutInputs:
-    """`RolloutInputs` of one rollout, with shapes checked; arguments and errors as in `simulate`."""
+    """Check the shapes of one rollout's inputs and return `RolloutInputs`; arguments and errors as in `simulate`."""
     sizes, check = step.sizes, checked_float_array
     nx, nu, nc = sizes["nx"], sizes["nu"], sizes["nc"]
     if steps < 1:
@@ -300,7 +300,7 @@ def checked_rollout_inputs(
 
 
 def applied_joint_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> Array:
-    """Torque at driven joints in every step, shape (N, nu) [N m]: the input, or the torque of position servos."""
+    """Torque that acts on driven joints in every step, (N, nu) [N m]: the input, or the torque of position servos."""
     system, h = step.system, step.time_step
     if not system.servos:
         return rollout.torque
@@ -316,7 +316,7 @@ def applied_joint_torque(step: Step, theta: ArrayLike, rollout: Rollout) -> Arra
 
 
 def generalized_momentum(step: Step, q: ArrayLike, v: ArrayLike, theta: ArrayLike) -> Array:
-    """Generalized momentum dL/dv at (q, v) [N m s], of a compliant coordinate times its compliance, shape of q.
+    """Generalized momentum dL/dv [N m s] at (q, v), in the shape of q; compliant coordinates are scaled by compliance.
 
     `q` and `v` have the shape (n,) or (K, n).
     """
@@ -338,7 +338,7 @@ def moving_observable_state_mask(
     loads: tuple[Array, Array] | None = None,
     seen: BoolArray | None = None,
 ) -> BoolArray:
-    """Mask of the states that move and that affect others, efforts or sensors, shape (nx,).
+    """Mask (nx,) of the states that move and that affect other states, efforts or sensors.
 
     Internal states of a neutral effect are excluded. The first and the last step of the rollout stand for all, `seen`
     (nx,) says which states sensors depend on.
@@ -367,7 +367,7 @@ def step_maps(
     loads: tuple[Array, Array] | None = None,
     chosen: slice = _ALL_STEPS,
 ) -> Iterator[tuple[Array, Array]]:
-    """Iterate over the derivatives of a finished rollout's steps, some at a time, prescribed coordinates unchanged.
+    """Iterate over the derivatives of a finished rollout's steps in blocks, with prescribed coordinates held fixed.
 
     Derivatives of the next state (k, nx, d), and of prescribed coordinates' effort followed by constraint forces
     (k, nc + m, d), are by the state, under the feedback where one is given, by c columns of torque that are `inputs`

@@ -48,7 +48,7 @@ def build_step_model(
     constraint_force: ConstraintForcePlacement,
     tolerance: float | None = None,
 ) -> StepModel:
-    """The `StepModel` of a system; arguments as in `compile_step`."""
+    """Build the `StepModel` of a system; arguments as in `compile_step`."""
     e = discrete_equations(system, force_split, constraint_force)
     functions = codegen.step_functions(e)
     n, nz = system.n_coordinates, e.z0.numel()
@@ -60,12 +60,12 @@ def build_step_model(
 
 
 def newton_correction_tolerance(time_step: float) -> float:
-    """Newton's tolerance on the coordinates [rad or m] for a time step [s]."""
+    """Largest coordinate correction [rad or m] at which Newton's method has converged, for a time step [s]."""
     return max(_ROUNDING_FLOOR, min(_COORDINATE_TOLERANCE, _VELOCITY_TOLERANCE * time_step))
 
 
 class NewtonStatus(IntEnum):
-    """Termination status of Newton's iteration of one step, as the C kernel numbers it."""
+    """Status with which Newton's iteration of one step ended, with the numbers of the C kernel."""
 
     OK = 0
     NOT_CONVERGED = 1
@@ -93,7 +93,7 @@ _INSTABILITY_HINT = (
 
 @dataclass(frozen=True)
 class StepStatus:
-    """Convergence status of a step or of a rollout: Newton's last correction [rad or m], and totals over all steps.
+    """Convergence status of a rollout: status code, Newton's last correction [rad or m], and totals over all steps.
 
     `prescribed_effort` (nc,) is that at the first node of the last step [N m], `internal_coordinates` (nz,) are those
     after it.
@@ -109,12 +109,12 @@ class StepStatus:
 
     @property
     def is_converged(self) -> bool:
-        """Whether every step converged."""
+        """Whether Newton's method converged in every step."""
         return self.code == NewtonStatus.OK
 
     @property
     def message(self) -> str:
-        """The status as a sentence with the step, the last correction and a remedy."""
+        """Sentence that explains the status, with the step, the last correction and a remedy."""
         if self.is_converged:
             return _STATUS_MESSAGES[self.code]
         step, what = self.completed_steps, _STATUS_MESSAGES[self.code]
@@ -126,7 +126,7 @@ class StepStatus:
 
 @dataclass(frozen=True)
 class SensitivityDirections:
-    """The d directions in which a rollout is differentiated: named parameters first, then states and inputs.
+    """The d directions in which a rollout is differentiated: named parameters first, then tangents of start and inputs.
 
     Derivatives of the initial state (nx, d), of the torque (N, nu, d) and of the prescribed path (N + 1, nc, d).
     """
@@ -143,13 +143,13 @@ class SensitivityDirections:
 
     @property
     def count(self) -> int:
-        """d, the number of directions."""
+        """Number d of directions."""
         return self.initial_state_tangents.shape[1]
 
 
 @dataclass(frozen=True)
 class TrackingFeedback:
-    """Time-varying feedback of the tracking filter, u_k = ubar_k - K_k (x_k[index] - xbar_k).
+    """Time-varying feedback of the tracking filter: torque u_k = ubar_k - K_k (x_k[index] - xbar_k).
 
     Of the rows of the state (q, p, z) in `state_indices` (nb,), with K_k in `gain` (N, nu, nb) [N m/rad for a
     coordinate, 1/s for a momentum] and the rows' measured values in `reference` (N, nb).
@@ -162,7 +162,7 @@ class TrackingFeedback:
 
 @dataclass(frozen=True)
 class RolloutInputs:
-    """Inputs of one rollout.
+    """Inputs of one rollout: parameters, initial state, torques, prescribed path, feedback and directions.
 
     The parameters (ntheta,), the initial state (q, p, z) (nx,), the nominal motor torque of every step (N, nu) [N m],
     and the prescribed coordinates at every node (N + 1, nc).
@@ -178,7 +178,7 @@ class RolloutInputs:
 
 @dataclass(frozen=True)
 class Rollout:
-    """A simulated trajectory and, if requested, its derivatives (..., d) by the directions; NaN after a failed step.
+    """A simulated trajectory and, if requested, its derivatives (..., d) along d directions; NaN after a failed step.
 
     (q, p, z) at every node (N + 1, nx), multipliers (N, m) [N s], effort of prescribed coordinates at nodes 0..N-1
     (N, nc) [N m] and applied torque (N, nu) [N m]. At node 0 the effort assumes that p_0 came from a step before (an
@@ -201,7 +201,7 @@ CostSlopes = tuple[Array, Array | None, Array | None]
 
 @dataclass(frozen=True)
 class CostGradient:
-    """Gradient of a scalar cost along a rollout, from the adjoint; NaN where a step's equations turned out singular.
+    """Gradient of a scalar cost along a rollout, by the adjoint method; NaN if the equations of a step are singular.
 
     By the chosen parameters, the initial state (nx,), the nominal torque (N, nu) and the prescribed coordinates at
     every node (N + 1, nc), those at node 0 as in `by_initial_state`.
@@ -215,7 +215,7 @@ class CostGradient:
 
 @dataclass(frozen=True)
 class StepEquationLinearizations:
-    """Residuals and Jacobians of the equations of many steps, at a trajectory that need not satisfy them.
+    """Residuals and Jacobians of the step equations along a trajectory that need not satisfy them.
 
     Of every step the momentum balance (n), internal (nz) and constraint (m) equations, nt in all, and the p_{k+1} (n)
     that follows from the other values, with their derivatives by what is new, (q_{k+1}, z_{k+1}, lam_k), by what is
@@ -235,7 +235,7 @@ class StepEquationLinearizations:
 
 
 def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -> Rollout:
-    """A rollout filled with NaN, with `count` directions or none, for a kernel to write into."""
+    """A rollout filled with NaN for a kernel to write into; with `count` directions, or no sensitivities for None."""
     shapes: dict[str, tuple[int, ...]] = {"state": (steps + 1, sizes["nx"]), "multipliers": (steps, sizes["m"])}
     shapes |= {"effort": (steps, sizes["nc"]), "torque": (steps, sizes["nu"])}
     names = [f"{name}_sensitivity" for name in ("state", "multipliers", "effort")]
@@ -249,7 +249,7 @@ def allocate_nan_rollout(sizes: dict[str, int], steps: int, count: int | None) -
 def allocate_linearization(
     sizes: dict[str, int], count: int, width: int, derivatives: bool
 ) -> StepEquationLinearizations:
-    """A linearization of `count` steps and `width` parameters filled with zeros; no Jacobians without `derivatives`."""
+    """Linearizations of `count` steps and `width` parameters, filled with zeros; no Jacobians without `derivatives`."""
     n, nz, m, nu = sizes["n"], sizes["nz"], sizes["m"], sizes["nu"]
     nt, steps = n + nz + m, count if derivatives else 0
     shapes: dict[str, tuple[int, ...]] = {"residual": (count, nt), "p1": (count, n)}
@@ -276,7 +276,7 @@ def out_of_memory_error(what: str, size: int) -> InsufficientMemoryError:
 def attach_step_status(
     rollout: Rollout, sizes: dict[str, int], code: int, step: int, error: float, counts: tuple[int, int]
 ) -> Rollout:
-    """A copy of the rollout with its `StepStatus`; `counts` are Newton iterations and factorisations."""
+    """A copy of the rollout with a `StepStatus`; `counts` are Newton iterations and matrix factorisations."""
     last = rollout.effort[step - 1] if step else np.zeros(sizes["nc"])
     inner = rollout.state[step, 2 * sizes["n"] :]
     return replace(rollout, status=StepStatus(NewtonStatus(code), step, error, *counts, last, inner))

@@ -26,7 +26,7 @@ _ANGLE_STD, _RATE_STD, _TORQUE_STD = 0.02, 0.3, 1.0  # errors that weigh the sam
 
 
 def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> TrackingFeedback:
-    """Feedback u_k = ubar_k - K (q_k - qbar_k) with a constant diagonal K on the driven joints.
+    """Tracking feedback u_k = ubar_k - K (q_k - qbar_k) on the driven joints, with a constant diagonal K.
 
     `measured` are their angles qbar at every node, shape (N + 1, nu) [rad], `gains` one or one arm's worth or nu
     [N m/rad]; `ModelError` of another number of gains, or a negative one.
@@ -47,7 +47,7 @@ def proportional_feedback(step: Step, measured: ArrayLike, gains: ArrayLike) -> 
 def lqr_feedback(
     step: Step, measured: ArrayLike, torque: ArrayLike, theta: ArrayLike, arms: Step | None = None
 ) -> TrackingFeedback:
-    """Feedback of a finite-horizon LQR of the driven arms, linearised about their measured motion.
+    """Tracking feedback with finite-horizon LQR gains for the driven arms, linearised about their measured motion.
 
     Minimises the sum of |dq|^2/angle^2 + |M^-1 dp|^2/rate^2 + |du|^2/torque^2 over the recording for the arms without
     the object, with the errors that weigh the same; the gains act on the arms' angles and momenta (Anderson and Moore
@@ -86,7 +86,7 @@ def lqr_feedback(
 
 
 def driven_joints_only_step(step: Step) -> Step:
-    """Step of the driven joints alone, without the object, grasps, prescribed joints and effects.
+    """Compiled step of the driven joints alone, without object, grasps, prescribed joints and effects.
 
     `ModelError` where the driven joints do not come first in the configuration.
     """
@@ -142,7 +142,7 @@ def _one_step_each(arm_step: Step, start: Array, torque: Array, guess: Array, th
 
 @dataclass(frozen=True)
 class JointMotionWithSensitivities:
-    """Angles and torques of the driven joints over the steps of a recording, with their derivatives.
+    """Angles and torques of the driven joints over the steps of a recording, with derivatives.
 
     The latter (..., d) are by d parameters and what follows these; None where nothing depends on them.
     """
@@ -161,7 +161,7 @@ class JointMotionWithSensitivities:
 
 
 class EffectMomentumShift:
-    """Difference between the momentum of a motion with effects and that of the recorded motion without them.
+    """Computes the momentum of a motion with effects minus that of the recorded motion without effects.
 
     `lqr_feedback` computes its reference once, from recorded angles and torques without effects. With a torque other
     than the recorded one, or an effect such as an armature, the same motion has another momentum, and the feedback
@@ -217,7 +217,7 @@ class EffectMomentumShift:
                 self._memories.append((own, _Memory(step, symbols, law, rows, columns)))
 
     def momentum_derivative_by_previous_torque(self, theta: Array) -> Array:
-        """Derivative of the momentum by the torques of the previous step, shape (nu, nu) [s]."""
+        """Derivative of the momentum with respect to the torques of the previous step, shape (nu, nu) [s]."""
         arguments = [np.zeros(self._impulse.numel_in(i)) for i in range(5)]
         return np.array(self._impulse(*arguments, theta, self._time_step))
 
@@ -228,7 +228,7 @@ class EffectMomentumShift:
         theta: Array,
         names: Sequence[str],
     ) -> tuple[Array, Array]:
-        """Momentum with effects minus recorded, at every node but the last, (N, nu), and its derivatives, (N, nu, d).
+        """Momentum shift (with effects minus recorded) at nodes 0..N-1, (N, nu), and its derivatives (N, nu, d).
 
         `recorded` is the recorded motion, `true` that corrected for effects, whose derivatives alone are used; `names`
         are the parameters of the first of the d derivatives.
@@ -275,18 +275,18 @@ class EffectMomentumShift:
         return z, total if np.any(total) else None
 
     def theta_without_effects(self, theta: Array) -> Array:
-        """theta with these effects neutral, at which the feedback's reference is computed."""
+        """Copy of theta with the effects' parameters neutral; the feedback's reference is computed with it."""
         plain = theta.copy()
         plain[self._columns] = self._neutral
         return plain
 
     def is_active(self, theta: Array, names: Sequence[str]) -> bool:
-        """Whether any effect shifts the momentum, or one of its parameters is in `names`."""
+        """Whether an effect shifts the momentum: one of its parameters is not neutral at `theta` or is in `names`."""
         return not set(names).isdisjoint(self.parameter_names) or bool(np.any(theta[self._columns] != self._neutral))
 
 
 def applied_torque_by_torque_error(gain: Array, by_torque: Array) -> Array:
-    """Derivative of the applied torque by an error of the recorded torque, feedback included, (..., nu, nu).
+    """Derivative (..., nu, nu) of the applied torque with respect to a recorded torque's error, including feedback.
 
     The feedback's reference momenta follow from the recorded torque; the error is assumed equal in the previous step.
     `gain` (..., nu, nb) is that of a step, `by_torque` is `EffectMomentumShift.momentum_derivative_by_previous_torque`.

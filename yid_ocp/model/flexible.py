@@ -23,7 +23,7 @@ AXIS_UNIT_VECTORS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0,
 
 @dataclass(frozen=True)
 class Segment:
-    """Description of one tube, branch or beam."""
+    """Segment of a flexible object (tube, branch, beam): length, mass, links, joint stiffness, damping and parent."""
 
     name: str
     length: float
@@ -69,7 +69,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class ElasticJoint:
-    """A spring 1/2 stiffness (q - rest)^2 and a damper -damping v on one joint; the values may be symbolic."""
+    """Spring with energy 1/2 stiffness (q - rest)^2 and damper with force -damping v on one joint of a segment."""
 
     joint_name: str
     segment_name: str
@@ -82,7 +82,7 @@ class ElasticJoint:
 
 @dataclass(frozen=True)
 class SegmentLayout:
-    """Where a segment is in the mechanism."""
+    """A segment's place in the mechanism: its joints and lengths link by link, radius, mass and parent segment."""
 
     name: str
     link_joints: tuple[tuple[str, ...], ...]  # names, link by link
@@ -94,7 +94,7 @@ class SegmentLayout:
 
 @dataclass(frozen=True, repr=False)
 class FlexibleObject(ReprMixin):
-    """A generated flexible object: its mechanism, elastic joints and segments.
+    """A flexible object as a rigid-link model: its mechanism, elastic joints and segments.
 
     Frames: `SEGMENT` tip as `w_SEGMENT`, tip of link i as `SEGMENT_i_tip`, the root frame `object_root`, and points by
     arc length, independent of the number of links, as `SEGMENT:40%`.
@@ -116,7 +116,7 @@ def flexible_object(
     name: str = "object",
     gravity_fraction: float = 1.0,
 ) -> FlexibleObject:
-    """A flexible object of rigid links with an elastic joint before each.
+    """Build a flexible object from segments, as a chain of rigid links with elastic joints before each link.
 
     Joints are named `SEGMENT_LINK_AXIS` (`T1_0_x`), parameters `SEGMENT.length` (or `.length_0`, ...), `.mass`,
     `.radius` (or `.size_x` and `.size_y`), `.bend`, `.twist`, `.damping` (and `.twist_damping` where given).
@@ -207,7 +207,7 @@ def _add_segment(parts: _Parts, segment: Segment, root: Placement, gravity_fract
 
 
 def relative_parallel_transport_rotations(vertices: ArrayLike, initial_frame: ArrayLike | None = None) -> list[Array]:
-    """Twist-free rotation of each edge's frame against that of the edge before, a list of one (3, 3) per edge.
+    """Twist-free rotations along a polyline: one (3, 3) matrix per edge, relative to the frame of the edge before.
 
     They are what `Segment.rest_rotation` and `Segment.link_rest_rotations` take. `vertices`, shape (k, 3), are the
     undeformed centre line [m]; `initial_frame`, shape (3, 3), is the frame before the first edge, whose z axis is the

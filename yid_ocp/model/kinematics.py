@@ -18,7 +18,7 @@ from yid_ocp.model.rotations import symbolic_rotation_from_axis_angle
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Joint poses and screws of a mechanism at a configuration."""
+    """Poses and screws of all joints of a mechanism at a configuration, as symbolic expressions."""
 
     mechanism: Mechanism
     joint_rotations: tuple[ca.SX, ...]  # of each joint's moving frame, to the world, each (3, 3)
@@ -26,7 +26,7 @@ class Kinematics:
     joint_screws: tuple[ca.SX, ...]  # S_j, the spatial velocity per unit rate of joint j, each (6, 1)
 
     def frame_pose(self, frame: str | Frame) -> Placement:
-        """Pose of a frame in the world."""
+        """Pose of a frame in the world, given by name or as a `Frame`."""
         entry = self._frame(frame)
         j, local = entry.joint_index, entry.placement
         return local if j < 0 else Placement(self.joint_rotations[j], self.joint_origins[j]) @ local
@@ -36,12 +36,12 @@ class Kinematics:
         return self.frame_pose(frame).translation
 
     def position_jacobian(self, frame: str | Frame) -> ca.SX:
-        """Derivative of a frame's position by the configuration, shape (3, n)."""
+        """Jacobian of a frame's position in the world with respect to the configuration, shape (3, n)."""
         point = self.frame_position(frame)
         return self._columns(frame, lambda screw: screw[3:] + ca.cross(screw[:3], point))
 
     def angular_jacobian(self, frame: str | Frame) -> ca.SX:
-        """Jacobian of a frame's angular velocity, in world axes, by the configuration rates, shape (3, n)."""
+        """Jacobian (3, n) of a frame's angular velocity, in world axes, with respect to the configuration's rates."""
         return self._columns(frame, lambda screw: screw[:3])
 
     def _frame(self, frame: str | Frame) -> Frame:
@@ -56,7 +56,7 @@ class Kinematics:
 
 @dataclass(frozen=True)
 class RigidBodyLagrangianDerivatives:
-    """First derivatives of the rigid-body Lagrangian at (q, v), and the vectors of its second derivatives.
+    """First derivatives of the rigid-body Lagrangian at (q, v), and vectors that give its second derivatives.
 
     With S_j the screw of joint j, D_j = V_parent(j) x S_j, Ic_j and H_j the inertia and momentum of all that j moves:
 
@@ -81,17 +81,17 @@ class RigidBodyLagrangianDerivatives:
 
 
 def motion_cross_motion_product(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Spatial cross product a x b of two motions (twists), shape (6, 1)."""
+    """Spatial cross product a x b of two motion vectors (twists), shape (6, 1), angular part first."""
     return ca.vertcat(ca.cross(a[:3], b[:3]), ca.cross(a[:3], b[3:]) + ca.cross(a[3:], b[:3]))
 
 
 def motion_cross_force_product(a: ca.SX, f: ca.SX) -> ca.SX:
-    """Spatial cross product a x* f of a motion and a wrench, shape (6, 1)."""
+    """Spatial cross product a x* f of a motion vector a and a wrench f, shape (6, 1), angular part first."""
     return ca.vertcat(ca.cross(a[:3], f[:3]) + ca.cross(a[3:], f[3:]), ca.cross(a[:3], f[3:]))
 
 
 def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
-    """Poses and screws of all joints at a configuration q, shape (n, 1) [rad or m]."""
+    """Compute poses and screws of all joints at a configuration q, shape (n, 1) [rad or m]."""
     rotations: list[ca.SX] = []
     origins: list[ca.SX] = []
     screws: list[ca.SX] = []
@@ -115,7 +115,7 @@ def forward_kinematics(mechanism: Mechanism, q: ca.SX) -> Kinematics:
 def rigid_body_lagrangian_derivatives(
     kinematics: Kinematics, v: ca.SX, gravity: ca.SX
 ) -> RigidBodyLagrangianDerivatives:
-    """Energies and first derivatives of the Lagrangian of a mechanism's bodies at a velocity (n, 1), gravity (3, 1)."""
+    """Energies and first Lagrangian derivatives of a mechanism's bodies at velocity v (n, 1) and gravity (3, 1)."""
     joints, S = kinematics.mechanism.joints, kinematics.joint_screws
     velocity: list[ca.SX] = []
     D: list[ca.SX] = []
@@ -190,14 +190,14 @@ def _moved(kinematics: Kinematics, velocity: Sequence[ca.SX], gravity: ca.SX) ->
 
 
 def mass_matrix(rigid: RigidBodyLagrangianDerivatives, mechanism: Mechanism) -> ca.SX:
-    """Mass matrix M = L_vv of the bodies, shape (n, n), from the closed form of `RigidBodyLagrangianDerivatives`."""
+    """Mass matrix M = L_vv of the mechanism, (n, n), from the closed form in `RigidBodyLagrangianDerivatives`."""
     return _from_pairs(mechanism, lambda i, j: (_dot(rigid.S, i, rigid.F, j),) * 2)
 
 
 def lagrangian_second_derivatives(
     rigid: RigidBodyLagrangianDerivatives, mechanism: Mechanism
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """(L_qq, L_qv, L_vv) of the bodies, each (n, n), from `RigidBodyLagrangianDerivatives`; L_qv[row q, column v]."""
+    """Second derivatives (L_qq, L_qv, L_vv) of the bodies' Lagrangian, each (n, n); L_qv has rows q, columns v."""
     S, D, F, B, G = rigid.S, rigid.D, rigid.F, rigid.B, rigid.G
     by_qq = _from_pairs(mechanism, lambda i, j: (_dot(D, i, B, j) + _dot(S[:3, :], i, G, j),) * 2)
     by_qv = _from_pairs(mechanism, lambda i, j: (_dot(D, i, F, j), _dot(S, i, B, j)))

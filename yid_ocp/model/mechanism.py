@@ -20,7 +20,7 @@ from yid_ocp.model.rotations import snap_near_integer_entries
 
 @dataclass(frozen=True)
 class Placement:
-    """Rigid transform of a child frame to its parent: rotation (3, 3), translation (3, 1) [m]; parameters may enter."""
+    """Rigid transform from a child frame to its parent: symbolic rotation (3, 3) and translation (3, 1) [m]."""
 
     rotation: ca.SX
     translation: ca.SX
@@ -33,20 +33,20 @@ class Placement:
 
     @staticmethod
     def identity() -> Placement:
-        """The identity transform."""
+        """Identity placement: no rotation and no translation."""
         return Placement.from_matrix(np.eye(4))
 
     def __matmul__(self, other: Placement) -> Placement:
         return Placement(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def homogeneous_matrix(self) -> ca.SX:
-        """The 4x4 homogeneous matrix."""
+        """The placement as a homogeneous 4x4 matrix."""
         return ca.vertcat(ca.horzcat(self.rotation, self.translation), ca.SX(ca.DM([[0.0, 0.0, 0.0, 1.0]])))
 
 
 @dataclass(frozen=True)
 class Inertia:
-    """Mass, centre of mass [m] and inertia about it [kg m^2], in the frame of the joint that carries the body.
+    """Inertia of a rigid body: mass [kg], centre of mass [m] and tensor about it [kg m^2], in its joint's frame.
 
     `gravity_fraction` multiplies the pull of gravity on the body, not its inertia; None means 1.
     """
@@ -58,15 +58,15 @@ class Inertia:
 
     @staticmethod
     def from_values(mass: float, com: ArrayLike, about_com: ArrayLike) -> Inertia:
-        """Inertia from numbers."""
+        """Inertia from numbers: mass [kg], centre of mass (3,) [m] and tensor about it (3, 3) [kg m^2]."""
         return Inertia(ca.SX(mass), ca.SX(ca.DM(np.asarray(com, float))), ca.SX(ca.DM(np.asarray(about_com, float))))
 
     def scaled_by(self, factor: ca.SX) -> Inertia:
-        """The inertia with mass and tensor multiplied by `factor`."""
+        """The inertia with mass and inertia tensor multiplied by `factor`."""
         return replace(self, mass=self.mass * factor, inertia_about_com=self.inertia_about_com * factor)
 
     def transformed_by(self, placement: Placement) -> Inertia:
-        """The inertia in another frame, in which its present frame has `placement`."""
+        """The inertia expressed in another frame; `placement` is the pose of the present frame in it."""
         rotation = placement.rotation
         com = rotation @ self.center_of_mass + placement.translation
         return replace(self, center_of_mass=com, inertia_about_com=rotation @ self.inertia_about_com @ rotation.T)
@@ -74,7 +74,7 @@ class Inertia:
 
 @dataclass(frozen=True)
 class Joint:
-    """One degree of freedom and the bodies that are rigidly attached to its moving side."""
+    """One degree of freedom (revolute or prismatic), its limits, and the bodies rigidly attached to its moving side."""
 
     name: str
     kind: Literal["revolute", "prismatic"]
@@ -89,7 +89,7 @@ class Joint:
 
     @property
     def coordinate_unit(self) -> str:
-        """Unit of the coordinate, `rad` or `m`."""
+        """Unit of the joint's coordinate, `rad` or `m`."""
         return "rad" if self.kind == "revolute" else "m"
 
 
@@ -109,7 +109,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class ArcLengthChain:
-    """A chain of straight links along which points are located by arc length."""
+    """A chain of straight links on which points are located by their fraction of the arc length."""
 
     tip_frames: tuple[str, ...]  # at the far end of every link, which is its translation, base to tip
     length_fractions: tuple[float, ...]  # part of the nominal arc length that each link has; they sum to one
@@ -127,7 +127,7 @@ class ArcLengthChain:
 
 @dataclass(frozen=True, repr=False)
 class Mechanism(ReprMixin):
-    """A tree of joints, parents before children.
+    """A kinematic tree: joints (parents before children) with bodies, named frames and parameters.
 
     Placements and inertias depend on its `parameters`; along its `link_chains` `NAME:40%` names a point by arc length.
     """
@@ -146,27 +146,27 @@ class Mechanism(ReprMixin):
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in configuration order."""
+        """Names of the joints, in the order of the configuration vector."""
         return tuple(joint.name for joint in self.joints)
 
     @property
     def parent_indices(self) -> tuple[int, ...]:
-        """Parent index of every joint, -1 for the world."""
+        """Index of every joint's parent joint, -1 for the world."""
         return tuple(joint.parent_index for joint in self.joints)
 
     def joint_index(self, name: str) -> int:
-        """Index of a joint by name; `ModelError` with the nearest name where there is none."""
+        """Index of a joint by name; `ModelError` with the nearest name if there is no such joint."""
         names = self.joint_names
         if name not in names:
             raise ModelError(f"there is no joint '{name}'", where=self.name, hint=nearest_name_hint(name, names))
         return names.index(name)
 
     def has_frame(self, name: str) -> bool:
-        """Whether there is a frame of a name, or a segment for a name such as `T1:40%`."""
+        """Whether the mechanism has a frame of this name, or for a name such as `T1:40%` the segment `T1`."""
         return name in self.frames or (":" in name and name.partition(":")[0] in self.link_chains)
 
     def frame(self, name: str) -> Frame:
-        """A frame by name, or a point of a line by its nominal arc length from the base, such as `T1:40%`.
+        """The frame of a name; `T1:40%` is the point of segment `T1` at 40 % of its nominal arc length from the base.
 
         Such a point lies on the straight link that reaches there and turns with it, however many links there are.
         `ModelError` where there is no such frame (with the nearest name) or no percentage from 0 to 100.
@@ -182,7 +182,7 @@ class Mechanism(ReprMixin):
         return replace(end, placement=Placement(end.placement.rotation, part * end.placement.translation))
 
     def ancestor_joint_indices(self, index: int) -> tuple[int, ...]:
-        """Indices of the joints from the root to joint `index`, itself included; empty for the world."""
+        """Indices of the joints on the path from the root to joint `index`, inclusive; empty for the world (-1)."""
         chain = []
         while index >= 0:
             chain.append(index)
@@ -192,7 +192,7 @@ class Mechanism(ReprMixin):
     def with_attached_mechanism(
         self, other: Mechanism, frame: str | None = None, placement: ArrayLike | None = None
     ) -> Mechanism:
-        """This mechanism with another one, its root at a pose (4, 4) in a frame of this one (the world when absent)."""
+        """This mechanism with another attached, whose root has the pose `placement` (4, 4) in `frame` (None: world)."""
         root = Placement.identity() if placement is None else Placement.from_matrix(placement)
         at = -1
         if frame is not None:
@@ -219,7 +219,7 @@ class Mechanism(ReprMixin):
         return Mechanism(name, tuple(joints), {**self.frames, **added}, both, chains)
 
     def with_added_frame(self, name: str, frame: str | None, placement: ArrayLike) -> Mechanism:
-        """The mechanism with one additional frame, at a pose (4, 4) in the one it is fixed to (the world for None)."""
+        """The mechanism with an additional frame `name`, fixed at a pose (4, 4) in `frame` (None: world)."""
         if name in self.frames:
             raise ModelError(f"there is a frame '{name}' already", where=self.name)
         carrier = Frame(-1, Placement.identity()) if frame is None else self.frame(frame)
@@ -227,7 +227,7 @@ class Mechanism(ReprMixin):
         return replace(self, frames={**self.frames, name: added})
 
     def with_numeric_values(self, values: Mapping[str, float] | None = None) -> Mechanism:
-        """The mechanism with numbers in place of its parameters, which are then empty."""
+        """The mechanism with numbers in place of all parameters, nominal or from `values`; it has no parameters."""
         symbols, theta = self.parameters.symbols, self.parameters.vector(values)
 
         def number(expression: ca.SX) -> ca.SX:
@@ -237,7 +237,7 @@ class Mechanism(ReprMixin):
         return replace(mapped, parameters=Parameters())
 
     def with_inserted_joints(self, index: int, chain: Sequence[Joint]) -> Mechanism:
-        """The mechanism with a chain of joints inserted from an index on, to which nothing is attached yet.
+        """The mechanism with a chain of joints inserted at `index`; no other joint or frame is attached to it yet.
 
         The first joint's parent stands before `index`, every other one's is the one before it whatever it says.
         """
@@ -254,7 +254,7 @@ class Mechanism(ReprMixin):
 
 
 def map_expressions(description: Any, change: Callable[[ca.SX], ca.SX]) -> Any:
-    """A description, or several, with `change` applied to every expression; parameters are left as they are."""
+    """A model description with `change` applied to every symbolic expression in it, except its parameters."""
     if isinstance(description, ca.SX):
         return change(description)
     if isinstance(description, tuple):
@@ -279,7 +279,7 @@ def _fraction(name: str, said: str) -> float:
 
 
 def merge_bodies(bodies: Iterable[Inertia]) -> Inertia | None:
-    """One rigid body equal to several; None for no body or zero mass."""
+    """The rigid body equivalent to several rigidly connected bodies; None without bodies or for zero total mass."""
     entries = list(bodies)
     if not entries:
         return None

@@ -17,7 +17,7 @@ from yid_ocp.errors import ConfigError, nearest_name_hint
 
 @dataclass(frozen=True)
 class Parameter:
-    """One physical number of the model: nominal value and physical bounds, in the SI `unit`."""
+    """One physical parameter of the model: name, nominal value, SI unit, physical bounds and symbol."""
 
     name: str  # `owner.quantity`, for example `T1.bend`; for an effect `kind@location.quantity`
     value: float
@@ -40,7 +40,7 @@ class Parameter:
 
 
 class Parameters(ReprMixin):
-    """The ordered, immutable set of a model's parameters (unique names), which defines the order of `theta`."""
+    """Immutable sequence of a model's parameters with unique names; it defines the order of the vector `theta`."""
 
     def __init__(self, entries: Iterable[Parameter] = ()) -> None:
         self._entries = tuple(entries)
@@ -78,13 +78,13 @@ class Parameters(ReprMixin):
         return self._entries[self.index(name)]
 
     def index(self, name: str) -> int:
-        """Index of a parameter in `theta`; `ConfigError` with the nearest name where there is none."""
+        """Index of a parameter in `theta`; `ConfigError` with the nearest name if there is no such parameter."""
         if name not in self._index:
             raise ConfigError(f"there is no parameter '{name}'", hint=nearest_name_hint(name, self._index))
         return self._index[name]
 
     def vector(self, values: Mapping[str, float] | None = None) -> Array:
-        """Theta, shape (ntheta,), some nominal values replaced; `ConfigError` of an unknown name or no finite value."""
+        """Vector theta (ntheta,), nominal or from `values`; `ConfigError` for an unknown name or non-finite value."""
         theta = np.array([entry.value for entry in self._entries], dtype=float)
         for name, value in (values or {}).items():
             if not math.isfinite(value):
@@ -93,17 +93,17 @@ class Parameters(ReprMixin):
         return theta
 
     def with_nominal_values(self, values: Mapping[str, float]) -> Parameters:
-        """The same parameters (and symbols) with other nominal values."""
+        """The same parameters and symbols, with some nominal values replaced."""
         changed = list(self._entries)
         for name, value in values.items():
             changed[self.index(name)] = replace(self[name], value=float(value))
         return Parameters(changed)
 
     def with_added(self, *others: Iterable[Parameter]) -> Parameters:
-        """These parameters followed by others."""
+        """These parameters followed by those of `others`."""
         return Parameters([*self._entries, *(entry for other in others for entry in other)])
 
     def bounds(self, names: Sequence[str]) -> tuple[Array, Array]:
-        """Lower and upper bounds of the named parameters, two arrays of shape (len(names),)."""
+        """Lower and upper bounds of the named parameters, two arrays (len(names),)."""
         chosen = [self[name] for name in names]
         return np.array([e.lower for e in chosen], dtype=float), np.array([e.upper for e in chosen], dtype=float)

@@ -16,7 +16,7 @@ _SNAP_TOLERANCE = 1e-11
 
 
 def snap_near_integer_entries(matrix: Array) -> Array:
-    """The matrix with entries within `_SNAP_TOLERANCE` of -1, 0 and 1 replaced by these numbers."""
+    """The matrix with entries within `_SNAP_TOLERANCE` of -1, 0 or 1 rounded to these numbers."""
     result = np.array(matrix, dtype=float)
     for exact in (-1.0, 0.0, 1.0):
         result[np.abs(result - exact) < _SNAP_TOLERANCE] = exact
@@ -31,7 +31,7 @@ def homogeneous_transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll), the URDF convention [rad]."""
+    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) from angles [rad], the convention of URDF, shape (3, 3)."""
     cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
     x = [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr]
     y = [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr]
@@ -69,7 +69,7 @@ def symbolic_rotation_from_axis_angle(axis: Sequence[float], angle: ca.SX) -> ca
 
 
 def symbolic_rotation_from_rpy(roll: ca.SX, pitch: ca.SX, yaw: ca.SX | None = None) -> ca.SX:
-    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of symbolic angles [rad], shape (3, 3); without yaw Ry Rx."""
+    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll) of symbolic angles [rad], (3, 3); yaw is zero if absent."""
     about_x = symbolic_rotation_from_axis_angle((1.0, 0.0, 0.0), roll)
     turned = symbolic_rotation_from_axis_angle((0.0, 1.0, 0.0), pitch) @ about_x
     return ca.densify(turned if yaw is None else symbolic_rotation_from_axis_angle((0.0, 0.0, 1.0), yaw) @ turned)

@@ -100,7 +100,7 @@ MOTOR_PRESETS: Mapping[_MotorPreset, _DcMotorData] = {
 
 @dataclass(frozen=True)
 class MotorOptions:
-    """Kind of the motor that turns a servo's command into torque, and the preset with its published data."""
+    """Settings of a servo's motor: its kind, `ideal` or `dc`, and the preset with published data of a dc motor."""
 
     kind: Annotated[
         _MotorKind,
@@ -123,7 +123,7 @@ class MotorOptions:
 
 @dataclass(frozen=True)
 class RobotJointSpring:
-    """A spring 1/2 stiffness (q - rest)^2 on one robot joint [N m/rad, rad; N/m, m for a prismatic joint]."""
+    """Spring on a robot joint: stiffness [N m/rad, prismatic N/m] and rest position [rad, prismatic m]."""
 
     stiffness: float
     rest_position: float = 0.0
@@ -131,7 +131,7 @@ class RobotJointSpring:
 
 @dataclass(frozen=True)
 class PositionServoOptions:
-    """How position servos process commands; gains and limits are parameters such as JOINT.servo_gain."""
+    """Settings of all position servos: interpolation, gravity compensation, motor, firmware; gains are parameters."""
 
     command_interpolation: Annotated[
         _CommandInterpolation,
@@ -160,7 +160,7 @@ class PositionServoOptions:
 
 @dataclass(frozen=True)
 class PositionServo:
-    """A position servo on one joint, whose input is the commanded coordinate u.
+    """A position servo on one joint, which turns the commanded coordinate u into a torque.
 
         ideal:  torque = clip(gain (e + integral z) - damping dq/dt)
         dc:     torque = clip(gain (e + integral z) - derivative dq/dt) - damping dq/dt
@@ -184,7 +184,7 @@ class PositionServo:
     torque_constant: float | None = None  # published one of a dc motor [N m/A]
 
     def torque(self, command: ca.SX, q: ca.SX, v: ca.SX) -> ca.SX:
-        """The servo's torque for a command, a coordinate and its rate [N m or N]."""
+        """Torque [N m], or force [N], of the servo for a commanded coordinate, the coordinate q and its rate v."""
         on = command < MOTOR_OFF_COMMAND / 2
         error, drag = self.error(command, q), self.damping * v
         error = error if self.integral.is_zero() else error + self.integral
@@ -197,7 +197,7 @@ class PositionServo:
         return ca.if_else(on, torque, 0)
 
     def error(self, command: ca.SX, q: ca.SX) -> ca.SX:
-        """Error of a coordinate beyond the dead band, none while the motor is off [rad or m]."""
+        """Position error [rad or m] beyond the dead band; zero while the motor is off."""
         error = ca.if_else(command < MOTOR_OFF_COMMAND / 2, command, q) - q
         if self.dead_band.is_zero():
             return error
@@ -212,7 +212,7 @@ def _clipped(x: ca.SX, tightness: ca.SX) -> ca.SX:
 
 
 def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJointSpring) -> tuple[Parameter, Parameter]:
-    """Stiffness and rest position parameters of a spring on a robot joint."""
+    """Parameters `JOINT.stiffness` and `JOINT.rest` of a spring on a robot joint."""
     unit = tree.joints[tree.joint_index(joint)].coordinate_unit
     per = "N m/rad" if unit == "rad" else "N/m"
     return (
@@ -224,7 +224,7 @@ def stiffness_and_rest_parameters(tree: Mechanism, joint: str, spring: RobotJoin
 def build_joint_servos(
     tree: Mechanism, joints: Sequence[str], options: PositionServoOptions
 ) -> tuple[dict[str, PositionServo], list[Parameter]]:
-    """A servo on every named joint, and their parameters `JOINT.servo_gain`, `servo_damping`, ...
+    """Build a servo for every named joint; return them by joint, and parameters such as `JOINT.servo_gain`.
 
     They give the joint's effort limit at an error of `_DEFAULT_FULL_TORQUE_ERROR`. Of a direct-current motor
     `JOINT.servo_gain_factor` multiplies the gain: the firmware's, which recordings may state.
@@ -283,7 +283,7 @@ def _firmware_parameters(joint: Joint, terms: Sequence[_FirmwareTerm]) -> dict[_
 
 
 def mechanism_without_gravity(tree: Mechanism) -> Mechanism:
-    """The robot without gravity on its bodies, as when its controller compensates its own weight."""
+    """The robot with no gravity on its bodies, as if its controller compensated its weight."""
     joints = tuple(
         replace(joint, bodies=tuple(replace(body, gravity_fraction=ca.SX(0)) for body in joint.bodies))
         for joint in tree.joints

@@ -66,7 +66,7 @@ def _example_robot_urdf(robot: str) -> Path:
 
 
 def resolve_urdf_path(robot: str | Path) -> Path:
-    """Path of a robot's URDF file from its name in the settings; the file need not exist.
+    """Path of the URDF file for a robot's name in the settings; the file need not exist.
 
     The name is a file, `package:NAME` for a robot of example-robot-data, or `default:NAME.urdf` for a small mechanism
     that ships with this package; `ModelError` where there is no such robot.
@@ -99,7 +99,7 @@ def read_urdf(
     locked: Mapping[str, float] | None = None,
     exclude_links: Sequence[str] = (),
 ) -> Mechanism:
-    """A mechanism from a URDF file with the chosen joints kept and the others locked.
+    """Read a mechanism from a URDF file, with the chosen joints movable and all others locked.
 
     Each kept joint's bodies have the parameter `JOINT.mass` [kg] (inertia in proportion). Links without a kept joint
     above them are fixed to the world. Every link is a frame of its name.
@@ -424,7 +424,7 @@ def _unit_axis(joint: Any) -> Array:
 
 
 def mechanism_to_urdf(mechanism: Mechanism, values: Mapping[str, float] | None = None) -> str:
-    """URDF text of a mechanism: one link per joint with its bodies merged, named frames as links on fixed joints.
+    """URDF text of a mechanism: each joint's bodies become one link, each named frame a link on a fixed joint.
 
     Reading the text back with `read_urdf` gives the same numbers to 1e-12.
     """

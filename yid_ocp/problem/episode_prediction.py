@@ -56,7 +56,7 @@ class _Prepared:
 
 @dataclass(frozen=True)
 class EpisodePredictor:
-    """Predicts episodes: initial state, rollout, sensor readings and derivatives; stateless."""
+    """Predicts episodes with the model: initial state, rollout, sensor readings and derivatives; holds no state."""
 
     model_functions: ModelFunctions
     options: ProblemOptions
@@ -64,12 +64,12 @@ class EpisodePredictor:
 
     @property
     def step(self) -> Step:
-        """The compiled step."""
+        """The integrator step with which episodes are rolled out."""
         return self.model_functions.step
 
     @property
     def system(self) -> System:
-        """The step's system."""
+        """The system whose motion the step computes."""
         return self.model_functions.step.system
 
     # -- the start ----------------------------------------------------------------------------------------------------
@@ -86,7 +86,7 @@ class EpisodePredictor:
         )
 
     def episode_with_fitted_initial_state(self, episode: Episode, theta: Array) -> Episode:
-        """Episode with its initial state fitted to the first measured points, where the options ask for it."""
+        """The episode with its initial state fitted to the first measured points if `initial_state` asks for it."""
         if episode.fixed_initial_state is not None or self.options.initial_state != "fitted_to_points":
             return episode
         samples = episode.measurements
@@ -100,7 +100,7 @@ class EpisodePredictor:
         return replace(episode, fixed_initial_state=start)
 
     def theta_with_episode_values(self, episode: Episode, theta: Array) -> Array:
-        """Parameter vector theta with the episode's own values: known ones and those fitted with its initial state."""
+        """Vector theta with the episode's own values inserted: known ones and those fitted with its initial state."""
         start = episode.fixed_initial_state
         return self._with(theta, {**episode.known_parameters, **({} if start is None else start.fitted_parameters)})
 
@@ -113,7 +113,7 @@ class EpisodePredictor:
     def initial_state(
         self, episode: Episode, theta: Array, offset: Array, wanted: tuple[str, ...], guess: Array | None = None
     ) -> InitialState:
-        """Initial state of an episode's rollout and its derivative by (wanted parameters, offset).
+        """Initial state of an episode's rollout and its derivative with respect to (`wanted` parameters, `offset`).
 
         `theta` is that of `theta_with_episode_values`, `offset` that of an estimated initial state from equilibrium,
         and `guess` (n,) a configuration near the equilibrium; when absent `Episode.equilibrium_guess`, else that of
@@ -143,7 +143,7 @@ class EpisodePredictor:
         return InitialState(state, np.hstack([by_theta, by_offset]), rest, "")
 
     def uses_inputs_as_recorded(self, episode: Episode, theta: Array) -> bool:
-        """Whether no effect corrects the episode's inputs, times or tracked reference: none is free or non-neutral."""
+        """Whether all effects that correct the episode's inputs, times or tracked reference are neutral and fixed."""
         wanted = self.unknowns.free_parameters
         inputs = self.corrected_inputs(episode, theta, wanted)
         true = (inputs.torque, inputs.prescribed_path, inputs.driven_angles)
@@ -167,7 +167,7 @@ class EpisodePredictor:
     def inputs_with_reference_momentum_shift(
         self, episode: Episode, theta: Array, wanted: tuple[str, ...], state: Array, by_unknowns: Array | None = None
     ) -> CorrectedInputs:
-        """Corrected inputs of an episode, with the momentum shift of its tracking filter's reference.
+        """Inputs of an episode corrected by effects, with the momentum shift of its tracking filter's reference.
 
         `state` (nx,) is the initial one, `by_unknowns` (nx, d) its derivative by the parameters and its estimated part.
         """
@@ -181,7 +181,7 @@ class EpisodePredictor:
         return inputs.with_reference_momentum_shift(shift, recorded, measured, theta, wanted, by_internal)
 
     def corrected_inputs(self, episode: Episode, theta: Array, wanted: tuple[str, ...]) -> CorrectedInputs:
-        """Torques, angles and paths corrected by the effects on inputs, with derivatives by the parameters `wanted`."""
+        """Recorded torques, angles and paths corrected by effects, with derivatives with respect to `wanted`."""
         corrections = self.model_functions.input_corrections
         torque, arm, path = episode.torque, episode.measured_driven_angles, episode.prescribed_path
         nu, nc, errors = torque.shape[1], path.shape[1], episode.input_errors
@@ -223,13 +223,13 @@ class EpisodePredictor:
     def predict_episode(
         self, episode: Episode, theta: Array, offset: Array, derivatives: bool, guess: Array | None = None
     ) -> EpisodePrediction | str:
-        """Roll out one episode and predict its samples; returns an error message where that fails."""
+        """Roll out one episode and predict its samples; return the prediction, or an error message if it fails."""
         return self.predict_episodes([(episode, theta, offset, guess)], derivatives)[0]
 
     def predict_episodes(
         self, asked: Sequence[tuple[Episode, Array, Array, Array | None]], derivatives: bool
     ) -> list[EpisodePrediction | str]:
-        """Roll out several episodes, each given as (episode, theta, offset, guess), and predict their samples."""
+        """Predict several episodes, each given as (episode, theta, offset, guess); a failed one gives an error text."""
 
         def part(some: Sequence[tuple[Episode, Array, Array, Array | None]]) -> list[EpisodePrediction | str]:
             prepared = map_in_threads(lambda one: self._prepared(*one, derivatives), some)
@@ -307,7 +307,7 @@ class EpisodePredictor:
     def readings_along_trajectory(
         self, samples: Measurements, state: Array, by_state: Array, theta: Array
     ) -> tuple[Array, Array]:
-        """Sensor readings (M, k) along a trajectory (N + 1, nx), and their derivatives (M, k, d).
+        """Predicted sensor readings (M, k) along a trajectory (N + 1, nx), and their derivatives (M, k, d).
 
         `by_state` (N + 1, nx, d) are those of the trajectory, the first ones by the free parameters.
         """
@@ -316,7 +316,7 @@ class EpisodePredictor:
         return samples.interpolate_to_samples(y), samples.interpolate_to_samples(total)
 
     def node_values(self, rollout: Rollout) -> TimeGridStateValues:
-        """State values at all nodes of a rollout; the load is prescribed joints' effort and driven joints' torque."""
+        """State values at all nodes of a rollout; the load is effort (prescribed joints) or torque (driven joints)."""
         load = np.zeros((len(rollout.state), self.system.n_coordinates))
         load[:-1, list(self.system.prescribed_coordinate_indices)] = rollout.effort
         load[:-1, list(self.system.driven_coordinate_indices)] = rollout.torque
@@ -332,7 +332,7 @@ class EpisodePredictor:
         return None if found is None else (found[0] / self.step.time_step, found[1] / self.step.time_step)
 
     def delay_corrected_measurements(self, samples: Measurements, theta: Array) -> Measurements:
-        """Measurements moved earlier by the sensor's delay, to the times at which their readings were true."""
+        """Measurements shifted earlier by the sensor's delay at `theta`, to the times at which they were true."""
         late = self._delay_in_steps(samples, theta, ())
         return samples if late is None else samples.shifted_earlier_by(late[0])
 
@@ -346,7 +346,7 @@ class EpisodePredictor:
         return replace(rollout, effort=effort, effort_sensitivity=slope)
 
     def predicted_effort_smoother(self, episode: Episode, theta: Array) -> NodeSmoother | None:
-        """Smoother of predicted efforts of prescribed joints, the filter of the measured ones; None if not compared."""
+        """Smoother of predicted efforts, the same filter as for measured efforts; None if no efforts are compared."""
         compared = [samples for samples in episode.measurements if samples.sensor.effort_joints]
         if not math.isfinite(self.options.path_cutoff) or not compared:
             return None
@@ -401,7 +401,7 @@ class EpisodePredictor:
     def cost_gradient_by_adjoint(
         self, episode: Episode, result: EpisodePrediction, theta: Array, offset: Array, pulls: list[Array]
     ) -> Array:
-        """Gradient of a cost of an episode's predictions by its (shared, local, start) unknowns, by the adjoint.
+        """Gradient of a cost of an episode's predictions with respect to its (shared, local, start) unknowns.
 
         `result` is predicted at the same unknowns, `pulls` (M, k) are the cost's derivatives by every prediction.
         """
@@ -480,7 +480,7 @@ class _Trajectory:
 
 
 def with_seen_equilibrium_and_denoised_loads(predictor: EpisodePredictor, episode: Episode, theta: Array) -> Episode:
-    """Episode with the initial equilibrium nearest to its points and gear loads without effort noise, at a theta."""
+    """The episode with an initial equilibrium near its first points, and with gear loads freed of effort noise."""
     return _loaded(predictor, _at_rest(predictor, episode, theta), theta)
 
 

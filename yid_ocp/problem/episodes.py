@@ -50,7 +50,7 @@ from yid_ocp.sensors.joints import (
 
 @dataclass(frozen=True)
 class EpisodePrediction:
-    """Rollout of one episode from its equilibrium, its predicted sensor readings and their sensitivities."""
+    """Prediction of one episode: rollout, initial equilibrium, predicted sensor readings and sensitivities."""
 
     rollout: Rollout
     equilibrium: Equilibrium | None
@@ -63,7 +63,7 @@ class EpisodePrediction:
 
     @property
     def torque_correction_and_sensitivity(self) -> Array | None:
-        """`torque_correction` followed by the columns of its derivative where it is known, shape (N, nu, 1 + d)."""
+        """`torque_correction` and, if known, its derivative, in one array (N, nu, 1 + d); None without correction."""
         if self.torque_correction is None:
             return None
         known, slopes = self.torque_correction[:, :, None], self.torque_correction_sensitivity
@@ -72,7 +72,7 @@ class EpisodePrediction:
 
 @dataclass(frozen=True)
 class InitialState:
-    """Initial state of a rollout with its derivative, and what went wrong, if anything."""
+    """Initial state of a rollout with its derivative and equilibrium, and a message if it was not found."""
 
     state: Array  # (q, p, z), (nx,)
     state_sensitivity: Array  # by (wanted parameters, offset of the start), (nx, d)
@@ -88,7 +88,7 @@ _MIN_TORQUE_ERROR_FRACTION = 1e-3
 
 @dataclass(frozen=True)
 class InputErrorModel:
-    """Noise levels and current estimates of the torque and angle errors that drive one recording's rollout.
+    """Noise levels and current estimates of the errors of recorded torques and angles that drive a rollout.
 
     The torque is off by w in a step and by b throughout [N m], the angles by v [rad].
     """
@@ -109,24 +109,24 @@ class InputErrorModel:
 
     @property
     def estimated_torque_error(self) -> Array:
-        """Estimated recorded minus true torque in every step, constant offset plus noise, shape (N, nu) [N m]."""
+        """Estimated torque error, recorded minus true, in every step: constant offset plus noise, (N, nu) [N m]."""
         return self.torque_bias + self.torque_noise
 
     @property
     def remaining_torque_error_after_effects(self) -> Array:
-        """Part of the torque error still to be subtracted after effects on torques apply, shape (N, nu) [N m]."""
+        """Part of the torque error that remains to be subtracted once effects on torques apply, (N, nu) [N m]."""
         return self.estimated_torque_error - self.transmitted_torque_noise
 
     @property
     def with_torque_bias_only(self) -> InputErrorModel:
-        """The same errors with the torques' constant offset alone: noise and smoothed reference are dropped."""
+        """The same errors with only the torques' constant offset: without torque noise and smoothed reference."""
         none = np.zeros_like(self.torque_noise)
         return replace(
             self, torque_noise=none, recorded_torque_noise=none, transmitted_torque_noise=none, smoothed_reference=None
         )
 
     def on_finer_steps(self, ratio: int) -> InputErrorModel:
-        """The same errors with `ratio` steps in place of each, its torques held and the reference interpolated."""
+        """The same errors with each step divided into `ratio` steps: torques held, the reference interpolated."""
         held = ("sample_of_step", "torque_noise", "recorded_torque_noise", "transmitted_torque_noise")
         made: dict[str, Any] = {name: np.repeat(getattr(self, name), ratio, axis=0) for name in held}
         if (known := self.smoothed_reference) is not None:
@@ -178,7 +178,7 @@ def _recorded_input_errors(
 
 @dataclass(frozen=True)
 class Episode:
-    """One recording placed on the nodes of a rollout: inputs, measurements, tracking filter, input errors."""
+    """One recording on the time grid of a rollout: inputs, measurements, tracking filter and input errors."""
 
     recording: Recording
     grid: TimeGrid
@@ -201,24 +201,24 @@ class Episode:
 
     @property
     def feedback_about_smoother_estimate(self) -> TrackingFeedback | None:
-        """Tracking filter whose reference is the motion that the Kalman smoother estimated, as measured without one."""
+        """Tracking filter with the Kalman smoother's estimate as its reference, or unchanged without a smoother."""
         if self.tracking_feedback is None or self.input_errors is None or self.input_errors.smoothed_reference is None:
             return self.tracking_feedback
         return replace(self.tracking_feedback, reference=self.input_errors.smoothed_reference)
 
     @property
     def has_uncertain_sensor_biases(self) -> bool:
-        """Whether a sensor may have a constant error over the recording, which counts as noise."""
+        """Whether a sensor has a constant error of unknown size over the recording, which is treated as noise."""
         return any(np.any(samples.bias_std > 0) for samples in self.measurements)
 
     @property
     def name(self) -> str:
-        """Name of the recording."""
+        """Name of the episode's recording."""
         return self.recording.name
 
 
 def prepare_episode(functions: ModelFunctions, recording: Recording, options: ProblemOptions, theta: Array) -> Episode:
-    """Place a recording on the nodes of a rollout: torques, paths, joint coordinates, samples, tracking filter.
+    """Prepare an episode: place a recording's inputs and measurements on the nodes of a rollout's time grid.
 
     At the nominal parameters `theta` encoder noise is converted to effort and the filter's gains are computed.
     `DataError` where the recording does not fit the model, is too short, or states no noise level.
@@ -270,7 +270,7 @@ def _tracked(episode: Episode, functions: ModelFunctions, options: ProblemOption
 
 
 def truncate_episode(episode: Episode, steps: int) -> Episode:
-    """Truncate an episode to its first steps and the measurements in them."""
+    """The episode truncated to its first `steps` steps and the measurements in them."""
     steps = min(steps, episode.grid.steps)
     samples = []
     for entry in episode.measurements:
@@ -294,7 +294,7 @@ def truncate_episode(episode: Episode, steps: int) -> Episode:
 
 
 def mass_matrix_diagonal_at_zero(step: Step, theta: Array, names: tuple[str, ...]) -> Array:
-    """Mass matrix diagonal of the named joints at the zero configuration, shape (k,) [kg m^2 or kg]."""
+    """Diagonal entries of the mass matrix for the named joints at zero configuration, (k,) [kg m^2 or kg]."""
     sizes = step.sizes
     n, zero = sizes["n"], np.zeros
     state = [zero(n), zero(n), zero(n), zero(sizes["nz"]), zero(sizes["nz"]), zero(sizes["m"]), zero(sizes["nu"])]

@@ -53,7 +53,7 @@ _HELD_OUT_ITERATIONS = 3
 
 
 class EstimationProblem(ReprMixin):
-    """Estimation of free parameters from recordings: residual, cost and derivatives; immutable and thread-safe.
+    """Problem of estimating free parameters from recordings: residual, cost, derivatives; immutable, thread-safe.
 
     It evaluates the cost, predicts held-out recordings, and derives problems with other parameters, data, options or
     whitening filters; `inference.whitening` makes these filters.
@@ -173,7 +173,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def initial_unknowns(self) -> Array:
-        """Initial guess of the unknown vector, shape (nx,)."""
+        """Initial value of the unknown vector, shape (nx,): initial parameter values and zero state offsets."""
         index, parts = self.system.parameters.index, (self.shared_parameters, self.local_parameters)
         shared, local = ([self.theta[index(name)] for name in part] for part in parts)
         offset = np.zeros(len(self.unknowns.initial_state_names))
@@ -181,7 +181,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the unknown vector."""
+        """Lower and upper bounds of the unknown vector, two arrays (nx,)."""
         parts = (self.shared_parameters, self.local_parameters)
         (low, high), (own_low, own_high) = (self.system.parameters.bounds(part) for part in parts)
         wide = initial_state_offset_limits(self.system, self.unknowns.initial_state_names)
@@ -190,7 +190,7 @@ class EstimationProblem(ReprMixin):
 
     @property
     def unknown_scales(self) -> Array:
-        """Typical size of each unknown: its initial value, its prior's standard deviation, or a tenth of its range."""
+        """Typical size of each unknown: its initial value, or if that is 0 its prior's std or a tenth of its range."""
         lower, upper = self.bounds
         size = np.abs(self.initial_unknowns)
         width = np.where(np.isfinite(upper - lower), upper - lower, 10.0)
@@ -199,12 +199,12 @@ class EstimationProblem(ReprMixin):
 
     @property
     def positive_unknowns_mask(self) -> BoolArray:
-        """Mask of unknowns that must be positive and have a positive initial value, shape (nx,)."""
+        """Mask (nx,) of unknowns with a nonnegative lower bound and a positive initial value."""
         return (self.bounds[0] >= 0) & (self.initial_unknowns > 0)
 
     @property
     def rms_noise_of_data_residuals(self) -> float:
-        """One number for the noise of all data residuals: 1 where they are whitened, else the points' RMS noise [m]."""
+        """RMS noise of all data residuals: 1 if they are whitened; with the paper's weights that of the points [m]."""
         if self.options.weighting != "paper":
             return 1.0
         found = [s.std[np.isfinite(s.std)] for episode in self.episodes for s in episode.measurements]
@@ -212,28 +212,28 @@ class EstimationProblem(ReprMixin):
 
     @property
     def initial_state_prior_std(self) -> Array:
-        """Prior standard deviation of each estimated component of an initial state."""
+        """Prior standard deviations of the estimated components of an initial state, as in `initial_state_names`."""
         at = len(self.unknowns.free_parameters)
         return self._prior_std[at : at + len(self.unknowns.initial_state_names)]
 
     @property
     def uses_inputs_as_recorded(self) -> bool:
-        """Whether no effect corrects recorded inputs, times or the tracked reference: none is free or non-neutral."""
+        """Whether all effects that correct recorded inputs, times or tracked references are neutral and fixed."""
         return all(self.predictor.uses_inputs_as_recorded(episode, self.theta) for episode in self.episodes)
 
     # -- the unknown vector -------------------------------------------------------------------------------------------
 
     def theta_and_initial_state_offset(self, x: ArrayLike, episode: int) -> tuple[Array, Array]:
-        """Return theta and the initial state offset of one episode from the unknown vector."""
+        """Extract theta and the initial state offset of episode number `episode` from the unknown vector."""
         return self.unknowns.theta_and_initial_state_offset(x, episode, self.theta, self.system)
 
     def vector(self, values: Mapping[str, float]) -> Array:
-        """Initial unknown vector with named entries replaced, clipped to the bounds, shape (nx,)."""
+        """Initial unknown vector (nx,) with the entries in `values` replaced, clipped to the bounds."""
         start = self.named_values(self.initial_unknowns)
         return np.clip([values.get(name, value) for name, value in start.items()], *self.bounds)
 
     def named_values(self, x: Array) -> dict[str, float]:
-        """Unknown vector as a dictionary of name to value."""
+        """Values of the unknown vector `x` by unknown name."""
         return dict(zip(self.unknown_names, map(float, x), strict=True))
 
     # -- evaluation ---------------------------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ class EstimationProblem(ReprMixin):
     def evaluate(
         self, x: ArrayLike, derivatives: bool = True, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> Evaluation:
-        """Residual, cost and, where asked for, Jacobian at an unknown vector.
+        """Evaluate residual, cost and, with `derivatives`, Jacobian at an unknown vector.
 
         `ok` is False, with the reason, where an equilibrium or a rollout failed. `equilibrium_guesses` of a nearby
         point's evaluation shorten the search for least energy.
@@ -276,7 +276,7 @@ class EstimationProblem(ReprMixin):
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Return the cost and its gradient by the adjoint; with process noise by forward sensitivities.
+        """Return the cost, its gradient and the evaluation; by the adjoint, or with process noise by sensitivities.
 
         An `evaluation` at `x` that is known already saves the rollout, most of the work; it is returned, without a
         Jacobian.
@@ -304,7 +304,7 @@ class EstimationProblem(ReprMixin):
         return evaluation.cost, gradient + prior_jacobian.T @ prior, evaluation
 
     def prior_residual_and_jacobian(self, x: Array) -> tuple[Array, Array]:
-        """Return the residual of the stated and weak priors, and its Jacobian by the unknowns."""
+        """Return the residual of the stated and weak priors, and its Jacobian with respect to the unknowns."""
         stated, weak, start = self._stated, self._weak, self.initial_unknowns
         rows = np.vstack([stated, np.zeros((len(weak), len(x)))])
         spread = np.log(max(self.options.weak_prior_std_as_factor, 1.0 + 1e-9))
@@ -315,7 +315,7 @@ class EstimationProblem(ReprMixin):
     def initial_state(
         self, episode: Episode, theta: Array, offset: Array | None = None, guess: Array | None = None
     ) -> InitialState:
-        """Initial state of an episode with its derivative by (free parameters, offset of an estimated start from rest).
+        """Initial state of an episode, with derivative with respect to (free parameters, offset from equilibrium).
 
         `guess` (n,) is a configuration near the equilibrium.
         """
@@ -328,7 +328,7 @@ class EstimationProblem(ReprMixin):
     def predict_held_out(
         self, x: ArrayLike, derivatives: bool = False
     ) -> list[tuple[Episode, EpisodePrediction | str]]:
-        """Predict the held-out recordings with the shared parameters of `x`; local ones keep their initial value.
+        """Predict the held-out recordings with the shared parameters in `x` and initial values of local ones.
 
         Returns each episode, with its fitted initial state where it has one, and its prediction or an error message.
         An `estimated` initial state is found from the first moments and its prior. Derivatives are by
@@ -338,7 +338,7 @@ class EstimationProblem(ReprMixin):
         return [(asked[0], predict(*asked, derivatives)) for asked in self.held_out_prediction_inputs(x)]
 
     def held_out_prediction_inputs(self, x: ArrayLike) -> list[tuple[Episode, Array, Array]]:
-        """For each held-out recording: episode with fitted initial state, theta, and estimated initial state offset."""
+        """Inputs of each held-out prediction: episode with fitted initial state, theta, and estimated state offset."""
         x = np.asarray(x, float)
         theta, found = self.held_out_theta(x), []
         for held in self.held_out:
@@ -353,7 +353,7 @@ class EstimationProblem(ReprMixin):
         return found
 
     def held_out_theta(self, x: Array) -> Array:
-        """Parameter vector theta with the shared parameters of `x`; local parameters keep their initial value."""
+        """Vector theta with the shared parameters in `x`; local parameters keep their initial values."""
         theta, _ = self.theta_and_initial_state_offset(x, 0)
         for name in self.local_parameters:
             theta[self.system.parameters.index(name)] = self.theta[self.system.parameters.index(name)]
@@ -364,7 +364,7 @@ class EstimationProblem(ReprMixin):
     def simulate_recording(
         self, values: Mapping[str, float] | None = None, recording: int = 0, seed: int | None = None
     ) -> Recording:
-        """Simulate a synthetic recording with other parameters and the inputs of one of the recordings.
+        """Simulate a synthetic recording with the inputs of one recording and, if given, other parameter values.
 
         Parameters
         ----------
@@ -386,11 +386,11 @@ class EstimationProblem(ReprMixin):
     # -- problems like this one ---------------------------------------------------------------------------------------
 
     def with_compiled_parameters_free(self, names: Sequence[str]) -> EstimationProblem:
-        """The same problem with other free parameters among `free` and `may_free`; shares the compiled functions."""
+        """The same problem with other free parameters out of `free` and `may_free`; compiled functions are shared."""
         return self._changed(free=tuple(names))
 
     def with_parameter_values(self, values: Mapping[str, float]) -> EstimationProblem:
-        """The same problem with other initial values of free and values of fixed parameters; filters are unchanged."""
+        """The same problem with other values of fixed and initial values of free parameters; filters are kept."""
         theta = self.theta.copy()
         for name, value in values.items():
             theta[self.system.parameters.index(name)] = value
@@ -403,26 +403,26 @@ class EstimationProblem(ReprMixin):
         whitening_filters: Sequence[ResidualWhitener | None] = (),
         held_out_whitening_filters: Sequence[ResidualWhitener | None] = (),
     ) -> EstimationProblem:
-        """The same problem on other episodes of its model, whitened by sensor noise alone without filters."""
+        """The same problem on other episodes; without given filters, residuals are whitened by sensor noise alone."""
         filters = {"whitening_filters": whitening_filters, "held_out_whitening_filters": held_out_whitening_filters}
         changes = {"episodes": episodes, "held_out": held_out, **filters}
         return self._changed(**{name: tuple(value) for name, value in changes.items()})
 
     @property
     def has_process_noise(self) -> bool:
-        """Whether errors of recorded torques or angles act as process noise in any recording."""
+        """Whether errors of recorded torques or angles act as process noise in at least one recording."""
         return any(episode.input_errors is not None for episode in self.episodes)
 
     def whitened_held_out_residual(self, i: int, episode: Episode, result: EpisodePrediction) -> ResidualAndJacobian:
-        """Whitened residual of held-out recording `i` from `predict_held_out`, without a robust loss."""
+        """Whitened residual of a prediction of held-out recording `i` (`predict_held_out`), without a robust loss."""
         return whitened_episode_residual(episode, self.held_out_whitening_filters[i], result, np.inf)
 
     def truncated_to_duration(self, duration: float) -> EstimationProblem:
-        """The same problem on the first `duration` seconds of each recording, rebuilt without held-out recordings."""
+        """The same problem on the first `duration` [s] of each recording, rebuilt without held-out recordings."""
         return self._prepared(options=replace(self.options, duration=duration), held_out=())
 
     def with_time_step(self, time_step: float) -> EstimationProblem:
-        """The same problem with another time step [s], not whitened and without held-out recordings.
+        """The same problem with another time step [s], without whitening filters and held-out recordings.
 
         Initial states, guesses of equilibria and loads on gears are those of this problem.
         """
@@ -439,11 +439,11 @@ class EstimationProblem(ReprMixin):
         return self._changed(model_functions=functions).with_episodes(list(map(placed, self.episodes)), ())
 
     def with_options(self, options: ProblemOptions) -> EstimationProblem:
-        """The same problem rebuilt with other options."""
+        """The same problem, prepared anew from its recordings with other options."""
         return self._prepared(options=options)
 
     def with_free_parameters(self, free: Sequence[str], values: Mapping[str, float] | None = None) -> EstimationProblem:
-        """The same problem rebuilt with other free parameters and values."""
+        """The same problem, prepared anew with other free parameters and, if given, other parameter values."""
         options = replace(
             self.options,
             local_parameters=tuple(name for name in self.options.local_parameters if name in free),

@@ -25,15 +25,15 @@ EquilibriumGuesses = tuple[Array | None, ...]
 
 
 class ResidualWhitener(Protocol):
-    """Frozen Kalman filter that whitens one recording's residual, process noise included (`inference.whitening`)."""
+    """Interface of a Kalman filter with fixed gains that whitens one recording's residual, with process noise."""
 
     @property
     def input_errors(self) -> InputErrorModel:
-        """Stds of torque and angle errors, and the torque errors about which the filter is linearized."""
+        """Standard deviations of torque and angle errors, and the errors about which the filter is linearized."""
         ...
 
     def whiten(self, rows: Array, push: Array | None) -> tuple[Array, Array]:
-        """Whitened residual and derivatives (r, c), and the estimated constant torque errors (nu, c) [N m].
+        """Whiten residual and derivatives; return them (r, c) and estimated constant torque errors (nu, c) [N m].
 
         Of `rows` (r, c), a residual in units of the sensors' noise and columns of its derivative, and `push`
         (N, nu, c), the tracking filter's correction of the torque and its derivative [N m].
@@ -43,7 +43,7 @@ class ResidualWhitener(Protocol):
 
 @dataclass(frozen=True)
 class ResidualVectorLayout:
-    """Layout of the residual vector as slices: measurements of all episodes, then stated priors, then weak priors."""
+    """Slices of the residual vector: measurements of all episodes, then stated priors, then weak priors."""
 
     measurements: tuple[tuple[slice, ...], ...]  # of every episode, of every group in it
     data: slice
@@ -52,12 +52,12 @@ class ResidualVectorLayout:
 
     @property
     def slice_without_weak_priors(self) -> slice:
-        """Slice of the data and the stated priors, without the weak priors."""
+        """Slice of the residual vector with data and stated priors, without weak priors."""
         return slice(0, self.stated_priors.stop)
 
     @staticmethod
     def from_episodes(episodes: Sequence[Episode], stated: int, weak: int) -> ResidualVectorLayout:
-        """Layout from the episodes' measurements and the numbers of stated and weak priors."""
+        """Build the layout from the episodes' measurements and the numbers of stated and weak priors."""
         at, groups = 0, []
         for episode in episodes:
             own = []
@@ -71,7 +71,7 @@ class ResidualVectorLayout:
 
 @dataclass(frozen=True, repr=False)
 class Evaluation(ReprMixin):
-    """Cost, residual and optional Jacobian of an estimation problem at one unknown vector."""
+    """Result of evaluating an estimation problem at one unknown vector: cost, residual, Jacobian, predictions."""
 
     cost: float  # 1/2 |r|^2, or the robust loss; infinite where the rollout failed
     residual: Array  # (nr,)
@@ -87,7 +87,7 @@ class Evaluation(ReprMixin):
 
     @property
     def equilibrium_guesses(self) -> EquilibriumGuesses:
-        """Guesses of the initial equilibria for evaluating a nearby point."""
+        """Initial equilibrium of each episode, as a guess for evaluating a nearby point."""
         return tuple(result.equilibrium_guess for result in self.episode_predictions)
 
 
@@ -114,7 +114,7 @@ def _sensor_whitened_residual(
 def whitened_episode_residual(
     episode: Episode, whitening: ResidualWhitener | None, result: EpisodePrediction, threshold: float
 ) -> ResidualAndJacobian:
-    """Whitened residual of one episode: by sensor noise, or by the frozen Kalman filter where one is given.
+    """Whitened residual of one episode, by sensor noise or by the Kalman filter `whitening` if it is given.
 
     Constant sensor errors count as noise, see `whitened_for_sensor_biases`.
     """

@@ -39,7 +39,7 @@ _TRIALS_PER_PARAMETER = 4
 
 @dataclass(frozen=True)
 class FixedInitialState:
-    """Initial state that is given or fitted to the first measured points, independent of the unknowns."""
+    """Initial state, given or fitted to the first measured points, that does not depend on the unknowns."""
 
     state: Array  # (q, p, z) at node 0, (nx,)
     fitted_parameters: Mapping[str, float] = field(default_factory=dict)  # along with it, in their units
@@ -58,7 +58,7 @@ class _Task:
 
 
 class InitialStateFitter:
-    """Fits an initial state, and optionally parameters, to the first measured points of an episode.
+    """Solver that fits an initial state, and optionally parameters, to the first measured points of an episode.
 
     Minimises, by Gauss-Newton over q (and the parameters asked for) at the first frame,
 
@@ -111,7 +111,7 @@ class InitialStateFitter:
         *,
         roughly: bool = False,
     ) -> FixedInitialState:
-        """Fit the configuration to the points of the first frame and the momentum to their change within the window.
+        """Fit configuration and momentum to the first frame's points and their change within the window.
 
         Given are driven, then prescribed coordinates at node 0 (nk,), samples, of which only points are used, how far
         from the start frames may be used [s], and the prescribed coordinates at all nodes (N + 1, nc). `roughly` finds

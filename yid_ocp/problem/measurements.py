@@ -24,7 +24,7 @@ _MAX_STEPS_PER_SAMPLE = 500  # on average; a clock in milliseconds read as secon
 
 @dataclass(frozen=True)
 class TimeGrid:
-    """Uniform time grid of a rollout: t_k = start + k time_step, k = 0..steps."""
+    """Uniform time grid of a rollout: t_k = start_time + k time_step [s], k = 0..steps."""
 
     start_time: float
     time_step: float
@@ -32,11 +32,11 @@ class TimeGrid:
 
     @property
     def node_times(self) -> Array:
-        """Times of all nodes, shape (steps + 1,) [s]."""
+        """Times [s] of all nodes, shape (steps + 1,)."""
         return np.asarray(self.start_time + self.time_step * np.arange(self.steps + 1), dtype=float)
 
     def node_and_fraction(self, t: ArrayLike) -> tuple[IntArray, Array]:
-        """Return the node before each time and the fraction of a step after it, to within 1e-6 of a step."""
+        """Return the node before each time and the fraction of a step after that node, to within 1e-6 of a step."""
         position = (np.asarray(t, float) - self.start_time) / self.time_step
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-6, near, position)
@@ -68,7 +68,7 @@ ResidualWeighting = Literal["whitened", "paper"]
 
 @dataclass(frozen=True)
 class ResidualAndJacobian:
-    """One block of a residual: robust cost, weighted residual and Jacobian."""
+    """One block of the residual vector: its cost, residual, Jacobian and factors of the robust loss."""
 
     cost: float  # half the sum of squares, or Huber's loss
     residual: Array  # (nr,)
@@ -78,7 +78,7 @@ class ResidualAndJacobian:
 
 @dataclass(frozen=True)
 class Measurements:
-    """M samples of the k outputs of one sensor, between the nodes of a rollout, with weights and noise levels."""
+    """M samples of a sensor's k outputs, located between the nodes of a rollout, with weights and noise levels."""
 
     sensor: Sensor
     node: IntArray  # before each sample, (M,), or (M, k) where outputs are late by different times
@@ -92,12 +92,12 @@ class Measurements:
 
     @property
     def output_channel_names(self) -> tuple[str, ...]:
-        """Channel name of each of the k outputs."""
+        """Name of the channel that each of the k outputs belongs to."""
         return tuple(channel for channel in self.sensor.channel_names for _ in range(self.sensor.outputs_per_channel))
 
     @property
     def evaluation_nodes(self) -> IntArray:
-        """Nodes at which the sensor function must be evaluated, sorted."""
+        """Sorted indices of the nodes at which the sensor must be predicted to interpolate at the samples."""
         if self.node.ndim > 1:
             # with the neighbours that a slope needs
             low = int(self.node.min(initial=self.predictable_nodes[1]))
@@ -113,12 +113,12 @@ class Measurements:
 
     @property
     def n_residuals(self) -> int:
-        """Number of residuals that the measurements yield."""
+        """Number of scalar residuals of the measurements, one per used output."""
         return int(np.count_nonzero(self.weight > 0))
 
     @cached_property
     def output_decorrelation_matrix(self) -> scipy.sparse.csr_array | None:
-        """Matrix R^(-1/2) that decorrelates normalized residuals, shape (nr, nr); None without correlation.
+        """Matrix R^(-1/2), (nr, nr), that decorrelates normalized residuals; None if outputs are independent.
 
         R is the noise correlation of one sample's outputs; zero-phase (ZCA) whitening (Kessy, Lewin and Strimmer 2018,
         doi:10.1080/00031305.2016.1277159).
@@ -134,18 +134,18 @@ class Measurements:
         return scipy.sparse.csr_array((blocks[together], (row, column)), shape=(self.n_residuals, self.n_residuals))
 
     def decorrelate(self, rows: Any) -> Any:
-        """Decorrelate rows normalized by their standard deviations, shape (nr,) or (nr, d), dense or sparse."""
+        """Decorrelate rows (nr,) or (nr, d), dense or sparse, already divided by their standard deviations."""
         return rows if self.output_decorrelation_matrix is None else self.output_decorrelation_matrix @ rows
 
     def whitened_residual(self, predicted: Array) -> Array:
-        """Whitened residual, prediction minus measurement, zero where nothing was measured, shape (M, k)."""
+        """Whitened residual (M, k), prediction minus measurement; zero where nothing was measured."""
         plain = np.asarray(self.weight * np.where(self.weight > 0, predicted - self.value, 0.0))
         if self.output_decorrelation_matrix is not None:
             plain[self.used_output_mask] = self.output_decorrelation_matrix @ plain[self.used_output_mask]
         return plain
 
     def whitened_residual_adjoint(self, pull: Array) -> Array:
-        """Adjoint of `whitened_residual`: cost derivative by the prediction from that by the residual, shape (M, k)."""
+        """Adjoint of `whitened_residual`: maps a cost's gradient (M, k) by residual to the gradient by prediction."""
         if self.output_decorrelation_matrix is not None:
             pull = pull.copy()
             pull[self.used_output_mask] = self.output_decorrelation_matrix.T @ pull[self.used_output_mask]
@@ -154,7 +154,7 @@ class Measurements:
     def residual_and_jacobian(
         self, predicted: Array, slopes: Array | None = None, threshold: float = math.inf
     ) -> ResidualAndJacobian:
-        """Residual block with weights of Huber's loss and, with slopes of the prediction (M, k, d), its Jacobian."""
+        """Residual block with Huber weights and, if the prediction's slopes (M, k, d) are given, its Jacobian."""
         raw = self.whitened_residual(predicted)
         cost, factor = huber_loss_and_residual_factors(raw, threshold)
         seen, jacobian = self.used_output_mask, None
@@ -164,7 +164,7 @@ class Measurements:
         return ResidualAndJacobian(cost, robust * raw[seen], jacobian, robust)
 
     def shifted_earlier_by(self, steps: Array) -> Measurements:
-        """The same samples moved earlier by each output's delay, shape (k,) [steps], within the predictable nodes."""
+        """The same samples, shifted earlier by each output's delay (k,) [steps] and clipped to predictable nodes."""
         position = np.clip((self.node + self.fraction)[:, None] - steps, *self.predictable_nodes)
         near = np.rint(position)
         position = np.where(np.abs(position - near) < 1e-9, near, position)
@@ -173,7 +173,7 @@ class Measurements:
         return replace(self, node=node, fraction=position - node)
 
     def prediction_rate_per_step(self, at_nodes: Array, unmoved: Measurements, steps: Array) -> Array:
-        """Rate of change of a prediction per step for delayed samples, shape (M, k); at a node the mean of both sides.
+        """Change of a prediction per step at delayed samples, (M, k); at a node the mean of both adjacent steps.
 
         `at_nodes` (len(nodes), k) is the prediction, `unmoved` the measurements before the delay of `steps` (k,).
         """
@@ -192,7 +192,7 @@ class Measurements:
         return np.where((position < first - 1e-9) | (position > last + 1e-9), 0.0, rate)
 
     def interpolate_to_samples(self, at_nodes: Array) -> Array:
-        """Interpolate values at `evaluation_nodes`, shape (len(nodes), ...), to the samples, shape (M, ...)."""
+        """Interpolate values at `evaluation_nodes`, (len(nodes), ...), linearly to the samples, (M, ...)."""
         nodes = self.evaluation_nodes
         column = () if self.node.ndim == 1 else (np.arange(at_nodes.shape[1]),)
         before = at_nodes[(np.searchsorted(nodes, self.node), *column)]
@@ -201,7 +201,7 @@ class Measurements:
         return np.where(fraction > 0, (1 - fraction) * before + fraction * after, before)
 
     def interpolation_adjoint(self, at_samples: Array) -> Array:
-        """Transpose of `interpolate_to_samples`, shape (M, ...) to (len(nodes), ...)."""
+        """Transpose of the linear map `interpolate_to_samples`: values (M, ...) to (len(nodes), ...)."""
         nodes = self.evaluation_nodes
         result = np.zeros((len(nodes), *at_samples.shape[1:]))
         fraction = self.fraction.reshape(*self.fraction.shape, *([1] * (at_samples.ndim - self.fraction.ndim)))
@@ -218,7 +218,7 @@ class Measurements:
 
 
 def locate_measurements_on_grid(data: SensorData, grid: TimeGrid, where: str) -> Measurements:
-    """Locate a sensor's data on the nodes of a rollout; raises `DataError` where a noise level is not positive."""
+    """Locate a sensor's samples between the nodes of a rollout; `DataError` if a noise level is not positive."""
     seen = np.isfinite(data.value)
     if np.any(seen & ~(data.std > 0)):
         what, allowed = "a noise level is zero or missing", "a positive standard deviation"
@@ -233,7 +233,7 @@ def locate_measurements_on_grid(data: SensorData, grid: TimeGrid, where: str) ->
 
 
 def measurements_with_paper_weights(samples: Measurements, grid: TimeGrid) -> Measurements:
-    """Measurements with the source paper's weights: 1 at the nearest node, 0 at k = 0, the last node counted twice.
+    """The measurements at nearest nodes with the source paper's weights: 0 at k = 0, double at the last node, else 1.
 
     J = sum_{k=1..N} 1/2 sigma_k |w_k - wbar_k|^2 + 1/2 |w_N - wbar_N|^2 for measured points [m^2].
     """
@@ -246,7 +246,7 @@ def measurements_with_paper_weights(samples: Measurements, grid: TimeGrid) -> Me
 
 
 def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[float, Array]:
-    """Return the Huber loss of whitened residuals, sum rho(r), and factors for weighted least squares, sqrt(rho'(r)/r).
+    """Return the Huber loss sum rho(r) of whitened residuals, and least-squares factors sqrt(rho'(r)/r).
 
     Beyond `scale` the loss grows linearly [standard deviations]; infinite for plain squares.
     """
@@ -259,7 +259,7 @@ def huber_loss_and_residual_factors(residual: Array, scale: float) -> tuple[floa
 
 
 def whitened_for_sensor_biases(slopes: Array, columns: Array) -> Array:
-    """Columns (a residual, its derivatives), (r, c), whitened by sensor noise and constant sensor errors.
+    """Whiten a residual and its derivatives, columns (r, c) in units of noise, by constant sensor errors too.
 
     `slopes` (r, m) are the sensitivities of residuals of unit variance to errors of unit variance.
     """
@@ -268,13 +268,13 @@ def whitened_for_sensor_biases(slopes: Array, columns: Array) -> Array:
 
 
 def estimated_constant_errors(slopes: Array, residual: Array) -> Array:
-    """Constant errors (m,), measured minus true, of a residual, prediction minus measurement; `slopes` as above."""
+    """Constant sensor errors (m,), measured minus true, from a residual and its `slopes` (r, m), all in std units."""
     left, size, right = np.linalg.svd(slopes, full_matrices=False)
     return np.asarray(-right.T @ ((size / (1 + size**2)) * (left.T @ residual)))
 
 
 def whitened_sensitivities_to_unit_biases(samples: Sequence[Measurements]) -> Array:
-    """Derivatives of whitened measurements by constant sensor errors of one standard deviation, shape (r, m).
+    """Derivatives (r, m) of whitened measurements with respect to constant sensor errors of unit variance.
 
     Those of the residual, prediction minus measurement, have the opposite sign.
     """
@@ -290,7 +290,7 @@ def whitened_sensitivities_to_unit_biases(samples: Sequence[Measurements]) -> Ar
 
 
 def subtract_estimated_biases(samples: Sequence[Measurements], predicted: Sequence[Array]) -> tuple[Measurements, ...]:
-    """Measurements minus their constant errors as estimated from a prediction, with zero `bias_std`.
+    """Measurements minus their constant errors, which are estimated from a prediction; their `bias_std` is zero.
 
     `predicted` has the shape (M, k) for each.
     """

@@ -27,7 +27,7 @@ from yid_ocp.sensors import Sensor, sensor_reading_function
 
 @dataclass(frozen=True)
 class CorrectedInputs:
-    """True inputs of a rollout, with derivatives (..., d) by d parameters; a derivative that is zero is None."""
+    """Inputs of a rollout corrected by effects, with derivatives (..., d) along d parameters (None: zero)."""
 
     torque: Array  # (N, nu) [N m]
     first_torque: Array  # of the initial equilibrium, (nu,) [N m]
@@ -42,11 +42,11 @@ class CorrectedInputs:
 
     @property
     def initial_known_coordinates(self) -> Array:
-        """Coordinates of driven, then prescribed joints at node 0, shape (nk,)."""
+        """Coordinates of the driven, then the prescribed joints at node 0, shape (nk,)."""
         return np.concatenate([self.driven_angles[0], self.prescribed_path[0]])
 
     def initial_known_coordinates_sensitivity(self, width: int) -> Array:
-        """Derivative of `initial_known_coordinates` by the parameters, shape (nk, d)."""
+        """Derivative of `initial_known_coordinates` with respect to the parameters, shape (nk, d)."""
         by_angles, by_path = self.driven_angles_sensitivity, self.prescribed_path_sensitivity
         parts = ((by_angles, self.driven_angles), (by_path, self.prescribed_path))
         return np.vstack([np.zeros((x.shape[1], width)) if by is None else by[0] for by, x in parts])
@@ -54,7 +54,7 @@ class CorrectedInputs:
     def corrected_feedback(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], measured: Array
     ) -> TrackingFeedback | None:
-        """Tracking filter whose reference has the true angles and the momentum shift of the effects."""
+        """Tracking filter whose reference is corrected to true angles and by the effects' momentum shift."""
         turned = None if self.driven_angles_sensitivity is None else self.driven_angles - measured
         if feedback is None or (turned is None and self.momentum_shift is None):
             return feedback
@@ -74,7 +74,7 @@ class CorrectedInputs:
         wanted: Sequence[str],
         by_internal: Array | None,
     ) -> CorrectedInputs:
-        """Inputs with the momentum that effects add to the tracking filter's reference at every step.
+        """The inputs with the momentum that effects add to the tracking filter's reference at every step.
 
         The angles `recorded` are smooth, those `measured` (N + 1, nu) are as they were read; `by_internal` (nz, d) is
         the derivative of the internal coordinates at the start.
@@ -92,7 +92,7 @@ class CorrectedInputs:
     def nominal_torque_sensitivity(
         self, feedback: TrackingFeedback | None, driven: tuple[int, ...], width: int
     ) -> Array | None:
-        """Derivatives of the nominal torque, including those through the filter's reference, shape (N, nu, width)."""
+        """Derivatives (N, nu, width) of the nominal torque, including those through the tracking filter's reference."""
         reached = [] if self.torque_sensitivity is None else [self.torque_sensitivity]
         for slope, momenta in ((self.driven_angles_sensitivity, False), (self.momentum_shift_sensitivity, True)):
             if feedback is not None and slope is not None:
@@ -113,7 +113,7 @@ class CorrectedInputs:
 
 
 class InputCorrections:
-    """Maps from recorded to true inputs and times, by the recording-error effects of a system.
+    """Compiled maps from recorded to true inputs and times, from the system's effects on recordings.
 
     Derivatives may be asked for by the parameters `names`; those wanted are some of them.
     """
@@ -177,7 +177,7 @@ class InputCorrections:
     def true_angles_and_efforts(
         self, angle: Array, effort: Array, theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array, Array, Array, Array]:
-        """True angles and efforts of `joint_names`, (K, nj), computed from recorded ones.
+        """True angles and efforts (K, nj) of `joint_names`, computed from recorded ones, with derivatives.
 
         Followed by their derivatives by the d parameters `wanted`, (K, nj, d), and that of the effort by its reading.
         """
@@ -189,14 +189,14 @@ class InputCorrections:
     def joint_delay_or_lag(
         self, kind: Literal["torque_delay", "torque_lag", "effort_lag"], theta: Array, wanted: tuple[str, ...]
     ) -> tuple[Array, Array] | None:
-        """Delays or lags' time constants of driven joints' torques or prescribed joints' efforts, shape (nj,) [s].
+        """Delays or lag time constants (nj,) [s] of driven joints' torques or prescribed joints' efforts.
 
         With their derivatives by the parameters `wanted`; None where no effect has any.
         """
         return self._evaluate(self._times[kind], theta, wanted)
 
     def sensor_delay(self, sensor: Sensor, theta: Array, wanted: tuple[str, ...]) -> tuple[Array, Array] | None:
-        """Recorded minus true time of each output, (k,) [s], with derivatives by `wanted`; None without delays."""
+        """Recorded minus true time of each sensor output, (k,) [s], and its derivatives; None without delays."""
         return self._evaluate(self._sensor_delays(sensor), theta, wanted)
 
     def _sensor_delay(self, sensor: Sensor) -> ca.Function | None:
@@ -226,7 +226,7 @@ def _depends(expression: ca.SX, symbols: ca.SX) -> bool:
 
 @dataclass(frozen=True)
 class TimeGridStateValues:
-    """Values of `NodeState` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m); rates by the recorded clock."""
+    """Numerical values of `NodeState` at K nodes: q, v, a, load (K, n), z (K, nz), lam (K, m)."""
 
     q: Array
     v: Array
@@ -239,7 +239,7 @@ class TimeGridStateValues:
     def from_trajectory(
         step: Step, state: Array, load: Array | None = None, lam: Array | None = None
     ) -> TimeGridStateValues:
-        """Values at all nodes of a trajectory (K, nx); loads and constraint forces are zero when absent."""
+        """Compute the values at all nodes of a trajectory (K, nx); absent loads and constraint forces are zero."""
         n, nodes = step.sizes["n"], np.arange(len(state))
         q, z = state[:, :n], state[:, 2 * n :]
         v, a = (rate(q, nodes, step.time_step) for rate in (node_velocity, node_acceleration))
@@ -252,14 +252,14 @@ class TimeGridStateValues:
 
 
 def node_velocity(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Velocity at some nodes of a trajectory (K, ...), the mean over the adjacent steps, shape (len(nodes), ...)."""
+    """Velocity (len(nodes), ...) at some nodes of a trajectory (K, ...), the mean over the adjacent steps."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, len(q) - 1)
     span = np.maximum(after - before, 1) * time_step
     return np.asarray((q[after] - q[before]) / span.reshape(-1, *[1] * (q.ndim - 1)))
 
 
 def node_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Transpose of `node_velocity`, shape (len(nodes), n) to (count, n)."""
+    """Transpose of the linear map `node_velocity`: values (len(nodes), n) to (count, n)."""
     before, after = np.maximum(nodes - 1, 0), np.minimum(nodes + 1, count - 1)
     scaled, result = pull / ((after - before) * time_step)[:, None], np.zeros((count, pull.shape[1]))
     np.add.at(result, after, scaled)
@@ -268,13 +268,13 @@ def node_velocity_adjoint(pull: Array, nodes: IntArray, count: int, time_step: f
 
 
 def node_acceleration(q: Array, nodes: IntArray, time_step: float) -> Array:
-    """Acceleration at some nodes of a trajectory (K, ...), the second difference, shape (len(nodes), ...)."""
+    """Acceleration (len(nodes), ...) at some nodes of a trajectory (K, ...), by second differences."""
     middle = _inner_nodes(nodes, len(q))
     return np.asarray((q[middle + 1] - 2 * q[middle] + q[middle - 1]) / time_step**2) if len(q) > 2 else 0 * q[nodes]
 
 
 def node_acceleration_adjoint(pull: Array, nodes: IntArray, count: int, time_step: float) -> Array:
-    """Transpose of `node_acceleration`, shape (len(nodes), n) to (count, n)."""
+    """Transpose of the linear map `node_acceleration`: values (len(nodes), n) to (count, n)."""
     middle, result = _inner_nodes(nodes, count), np.zeros((count, pull.shape[1]))
     for shift, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
         np.add.at(result, middle + shift, factor / time_step**2 * pull)
@@ -304,7 +304,7 @@ class _SensorReadings(NamedTuple):
 
 
 class ModelFunctions:
-    """Compiled functions of one step's system: sensors, equilibrium, initial state fit and input corrections.
+    """Compiled functions of a step's system: sensor readings, equilibrium, initial state fit, input corrections.
 
     Derivatives may be asked for by the parameters `names`; `start_parameters` are fitted along with starts from points.
     """
@@ -335,23 +335,23 @@ class ModelFunctions:
 
     @property
     def initial_state_fitter(self) -> InitialStateFitter:
-        """Fitter of an initial state to the first measured points."""
+        """Solver that fits an initial state to the first measured points."""
         return self._start_fit(None)
 
     @property
     def arms_only_integrator_step(self) -> Step:
-        """Compiled step of the arms alone, for which the tracking filter's gains are computed."""
+        """Compiled step of the arms alone, from which the tracking filter's gains are computed."""
         return self._arms(None)
 
     @property
     def reference_momentum_shift(self) -> EffectMomentumShift:
-        """Function of the momenta that effects add to the tracking filter's reference, at every step of a motion."""
+        """Calculator of the momentum that effects add to the tracking filter's reference at every step."""
         return self._momentum(None)
 
     def compiled_sensor_function(
         self, sensor: Sensor, wanted: tuple[str, ...] = ()
     ) -> Callable[[TimeGridStateValues, Array], _SensorReadings]:
-        """Compiled function of a sensor's readings at nodes, with derivatives by the parameters `wanted`."""
+        """Compiled function of a sensor's readings at nodes, with derivatives with respect to `wanted`."""
         function, columns = self._sensors((sensor, bool(wanted))), [self.parameter_names.index(name) for name in wanted]
 
         def read(at: TimeGridStateValues, theta: Array) -> _SensorReadings:

@@ -22,7 +22,7 @@ _InitialStateKind = Literal["equilibrium", "estimated", "fitted_to_points"]
 
 @dataclass(frozen=True)
 class MultivariateGaussianPrior:
-    """Multivariate Gaussian prior of shared parameters about their initial values, such as an earlier estimate.
+    """Multivariate Gaussian prior of shared parameters about their initial values, as from an earlier estimate.
 
     The covariance (n, n) is positive definite, in the parameters' units.
     """
@@ -31,19 +31,19 @@ class MultivariateGaussianPrior:
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)), compare=False)
 
     def with_parameters_scaled_by(self, factors: Mapping[str, float]) -> MultivariateGaussianPrior:
-        """Prior of the parameters when each is multiplied by its factor; parameters without a factor are unchanged."""
+        """Prior of the rescaled parameters factor x parameter; parameters without a factor are unchanged."""
         by = np.array([factors.get(name, 1.0) for name in self.parameter_names])
         return MultivariateGaussianPrior(self.parameter_names, self.covariance * np.outer(by, by))
 
     def restricted_to(self, names: Sequence[str]) -> MultivariateGaussianPrior:
-        """Marginal prior of the named parameters, in the given order."""
+        """Marginal prior of those of the named parameters that it covers, in the given order."""
         at = [self.parameter_names.index(name) for name in names if name in self.parameter_names]
         return MultivariateGaussianPrior(tuple(self.parameter_names[i] for i in at), self.covariance[np.ix_(at, at)])
 
 
 @dataclass(frozen=True)
 class ProblemOptions:
-    """Settings of an estimation problem: everything but model and data.
+    """Settings of an estimation problem besides model and data: initial states, feedback, weighting, priors, ...
 
     Attributes
     ----------
@@ -124,5 +124,5 @@ class ProblemOptions:
 
     @property
     def has_no_serious_data_issues(self) -> bool:
-        """Whether the recordings have no data quality issue graver than a warning."""
+        """Whether no data quality issue of the recordings is more severe than a warning."""
         return all(doubt.weight == "warning" for doubt in self.data_issues)

@@ -68,7 +68,7 @@ def interpolated_displacement_baseline(
     clamped: Sequence[str] | None = None,
     given: int = 2,
 ) -> Array:
-    """Baseline prediction: displacement interpolated in arc length along the parent; children move with their junction.
+    """Baseline prediction: displacements interpolated along the parent's arc length; children move with their junction.
 
     Shape and errors as in `constant_position_baseline`, and for a point of no branch. `parent` has its points from end
     to end, of which `clamped` are those between which is interpolated, its two ends when absent; each child begins with
@@ -93,7 +93,7 @@ def interpolated_displacement_baseline(
 
 
 def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
-    """Square root of the mean squared Euclidean error over points and frames [m]; NaN where none is left to compare.
+    """Root mean square of the Euclidean error over points and frames [m]; NaN if there is nothing to compare.
 
     Given frames and those in which a point was not measured do not count; shapes are (M, np, 3), `DataError` where the
     two differ.
@@ -106,7 +106,7 @@ def position_rmse(predicted: Array, measured: Array, given: int = 2) -> float:
 
 
 def measured_point_positions(recording: Recording, points: Sequence[str]) -> Array:
-    """Measured positions of some points of one group, shape (M, len(points), 3) [m]."""
+    """Measured positions (M, len(points), 3) [m] of some points of one group of a recording."""
     group = _group_with_points(recording, points)
     return group.position[:, [group.names.index(point) for point in points]]
 
@@ -138,7 +138,7 @@ def _carried(recording: Recording, points: Sequence[str], known: Sequence[str], 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChannelPrediction(ReprMixin):
-    """Measured and predicted samples of one channel of one recording; w is 3 for a point and 1 for a joint."""
+    """Measured and predicted samples (M, w) of one channel of a recording; w is 3 for a point, 1 for a joint."""
 
     recording: str
     channel: str
@@ -150,12 +150,12 @@ class ChannelPrediction(ReprMixin):
 
     @property
     def predicted_minus_measured(self) -> Array:
-        """Predicted minus measured, shape (M, w)."""
+        """Error of the prediction, predicted minus measured, shape (M, w)."""
         return self.predicted - self.measured
 
     @property
     def rmse(self) -> float:
-        """Root mean square error; for a point, of the Euclidean distance."""
+        """Root mean square error in the channel's unit; for a point, that of the Euclidean distance."""
         return float(np.sqrt(np.nanmean(np.sum(self.predicted_minus_measured**2, axis=1))))
 
     def _summary(self) -> ReprSummary:
@@ -164,7 +164,7 @@ class ChannelPrediction(ReprMixin):
 
 
 def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[ChannelPrediction, ...]:
-    """Measured and predicted samples of every channel of an episode."""
+    """Measured and predicted samples of an episode, one `ChannelPrediction` per channel."""
     found = []
     for samples, predicted in zip(episode.measurements, result.predicted_outputs, strict=True):
         sensor = samples.sensor
@@ -181,7 +181,7 @@ def channel_predictions(episode: Episode, result: EpisodePrediction) -> tuple[Ch
 def rmse_unit_and_count_by_channel(
     results: Sequence[EpisodePrediction], episodes: Sequence[Episode]
 ) -> dict[str, dict[str, Any]]:
-    """Root mean square error, unit and number of samples of every channel: {channel: {rmse, unit, n}}.
+    """Root mean square error, unit and number of samples by channel: {channel: {rmse, unit, n}}.
 
     For points the error of a sample is the Euclidean distance.
     """
@@ -209,7 +209,7 @@ def recording_from_prediction(
     seed: int | None = None,
     description: str = "",
 ) -> Recording:
-    """Convert an episode's rollout, predicted at `theta`, into a recording with its sensors' clocks and noise levels.
+    """Convert an episode's prediction at `theta` into a synthetic recording with its sensors' clocks and noise levels.
 
     `seed` is that of the noise that the estimation assumes, constant torque offsets included; no noise when absent.
     """
@@ -240,7 +240,7 @@ def recording_from_prediction(
 def synthesize_recording(
     predictor: EpisodePredictor, episode: Episode, theta: Array, seed: int | None = None
 ) -> Recording:
-    """Roll out an episode at theta and return it as a synthetic recording."""
+    """Roll out an episode at `theta` and return the prediction as a synthetic recording, with noise for a `seed`."""
     refit = predictor.options.initial_state == "fitted_to_points"
     fresh = (
         predictor.episode_with_fitted_initial_state(replace(episode, fixed_initial_state=None), theta)

@@ -31,7 +31,7 @@ def mean_step_inputs(
     delay: Array | None = None,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Mean input of driven joints over every step, shape (steps, nu): torques [N m], or commands [rad or m].
+    """Mean input of driven joints in every step, (steps, nu): torques [N m], or servo commands [rad or m].
 
     An effort that is held from sample to sample (`command`) jumps, and so do commands that are held; through samples of
     efforts goes a cubic spline, and where means over the recorded intervals are given, the derivative of one through
@@ -57,7 +57,7 @@ def mean_step_input_delay_derivative(
     delay: Array,
     servos: Mapping[str, PositionServo] | None = None,
 ) -> Array:
-    """Derivative of `mean_step_inputs` by each joint's delay, shape (steps, nu); at a jump the mean of both sides."""
+    """Derivative (steps, nu) of `mean_step_inputs` with respect to each joint's delay; mean of both sides at a jump."""
     result = []
     for course, shift in zip(_courses(joints, driven, where, servos or {}), delay, strict=True):
         sides = (course(np.clip(grid.node_times - shift + near, *course.x[[0, -1]])) for near in (-1e-9, 1e-9))
@@ -80,7 +80,7 @@ def _motor_off_steps(
 
 
 def servo_gain_factors_by_recording(system: System, recordings: Sequence[Recording]) -> dict[str, dict[str, float]]:
-    """Firmware gains that recordings state, as values of `JOINT.servo_gain_factor` by recording.
+    """Firmware gains stated in recordings, as values of `JOINT.servo_gain_factor` by recording name.
 
     `DataError` where some recordings state it and others, whose motors are on, do not: their gains would not compare.
     """
@@ -158,7 +158,7 @@ def _summed(course: scipy.interpolate.PPoly, t: Array) -> Array:
 def smoothed_joint_angles(
     joints: JointGroup, names: tuple[str, ...], grid: TimeGrid, where: str, low_pass: LowPassFilter
 ) -> Array:
-    """Smoothed joint angles at every node by a cubic spline, shape (steps + 1, len(names)) [rad]."""
+    """Joint angles at every node, low-pass filtered from the recording, (steps + 1, len(names)) [rad]."""
     columns = recorded_joint_columns(joints, names, where)
     return _smoothed_at_nodes(joints.t, joints.position[:, columns], grid, low_pass)
 
@@ -171,7 +171,7 @@ def _smoothed_at_nodes(t: Array, values: Array, grid: TimeGrid, low_pass: LowPas
 def smoothed_joint_efforts(
     recording: Recording, names: tuple[str, ...], grid: TimeGrid, low_pass: LowPassFilter
 ) -> Array:
-    """Smoothed recorded joint efforts at every node, shape (steps + 1, len(names)) [N m]; `DataError` without them."""
+    """Low-pass filtered joint efforts at every node, (steps + 1, len(names)) [N m]; `DataError` without efforts."""
     joints = recording.joints
     if joints is None or joints.effort is None:
         what = "the model's gears give way under an effort that the recording does not have"
@@ -182,7 +182,7 @@ def smoothed_joint_efforts(
 
 
 def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Array, cutoff: float) -> Array:
-    """Gear loads: the model's own plus the slow part of measured minus own, so that effort noise is not fed back.
+    """Gear loads without effort noise: the model's loads plus the slow part of measured minus model loads.
 
     Both are smoothed (N + 1, k) and compared at `nodes` (M,), beyond the first and last of which neither is right; the
     filter of paths and efforts has the `cutoff` [Hz].
@@ -192,7 +192,7 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
 
 
 def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
-    """Signals that effects require (`effects.signal_kinds_required_by_any_effect`) and recordings contain.
+    """Kinds of signals in the recordings, as in `effects.signal_kinds_required_by_any_effect`.
 
     Each sensor mounted on a frame is one of its own, such as `wrist:FRAME`.
     """
@@ -221,7 +221,7 @@ def prescribed_path(
     low_pass: LowPassFilter,
     clamps: tuple[ClampPoseDefinition, ...] = (),
 ) -> Array:
-    """Prescribed coordinates at every node, shape (steps + 1, nc).
+    """Prescribed coordinates at every node, (steps + 1, nc), from smoothed recorded joints and clamp points.
 
     Joints follow the smoothed recorded positions, clamps their smoothed points; `DataError` where one is not recorded,
     or is seen too seldom.

@@ -43,17 +43,17 @@ class LowPassFilter:
         return np.asarray(scipy.interpolate.CubicSpline(even, smooth, axis=0)(np.clip(t, even[0], even[-1])))
 
     def decorrelation_stride(self, step: float) -> int:
-        """Number of samples, `step` [s] apart, after which filtered white noise is about uncorrelated: 1/(2 f step)."""
+        """Number of samples, `step` [s] apart, after which filtered white noise is nearly uncorrelated."""
         return max(1, round(1 / (2 * self.cutoff * step))) if math.isfinite(self.cutoff) else 1
 
     @property
     def settling_time(self) -> float:
-        """Settling time of the filter, during which ends of a record distort it: decay to a thousandth [s]."""
+        """Settling time [s], after which the distortion at the ends of a record has decayed to a thousandth."""
         decay = 2 * math.pi * self.cutoff * math.sin(math.pi / (2 * _FILTER_ORDER))
         return float(scipy.special.gammainccinv(self.passes, 1e-3)) / decay
 
     def noise_gains_of_value_and_rates(self, step: float) -> tuple[float, float, float]:
-        """Stds of the filtered value, its rate [1/s] and second rate [1/s^2] for white noise of unit std."""
+        """Standard deviations of filtered unit white noise, and of its first [1/s] and second [1/s^2] derivatives."""
         if not math.isfinite(self.cutoff):
             return 1.0, math.sqrt(0.5) / step, math.sqrt(6.0) / step**2
         response = self._response(step)
@@ -63,7 +63,7 @@ class LowPassFilter:
         return float(np.linalg.norm(response)), float(np.linalg.norm(rate)), float(np.linalg.norm(second))
 
     def node_smoother(self, nodes: IntArray, count: int, step: float) -> NodeSmoother:
-        """Filter as a matrix for some of `count` nodes, `step` apart [s]; nodes beyond are left out.
+        """The filter as a matrix that smooths values at `nodes` out of `count` nodes, `step` [s] apart.
 
         Values before node 1 and after the last node are taken as constant.
         """
@@ -100,19 +100,19 @@ class LowPassFilter:
 
 @dataclass(frozen=True)
 class NodeSmoother:
-    """Matrix (M, N) that smooths values at M of N nodes and leaves the others unchanged."""
+    """A smoothing filter as a matrix (M, N): smooths values at M of N nodes and leaves the others unchanged."""
 
     nodes: IntArray
     matrix: scipy.sparse.csr_array
 
     def smooth(self, values: Array) -> Array:
-        """Smooth values at all nodes, shape (N, ...)."""
+        """Apply the filter to values at all nodes, (N, ...), and return them in the same shape."""
         smooth = values.copy()
         smooth[self.nodes] = (self.matrix @ values.reshape(len(values), -1)).reshape(len(self.nodes), *values.shape[1:])
         return smooth
 
     def smoothing_adjoint(self, pull: Array) -> Array:
-        """Adjoint of `smooth`: cost derivative by the input values from that by the smoothed ones, shape (N, k)."""
+        """Adjoint of `smooth`: maps a cost's gradient (N, k) by smoothed values to the gradient by input values."""
         passed = pull.copy()
         passed[self.nodes] = 0.0
         return np.asarray(passed + self.matrix.T @ pull[self.nodes])
@@ -135,7 +135,7 @@ def effort_filter_from_path_cutoff(cutoff: float) -> LowPassFilter:
 
 @dataclass(frozen=True)
 class FirstOrderLag:
-    """First-order lags of k channels, with derivatives by their time constants.
+    """First-order lags of k channels, with derivatives with respect to their time constants.
 
     With E = exp(-h/T) and f = T/h (1 - E), both zero at T = 0, where a value is followed at once. At nodes T may be
     negative: then the value follows z with the time constant -T, so that z = x - T dx/dt.
@@ -146,7 +146,7 @@ class FirstOrderLag:
     time_step: float  # h [s]
 
     def lagged_step_means(self, value: Array, slope: Array | None) -> tuple[Array, Array]:
-        """Mean over each step of the lagged output for inputs held over steps; output and input start equal.
+        """Mean of the lagged output over each step, for inputs held over steps; output and input start equal.
 
         Of x (N, k) with its slope (N, k, d), if any, it is x + (z - x) f, with z_{k+1} = x + (z - x) E; and its slope.
         """
@@ -161,7 +161,7 @@ class FirstOrderLag:
         return value + share * gap, through + mean_by_time
 
     def lagged_node_values(self, value: Array, slope: Array | None) -> tuple[Array, Array | None]:
-        """Lagged output at nodes for an input that is linear between nodes, starting at node 1, and its slope.
+        """Lagged output at nodes and its derivatives, for an input that is linear between nodes; it starts at node 1.
 
         Of x (N, k) it is z_{k+1} = E z_k + (f - E) x_k + (1 - f) x_{k+1}, or x - T dx/dt by central differences. Slopes
         (N, k, d) are by all directions, first the parameters of `time_constant_sensitivity`.
@@ -179,7 +179,7 @@ class FirstOrderLag:
         return followed, total
 
     def lagged_node_values_adjoint(self, value: Array, pull: Array) -> tuple[Array, Array]:
-        """Adjoint of `lagged_node_values`: cost derivatives by input (N, k) and parameters (d,) from the output's."""
+        """Adjoint of `lagged_node_values`: maps a cost's gradient (N, k) by output to those by input and parameters."""
         decay, share, _, _ = self._factors()
         lead, rates = np.minimum(self.time_constant, 0.0), _rates(len(value), self.time_step)
         by_time = self._by_time(value, self._straight(value, decay, share))

@@ -23,7 +23,7 @@ SOFT_LOGARITHM_MIN_RATIO = 1e-3
 
 @dataclass(frozen=True)
 class UnknownVectorLayout:
-    """Layout of the unknown vector: (shared | recording 1: local, initial state offset | recording 2: ...)."""
+    """Order of the unknown vector: shared parameters, then per recording local parameters and initial state offset."""
 
     shared_parameters: tuple[str, ...]  # free, with one value for all recordings
     local_parameters: tuple[str, ...]  # free, with a value in each
@@ -32,23 +32,23 @@ class UnknownVectorLayout:
 
     @cached_property
     def unknown_names(self) -> tuple[str, ...]:
-        """Names of all unknowns; local ones and initial states carry their recording's name."""
+        """Names of all unknowns; those of local parameters and initial states contain the recording's name."""
         own = [*self.local_parameters, *(f"{INITIAL_STATE_PREFIX}{name}" for name in self.initial_state_names)]
         each = (f"{name}[{recording}]" for recording in self.recording_names for name in own)
         return (*self.shared_parameters, *each)
 
     @property
     def free_parameters(self) -> tuple[str, ...]:
-        """Free parameters, shared then local, in the order of one recording's derivative columns."""
+        """Names of the free parameters, shared then local, in the order of one recording's derivative columns."""
         return (*self.shared_parameters, *self.local_parameters)
 
     def unknown_indices_of_recording(self, recording: int) -> IntArray:
-        """Indices in the unknown vector of one recording's shared, local and initial state unknowns."""
+        """Indices in the unknown vector of shared unknowns and of one recording's local and initial state unknowns."""
         shared, own = len(self.shared_parameters), len(self.local_parameters) + len(self.initial_state_names)
         return np.concatenate([np.arange(shared), shared + recording * own + np.arange(own)])
 
     def scatter_to_unknown_columns(self, block: Array, recording: int) -> Array:
-        """Scatter derivative columns of one recording, (r, d), to the columns of the unknown vector, (r, nx)."""
+        """Scatter one recording's derivative columns (r, d) to those of the unknown vector (r, nx); others are zero."""
         wide = np.zeros((len(block), len(self.unknown_names)))
         wide[:, self.unknown_indices_of_recording(recording)] = block
         return wide
@@ -56,7 +56,7 @@ class UnknownVectorLayout:
     def theta_and_initial_state_offset(
         self, x: ArrayLike, recording: int, theta: Array, system: System
     ) -> tuple[Array, Array]:
-        """Return theta with one recording's values, and its initial state offset, from the unknown vector."""
+        """Return theta with one recording's values in `x`, and that recording's initial state offset."""
         own = np.asarray(x, float)[self.unknown_indices_of_recording(recording)]
         result = theta.copy()
         for name, value in zip(self.free_parameters, own, strict=False):
@@ -64,7 +64,7 @@ class UnknownVectorLayout:
         return result, own[len(self.free_parameters) :]
 
     def pack_same_for_all_recordings(self, shared: ArrayLike, local: ArrayLike, start: ArrayLike) -> Array:
-        """Pack shared values, and local values and an initial state offset equal in all recordings, into a vector."""
+        """Unknown vector from shared values, and local values and an initial state offset used for all recordings."""
         parts = [np.asarray(shared, float)]
         parts += [np.asarray(local, float), np.asarray(start, float)] * len(self.recording_names)
         return np.concatenate(parts)
@@ -73,7 +73,7 @@ class UnknownVectorLayout:
 def stated_prior_std(
     unknowns: UnknownVectorLayout, options: ProblemOptions, system: System, inertia: Callable[[tuple[str, ...]], Array]
 ) -> Array:
-    """Standard deviation of each unknown's stated Gaussian prior, infinite where there is none, shape (nx,).
+    """Standard deviation (nx,) of each unknown's stated Gaussian prior; infinite for unknowns without one.
 
     `inertia` gives the diagonal of the mass matrix, by which a start's velocity becomes a momentum. An internal
     coordinate may begin anywhere within its limits; the standard deviation is that of such a uniform prior.
@@ -97,7 +97,7 @@ def stated_prior_std(
 
 
 def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions, std: Array) -> Array:
-    """Jacobian of the stated priors' whitened residual, which is this matrix (k, nx) times (x - initial x)."""
+    """Jacobian (k, nx) of the stated priors' whitened residual, which is Jacobian x (x - initial x)."""
     joint = options.multivariate_prior.restricted_to(unknowns.shared_parameters)
     at = [unknowns.unknown_names.index(name) for name in joint.parameter_names]
     alone = [i for i in np.flatnonzero(np.isfinite(std)) if i not in at]
@@ -112,7 +112,7 @@ def stated_prior_jacobian(unknowns: UnknownVectorLayout, options: ProblemOptions
 def estimated_initial_state_names(
     system: System, options: ProblemOptions, free: Sequence[str], theta: Array
 ) -> tuple[str, ...]:
-    """Names of the estimated components of an initial state.
+    """Names of the estimated components of initial states, such as `q.JOINT`, `p.JOINT` and `z.NAME`.
 
     Where starts are estimated, q and p of the coordinates that are neither driven by torques, nor prescribed, nor
     follow their load at once; in any case the unobserved internal coordinates of effects that are free or not neutral.
@@ -139,13 +139,13 @@ def _unobserved_state_limits(system: System) -> dict[str, float]:
 
 
 def initial_state_offset_limits(system: System, names: Sequence[str]) -> Array:
-    """Largest offset of each estimated component of an initial state, infinite for coordinates and momenta."""
+    """Largest absolute offset of each estimated initial state component; infinite for coordinates and momenta."""
     limits = _unobserved_state_limits(system)
     return np.array([limits[name.removeprefix("z.")] if name.startswith("z.") else np.inf for name in names])
 
 
 def check_free_parameters(system: System, free: Sequence[str], options: ProblemOptions) -> None:
-    """Raise `ConfigError` where free parameters are unknown or repeated, or local ones or priors are not free."""
+    """Raise `ConfigError` if a free parameter is unknown or repeated, or a local or prior's parameter is not free."""
     for name in [*free, *options.local_parameters, *options.prior_stds, *options.multivariate_prior.parameter_names]:
         system.parameters.index(name)
     if len(set(free)) != len(free):
@@ -156,7 +156,7 @@ def check_free_parameters(system: System, free: Sequence[str], options: ProblemO
 
 
 def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) -> None:
-    """Raise `ConfigError` where an initial value lies outside its bounds, or the bounds coincide."""
+    """Raise `ConfigError` if a free parameter's initial value is outside its bounds, or its bounds coincide."""
     for name in free:
         entry, value = system.parameters[name], theta[system.parameters.index(name)]
         if not entry.lower <= value <= entry.upper:
@@ -169,7 +169,7 @@ def check_parameter_bounds(system: System, free: Sequence[str], theta: Array) ->
 
 
 def soft_logarithm_and_slope(ratio: Array) -> tuple[Array, Array]:
-    """Return log(ratio) and its slope, below `SOFT_LOGARITHM_MIN_RATIO` those of the parabola that continues it."""
+    """Return log(ratio) and its slope; below `SOFT_LOGARITHM_MIN_RATIO` a parabola continues the logarithm."""
     below = (ratio - SOFT_LOGARITHM_MIN_RATIO) / SOFT_LOGARITHM_MIN_RATIO
     small = below < 0
     kept = np.where(small, SOFT_LOGARITHM_MIN_RATIO, ratio)

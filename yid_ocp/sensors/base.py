@@ -28,7 +28,7 @@ _NonNegative = Annotated[float, Ge(0)]
 
 @dataclass(frozen=True)
 class SensorOptions:
-    """How one sensor group of a recording is used: points, points_NAME, joints.position or GROUP.QUANTITY."""
+    """Settings of one sensor group (such as `points` or `joints.effort`): use, noise, bias, frames and constants."""
 
     use: Annotated[
         bool | None,
@@ -80,7 +80,7 @@ class SensorOptions:
 
 @dataclass(frozen=True)
 class ChannelKind:
-    """Kind of recorded quantity: where a recording holds it, its unit, and which constants settings may give.
+    """Kind of recorded quantity: its group and dataset in a recording, unit, components and sensor constants.
 
     The noise stands in the group's attributes `QUANTITY_std` and `QUANTITY_bias_std`, of points in the dataset `std`.
     """
@@ -94,11 +94,11 @@ class ChannelKind:
 
     @property
     def std_attribute_names(self) -> tuple[str, str]:
-        """Names of the group's attributes that hold the stds of white noise and of a constant error."""
+        """Names of the recorded attributes with the standard deviations of white noise and of a constant error."""
         return f"{self.quantity}_std", f"{self.quantity}_bias_std"
 
     def matches_group_name(self, name: str) -> bool:
-        """Whether a group of this name is one for the channel, `GROUP` or `GROUP_NAME`; only the name is looked at."""
+        """Whether a group's name is `GROUP` or `GROUP_NAME` of this channel kind; its contents are not checked."""
         return re.fullmatch(rf"{self.group}(_[^/]+)?", name) is not None
 
 
@@ -107,7 +107,7 @@ CHANNEL_KINDS: Registry[ChannelKind] = Registry("recorded channel")
 
 
 def channel_kinds_for_group_name(group: str) -> tuple[ChannelKind, ...]:
-    """Kinds of channels that sensors declare for a recording's group of this name; none for joints and points."""
+    """Channel kinds registered for a recording's group of this name; an empty tuple for joints and points."""
     found = (CHANNEL_KINDS[name] for name in CHANNEL_KINDS)
     return tuple(c for c in found if c.group not in ("joints", "points") and c.matches_group_name(group))
 
@@ -122,7 +122,7 @@ class _RecordedGroup(Protocol):
 
 
 class RecordedPointGroup(_RecordedGroup, Protocol):
-    """A recorded group of points, as in `data.recording.PointGroup`."""
+    """Interface of a recorded point group (names, times, positions), as implemented by `data.recording.PointGroup`."""
 
     @property
     def sensor(self) -> str: ...
@@ -135,7 +135,7 @@ class RecordedPointGroup(_RecordedGroup, Protocol):
 
 
 class RecordedJoints(Protocol):
-    """Recorded joints, as in `data.recording.JointGroup`."""
+    """Interface of recorded joints (names, times, channels), as implemented by `data.recording.JointGroup`."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
@@ -158,7 +158,7 @@ class RecordedJoints(Protocol):
 
 
 class RecordedChannelGroup(_RecordedGroup, Protocol):
-    """A recorded group of declared channels, as in `data.recording.SensorChannelGroup`."""
+    """Interface of a further sensor's recorded channels, as implemented by `data.recording.SensorChannelGroup`."""
 
     @property
     def values_by_quantity(self) -> Mapping[str, Array]: ...
@@ -180,7 +180,7 @@ class _RecordingData(Protocol):
 
 
 def recorded_joint_columns(joints: RecordedJoints, names: tuple[str, ...], where: str) -> list[int]:
-    """Column indices of the named joints in a recording; `DataError` for a joint that is not recorded."""
+    """Column indices of the named joints in the recorded arrays; `DataError` for a joint that is not recorded."""
     for name in names:
         if name not in joints.names:
             what, hint = f"joint '{name}' of the model is not recorded", nearest_name_hint(name, joints.names)
@@ -191,7 +191,7 @@ def recorded_joint_columns(joints: RecordedJoints, names: tuple[str, ...], where
 def expand_to_joint_values(
     given: float | Array | Mapping[str, float], recorded: Sequence[str], names: Sequence[str], key: str
 ) -> Array:
-    """One value per joint in `names`, from one value for all, one per recorded joint, or a mapping."""
+    """One value per joint in `names`, from a single value, one value per recorded joint, or a mapping by joint."""
     if isinstance(given, Mapping):
         for name in names:
             if name not in given:
@@ -205,7 +205,7 @@ def expand_to_joint_values(
 
 
 class Sensor(ABC):
-    """A group of measured channels with one clock; hashable, as subclasses are frozen dataclasses.
+    """Base class of sensors: a group of measured channels on one clock and its prediction from the model; hashable.
 
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
     """
@@ -231,42 +231,42 @@ class Sensor(ABC):
     @property
     @abstractmethod
     def channel_names(self) -> tuple[str, ...]:
-        """Names of the channels, in the order of the outputs."""
+        """Names of the sensor's channels, in the order of its outputs."""
 
     @property
     def output_names(self) -> tuple[str, ...]:
-        """Name of each output: its channel's, with the component where there are several."""
+        """Name of each scalar output: the channel's name, followed by the component if a channel has several."""
         parts = [f".{part}" for part in self.channel.components] or [""]
         return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
 
     @property
     def output_frames(self) -> tuple[str, ...]:
-        """Frame of the mechanism that each output marks, empty where it marks none."""
+        """Name of the mechanism's frame at which each output is measured; an empty string for joints."""
         frames = self.frame_names or ("",) * len(self.channel_names)
         return tuple(frame for frame in frames for _ in range(self.outputs_per_channel))
 
     @property
     def effort_joints(self) -> tuple[str, ...]:
-        """Names of the joints whose effort, filtered like the path, the sensor reads; empty where it reads none."""
+        """Names of the joints whose effort the sensor reads, filtered like the prescribed path; empty if none."""
         return ()
 
     @property
     def effort_per_unit_reading(self) -> Array:
-        """Joint effort that one unit of each output stands for, shape (len(effort_joints),) [N m per unit]."""
+        """Joint effort that corresponds to one unit of each output, (len(effort_joints),) [N m per unit]."""
         return np.ones(len(self.effort_joints))
 
     @property
     def camera_pose(self) -> Placement | None:
-        """Pose of the camera in the world; None for any other sensor."""
+        """Pose of the camera in the world; None if the sensor is not a camera."""
         return None
 
     @abstractmethod
     def ideal_reading(self, state: NodeState) -> ca.SX:
-        """What the sensor reads at a node without effects, shape (outputs_per_channel * len(channel_names), 1)."""
+        """Symbolic reading of the sensor at a node, without errors, (outputs_per_channel * len(channel_names), 1)."""
 
 
 def sensor_reading_function(system: System, sensor: Sensor, names: tuple[str, ...]) -> ca.Function:
-    """A CasADi function for readings y(q, v, a, z, load, lam; theta), effects included, with their derivatives.
+    """Build a CasADi function of a sensor's readings y(q, v, a, z, load, lam; theta), with effects, and derivatives.
 
     It maps (q, v, a, z, load, lam, theta) to (y, dy/dq, dy/dv, dy/da, dy/dz, dy/dload, dy/dlam, dy/dtheta), as in
     `NodeState`, the last one by the parameters `names`; v, a and lam by the recorded clock. Slopes by these have no
@@ -312,7 +312,7 @@ class _SmoothingFilter(Protocol):
 
 @dataclass(frozen=True)
 class SensorDataInputs:
-    """What is needed to read a sensor's measurements from a recording.
+    """Inputs for reading a sensor's measurements from a recording: system, recording, options, nodes and filters.
 
     `joint_mass_matrices` maps joint names and some of their configurations, shape (K, k), to their part of the mass
     matrix in each of them, shape (K, k, k) [kg m^2 or kg].
@@ -330,7 +330,7 @@ class SensorDataInputs:
 
 @dataclass(frozen=True)
 class SensorData:
-    """The measurements of one sensor in one recording."""
+    """Measurements of one sensor in one recording: times, values, noise and bias standard deviations."""
 
     sensor: Sensor
     t: Array  # shape (M,) [s]

@@ -38,7 +38,7 @@ NOISE_DIFFERENCE_ORDER = 6  # of the differences that estimate a noise level: th
 
 @dataclass(frozen=True)
 class JointSensor(Sensor):
-    """A sensor of named joints with one output per joint and no points."""
+    """Base class of sensors of named joints, with one output per joint."""
 
     frame_names = point_names = ()
 
@@ -50,13 +50,13 @@ class JointSensor(Sensor):
         return tuple(f"{self.group_name}.{joint}" for joint in self.joint_names)
 
     def select_sensor_joint_rows(self, values: ca.SX, state: NodeState) -> ca.SX:
-        """Entries for the sensor's joints among values of all joints (n, 1), shape (nj, 1)."""
+        """Entries (nj, 1) of the sensor's joints in a column of values of all joints (n, 1)."""
         return ca.vertcat(*(values[state.system.mechanism.joint_index(joint)] for joint in self.joint_names))
 
 
 @dataclass(frozen=True)
 class PositionSensor(JointSensor):
-    """Encoders of named driven joints."""
+    """Encoders of named driven joints, which measure joint positions [rad or m]."""
 
     channel = _POSITION
     has_paper_weight = False
@@ -68,7 +68,7 @@ class PositionSensor(JointSensor):
 
 @dataclass(frozen=True)
 class EffortSensor(JointSensor):
-    """Efforts of named prescribed joints, predicted by the discrete inverse dynamics."""
+    """Efforts of named prescribed joints, predicted by discrete inverse dynamics."""
 
     channel = _EFFORT
     naive_prediction = "zero"
@@ -83,7 +83,7 @@ class EffortSensor(JointSensor):
 
 
 def is_point_group_measured_by_arm(group: RecordedPointGroup) -> bool:
-    """Whether the arm itself measured these points, usually from its encoders."""
+    """Whether a point group was measured by the arm itself, usually by its encoders and forward kinematics."""
     return "arm" in (group.sensor, group.name.rpartition("_")[2])
 
 
@@ -139,7 +139,7 @@ def smoothed_effort_data(
     *,
     is_sample: bool,
 ) -> SensorData:
-    """Measurements of a sensor of efforts, low-pass filtered and thinned out to independent samples.
+    """Measurements of an effort sensor, low-pass filtered and thinned until their noise is nearly independent.
 
     `values`, shape (M, k), are in the sensor's unit, `std` and `bias`, shape (k,), those of their white noise and of an
     error that is constant in the recording; `is_sample` says whether a value is that at its time, not of the interval
@@ -160,7 +160,7 @@ def smoothed_effort_data(
 def smoothed_node_values(
     around: SensorDataInputs, t: Array, values: Array, noun: str, late: float = 0.0, *, like_path: bool = False
 ) -> tuple[IntArray, Array]:
-    """Nodes (K,) and low-pass filtered values (K, k) there, thinned out to independent samples.
+    """Return nodes (K,) and low-pass filtered values (K, k) there, so far apart that noise is nearly independent.
 
     `values` (M, k) belong to the times `t` + `late` [s] and are called `noun` in a `DataError` of a recording too short
     for the filter: that of efforts, whose prediction is smoothed again, or the one of the path.
@@ -188,7 +188,7 @@ def smoothed_node_values(
 
 
 def is_noise_std_stated(joints: RecordedJoints, group: str, choice: SensorOptions) -> bool:
-    """Whether the recording or the settings state the noise std of `joints.effort` or `joints.position`.
+    """Whether the recording or the settings specify the noise of `group`, `joints.effort` or `joints.position`.
 
     The step of the encoders, where the recording states it, is a statement of their noise.
     """
@@ -198,7 +198,7 @@ def is_noise_std_stated(joints: RecordedJoints, group: str, choice: SensorOption
 
 
 def quantization_step(values: Array) -> float:
-    """Quantization step of a channel from the gaps between its values, zero if it is not quantized."""
+    """Quantization step of a channel, from the gaps between its sorted values; zero if it is not quantized."""
     levels = np.unique(values)
     apart = np.diff(levels)
     step = float(np.min(apart[apart > 1e-9 * np.ptp(levels)], initial=np.inf))
@@ -244,7 +244,7 @@ joint_torque_noise_std = partial(_joint_noise_std, group=JOINT_EFFORT_GROUP_NAME
 
 
 def joint_torque_bias_std(joints: RecordedJoints, names: Sequence[str], choice: SensorOptions) -> Array:
-    """Standard deviation of a constant error of recorded torques, zero if unknown, shape (len(names),) [N m]."""
+    """Standard deviation of the recorded torques' constant errors, (len(names),) [N m]; zero if unknown."""
     given = choice.bias_std if choice.bias_std is not None else joints.effort_bias_std
     key = f"sensors.{JOINT_EFFORT_GROUP_NAME}.bias_std"
     return expand_to_joint_values(0.0 if given is None else given, joints.names, names, key)

@@ -24,7 +24,7 @@ from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, smoothed_node_valu
 
 @dataclass(frozen=True)
 class MountedSensor(Sensor):
-    """A sensor of three components along the axes of each of its frames."""
+    """Base class of sensors mounted on frames, with three components along each frame's axes."""
 
     naive_prediction: ClassVar = "stays"
     has_paper_weight = False
@@ -48,7 +48,7 @@ class MountedSensor(Sensor):
 
 
 def read_mounted_sensors(around: SensorDataInputs, kind: type[MountedSensor]) -> list[SensorData]:
-    """Measurements of one kind of mounted sensor in a recording."""
+    """Read the measurements of one kind of mounted sensor from a recording, one `SensorData` per recorded group."""
     channel, found = kind.channel, []
     for group in around.recording.channel_groups:
         key = f"{group.name}.{channel.quantity}"

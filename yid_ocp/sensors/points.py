@@ -27,7 +27,7 @@ _POINTS = CHANNEL_KINDS.register("points")(ChannelKind("points", "position", "m"
 
 @dataclass(frozen=True)
 class PointSensor(Sensor):
-    """Measured positions of named frames in the world."""
+    """Sensor of the positions of named frames in the world [m], such as motion capture or a camera."""
 
     channel = _POINTS
     group_name: str
@@ -90,7 +90,7 @@ def _points(around: SensorDataInputs, group: RecordedPointGroup, choice: SensorO
 
 
 def recorded_camera_pose(group: RecordedPointGroup) -> tuple[tuple[float, ...], ...] | None:
-    """4x4 pose of the camera that saw a group of points; None where no camera saw it.
+    """Pose (4x4) of the camera that measured a point group; None if no camera measured it.
 
     A group is a camera's when it has a pose, or when its name or its sensor says `camera`; without a pose the camera
     then counts as standing in the world's origin.

@@ -27,7 +27,7 @@ for _format in iter_modules(__path__):
 
 
 def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS, **options: Any) -> Recording:
-    """Read and check a recording of any known format, chosen by its suffix.
+    """Read and check a recording in any known format; the path's suffix selects the reader.
 
     It is an HDF5 recording, a CSV file, a rosbag, an MCAP file, a ROS 2 bag folder, a C3D file or a LeRobot dataset.
     The options are those of the reader in `READERS`, by name. `DataError` where the format or an option is not known,
@@ -49,7 +49,7 @@ def read_any(path: str | os.PathLike[str], *, progress: Progress = NULL_PROGRESS
 
 
 def preview_file(path: str | os.PathLike[str], progress: Progress = NULL_PROGRESS) -> FilePreview:
-    """Preview of a file of any known format, with the options for `read_any`; it raises the same errors."""
+    """Preview of a file in any known format: its data sources and options for `read_any`; errors as `read_any`."""
     path = Path(path)
     known_as = _format_of(path)
     if known_as in FILE_PREVIEWERS:

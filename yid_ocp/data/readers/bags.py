@@ -40,7 +40,7 @@ _PLAIN_WORDS = ("pose", "point", "position", "transform", "odom", "wrench", "imu
 
 @dataclass(frozen=True)
 class BagMessage:
-    """One message of a bag: source, time of recording and header stamp [ns], and its contents or where they stand."""
+    """One message of a bag: source (topic), time of recording and header stamp [ns], and decoded content."""
 
     source: str
     logged: int
@@ -60,7 +60,7 @@ _MAX_METADATA_BYTES = 1 << 18  # of a bag's YAML, which is read slowly
 
 
 class OpenBag:
-    """An open ROS 1 bag, ROS 2 bag or MCAP file, with the `reader` of rosbags; `DataError` where it cannot be read."""
+    """An open ROS 1 bag, ROS 2 bag or MCAP file: its topics and the `reader` of rosbags; `DataError` if unreadable."""
 
     def __init__(self, path: Path) -> None:
         highlevel, typesys = (
@@ -94,17 +94,17 @@ class OpenBag:
             raise DataError(what, where=where, allowed=allowed, hint=hint) from error
 
     def topic_names_of_types(self, *kinds: str) -> list[str]:
-        """Names of the topics that have one of the given message types."""
+        """Names of the bag's topics that have one of the given message types."""
         return [topic.name for topic in self.topics if topic.kind in kinds]
 
     def check_topic_is_known(self, name: str, known: Sequence[str], noun: str) -> None:
-        """Raise `DataError` if a topic is not among the known ones."""
+        """Raise `DataError` if the topic `name` is not in `known`; `noun` says what the topic should provide."""
         if name not in known:
             what = f"there are no {noun} on the topic '{name}'"
             raise DataError(what, where=str(self.path), **unknown_name_details(name, known))
 
     def no_usable_topics_error(self, what: str, allowed: str) -> DataError:
-        """The `DataError` to raise for a bag without usable topics; it lists those that the bag holds."""
+        """The `DataError` to raise for a bag without usable topics; it lists the topics that the bag holds."""
         held = ", ".join(f"{topic.name} ({topic.kind})" for topic in self.topics) or "no topics at all"
         return DataError(what, where=str(self.path), allowed=allowed, hint=f"it holds {held}")
 
@@ -112,7 +112,7 @@ class OpenBag:
 def relative_message_time_function(
     messages: Sequence[BagMessage], origins: Sequence[BagMessage] | None = None
 ) -> Callable[[BagMessage], float]:
-    """Function from a message to its time since the first message, or since the first of `origins` [s]."""
+    """Function that returns a message's time [s] since the first of `origins`, or since the first of `messages`."""
     # one message without a stamp makes the two clocks incomparable, so then no stamp is used
     stamped = all(message.stamp > 0 for message in (*messages, *(origins or ())))
     origin = min((message.stamp if stamped else message.logged for message in origins or messages), default=0)
@@ -139,7 +139,7 @@ class _Contents:
 
 @dataclass(frozen=True)
 class BagOptions(base.SelectionAndUnitOptions):
-    """Options of `read_bag`: which topics, joints and points are read, under which names and in which units.
+    """Options of `read_bag`: topics, joints and points to read, their names in the recording, and their units.
 
     Joints are needed where the messages of a topic do not all have the same ones; messages that lack one are skipped.
     Points are named by topic, or by `TOPIC:CHILD` for a frame of `/tf`; all topics of points, poses and transforms

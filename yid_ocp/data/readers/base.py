@@ -24,7 +24,7 @@ _RecordingReader = Callable[..., Recording]
 
 @dataclass(frozen=True)
 class FileDataSourceSummary:
-    """Summary of one data source in a file of another tool: a topic, a column or a marker."""
+    """One data source (topic, column or marker) of a file to import, with sample count, rate and imported name."""
 
     # what the file calls it, and its type
     name: str
@@ -37,7 +37,7 @@ class FileDataSourceSummary:
 
 @dataclass(frozen=True)
 class FilePreview:
-    """Preview of a file of another tool: summaries of its data sources, and the reader options to import it."""
+    """Preview of a file to import: summaries of its data sources, suggested reader options, and notes."""
 
     sources: tuple[FileDataSourceSummary, ...]
     reader_options: Mapping[str, Any] = field(default_factory=dict)  # named options of the reader
@@ -67,7 +67,7 @@ _MAX_PLAUSIBLE_VALUES = {"position": 2.1 * math.pi, "points": 20.0}
 
 
 def parse_quantity_units(words: Iterable[str]) -> dict[str, str]:
-    """Unit of each quantity, from words such as `deg` or, before these, `velocity=rpm`; `DataError` for none or two."""
+    """Unit by quantity, from words such as `deg` or `velocity=rpm`; `DataError` for an unknown or conflicting unit."""
     units, exact = dict[str, str](), dict[str, str]()
     for word in words:
         quantity, equals, unit = word.partition("=")
@@ -110,7 +110,7 @@ def _factors(units: Mapping[str, str], where: str) -> dict[str, float]:
 
 
 def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, str]:
-    """Recorded names to new names, from `name` or `recorded=name`; `DataError` for an empty or a repeated one."""
+    """Recorded to new names, parsed from `name` or `recorded=name`; `DataError` for an empty or repeated name."""
     found: dict[str, str] = {}
     for entry in entries:
         recorded, equals, name = (part.strip() for part in entry.partition("="))
@@ -125,7 +125,7 @@ def parse_renamings(entries: Iterable[str], noun: str, where: str) -> dict[str, 
 
 @dataclass(frozen=True)
 class SelectionAndUnitOptions:
-    """Which joints and points of a file are kept, under which names, and in which units it has them."""
+    """Options shared by readers: joints and points to keep, their new names, and the units of the file."""
 
     joints: Sequence[str] | None = None  # `name` or `recorded=name`, in this order; all of them when absent
     points: Mapping[str, str] | None = None  # recorded name to name; all of them when absent
@@ -137,7 +137,7 @@ class SelectionAndUnitOptions:
 
 
 def convert_to_si_and_validate(raw: Recording, where: str, options: SelectionAndUnitOptions) -> Recording:
-    """Convert a recording as it stands in a file to SI units, select its joints and points, and validate it.
+    """Convert a recording from the units of its file to SI units, select joints and points, and validate the result.
 
     `DataError` for a joint, point, quantity or unit that is not known, a current without torque constants, and as
     `validate_recording`.
@@ -184,7 +184,7 @@ def _check_known(chosen: Iterable[str], known: Sequence[str], noun: str, where: 
 
 
 def check_unique_point_names(chosen: Mapping[str, str], where: str) -> None:
-    """Raise `DataError` if two sources give points of the same name."""
+    """Raise `DataError` if two data sources are mapped to the same point name."""
     names = list(chosen.values())
     shared = [source for source, name in chosen.items() if names.count(name) > 1]
     if shared:
@@ -222,7 +222,7 @@ def _torque_factors(names: Sequence[str], options: SelectionAndUnitOptions, wher
 
 
 def import_optional(module: str, extra: str, what: str, where: Path) -> Any:
-    """A module of an optional dependency; `DataError` with what needs it where it is not installed."""
+    """Import and return a module of an optional dependency; `DataError` with an install hint if it is missing."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -230,13 +230,13 @@ def import_optional(module: str, extra: str, what: str, where: Path) -> Any:
 
 
 def mean_sample_rate(t: Array) -> float:
-    """Mean rate of samples [Hz]; NaN for fewer than two."""
+    """Mean sample rate [Hz] of the times `t` [s]; NaN for fewer than two samples."""
     span = float(t[-1] - t[0]) if len(t) > 1 else 0.0
     return (len(t) - 1) / span if span > 0 else math.nan
 
 
 def guess_units(recording: Recording) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Units guessed from values of a raw recording that cannot be SI, and the reasons in words."""
+    """Guess units of values that cannot be in SI units; return the unit by quantity, and the reasons as sentences."""
     units: dict[str, str] = {}
     notes = []
     joints = recording.joints
@@ -263,7 +263,7 @@ _MAX_INTERPOLATED_PERIODS = 5.0  # of a source, in the longest gap that is inter
 
 
 def merge_on_fastest_clock(groups: Sequence[tuple[str, JointGroup]], where: str) -> tuple[JointGroup, tuple[str, ...]]:
-    """Merge the joints of several named sources onto the clock of the fastest one, and say in words what was done.
+    """Merge joint groups of several named sources on the fastest clock; return the group, and notes on the merge.
 
     Values of the others are interpolated linearly between their samples. A time at which one of them has no sample
     within five of its periods on both sides is left out, so that a gap stays a gap. `DataError` where two sources have

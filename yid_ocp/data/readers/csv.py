@@ -49,7 +49,7 @@ _LISTED = 5  # numbers of bad lines in a note
 
 @dataclass(frozen=True)
 class CsvOptions(base.SelectionAndUnitOptions):
-    """Options of `read_csv`: what the columns of the table mean, and which of them are kept.
+    """Options of `read_csv`: meaning of the table's columns, columns to keep, delimiter, header and clock.
 
     `columns` say what a column means where its name does not: `t`, `channel:joint`, `axis:point`, or `skip`. A `*` in a
     column's name stands for any text, which a `*` in the meaning repeats: `*_pos` is `position:*`.
@@ -70,7 +70,7 @@ _DEFAULTS = CsvOptions()
 
 @base.READERS.register(".csv")
 def read_csv(path: str | os.PathLike[str], options: CsvOptions = _DEFAULTS) -> Recording:
-    """Read a table with one row per time; its points become one group called `points`.
+    """Read a recording from a CSV table with one row per time; its points become one group `points`.
 
     Columns are understood by their names: `t` or `time`; a channel and a joint, `q_<joint>`, `position_<joint>`,
     `velocity_<joint>`, `effort_<joint>` and so on; `q1`, `dq1` and `cmd1` as in telemetry of Isaac Sim's system

@@ -64,7 +64,7 @@ def read_lerobot_episode(
     gears: Mapping[str, float] | None = None,
     description: str = "",
 ) -> Recording:
-    """Read one episode, from zero on, of the folder of a LeRobot dataset.
+    """Read one episode, counted from zero, from the folder of a LeRobot dataset.
 
     `observation.state` is the measured position of the joints, or position, velocity and effort where the names of its
     entries end in `.pos`, `.vel` and `.torque`, `.effort` or `.current`; `action` is the commanded position. Times are

@@ -34,7 +34,7 @@ _PER_JOINT_QUANTITIES = ("bend", "twist", "damping", "twist_damping")
 
 @dataclass(frozen=True, kw_only=True)
 class MountSettings:
-    """Pose of an object's root in a parent frame."""
+    """Settings of an object's mount: parent frame, and position and orientation of the object's root in it."""
 
     parent_frame: Annotated[str | None, OptionInfo("frame or clamp that carries it; the world when absent")] = None
     xyz: Annotated[_Vector3, OptionInfo("position in that frame", "m")] = (0.0, 0.0, 0.0)
@@ -42,13 +42,13 @@ class MountSettings:
 
     @property
     def pose(self) -> Array:
-        """Homogeneous transform of the root in the parent frame, shape (4, 4)."""
+        """Pose of the object's root in the parent frame as a homogeneous matrix, shape (4, 4)."""
         return transform_from_xyz_rpy(self.xyz, self.rpy)
 
 
 @dataclass(frozen=True)
 class ClampPoseDefinition:
-    """How a clamp's pose follows from two measured points: its origin is at one, its z axis points to the other.
+    """Definition of a clamp's pose from two measured points: origin at the first, z axis towards the second.
 
     With `level` the third angle is zero (x axis across world y); with `transported` the clamp never turns about its own
     z axis, from `level` at the first node on.
@@ -62,7 +62,7 @@ class ClampPoseDefinition:
 
 @dataclass(frozen=True)
 class CableTopology:
-    """Vertices and branches of a cable with their undeformed positions; branches by the name of their segment."""
+    """Topology of a branched cable: vertices along the parent and child branches, and their undeformed positions."""
 
     points_along_parent_branch: tuple[str, ...]  # from one clamp to the other; the first two and the last two are held
     points_along_child_branches: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
@@ -90,7 +90,7 @@ class CableTopology:
 
     @property
     def vertices(self) -> tuple[str, ...]:
-        """Names of all vertices, the parent's first."""
+        """Names of all vertices, those of the parent branch first."""
         return (
             *self.points_along_parent_branch,
             *(vertex for chain in self.points_along_child_branches.values() for vertex in chain[1:]),
@@ -98,33 +98,33 @@ class CableTopology:
 
     @property
     def clamped_vertex_names(self) -> tuple[str, ...]:
-        """Names of the four vertices held by the clamps."""
+        """Names of the four clamped vertices, the first and last two of the parent branch."""
         return (*self.points_along_parent_branch[:2], *self.points_along_parent_branch[-2:])
 
     @property
     def free_vertex_names(self) -> tuple[str, ...]:
-        """Names of the vertices that no clamp holds, on which predictions are evaluated."""
+        """Names of the vertices that no clamp holds; predictions are evaluated at them."""
         return tuple(vertex for vertex in self.vertices if vertex not in self.clamped_vertex_names)
 
     @property
     def vertex_names_by_branch(self) -> dict[str, tuple[str, ...]]:
-        """Names of the vertices of every branch, by segment, the parent first."""
+        """Vertex names of every branch by segment name, the parent branch first."""
         return {self.parent_segment: self.points_along_parent_branch, **self.points_along_child_branches}
 
     @property
     def edges(self) -> tuple[tuple[str, str], ...]:
-        """Names of the two vertices of every edge, branch by branch."""
+        """Pairs of vertex names, one for every edge, branch by branch."""
         return tuple(pair for chain in self.vertex_names_by_branch.values() for pair in pairwise(chain))
 
     @property
     def clamp_pose_definitions(self) -> tuple[ClampPoseDefinition, ClampPoseDefinition]:
-        """Points that define the poses of the two clamps, start and end."""
+        """Definitions of the poses of the two clamps, at the start and at the end."""
         a, b, *_, y, z = self.points_along_parent_branch
         start = ClampPoseDefinition(START_CLAMP, a, b, "transported")
         return start, ClampPoseDefinition(END_CLAMP, y, z, "transported")
 
     def undeformed_polyline(self, chain: Sequence[str]) -> Array:
-        """Undeformed positions of some vertices, shape (len(chain), 3) [m]."""
+        """Undeformed positions of the vertices in `chain`, shape (len(chain), 3) [m]."""
         return np.array([self.undeformed_positions[vertex] for vertex in chain], float)
 
 
@@ -133,7 +133,7 @@ class CableTopology:
 
 @dataclass(frozen=True)
 class InitObjectConfiguration:
-    """An object described on the command line of `init`."""
+    """An object from the command line of `init`: its settings, and start values of its free parameters."""
 
     settings: ObjectKind  # without its mount
     start_values: Mapping[str, tuple[float, str]]  # where the search for each free parameter starts, with a comment
@@ -144,7 +144,7 @@ class InitObjectConfiguration:
 
 @dataclass(frozen=True)
 class InitObjectTemplate:
-    """What one word of `init --object` stands for: how the object is built and which numbers it needs.
+    """Template for one word of `init --object`: how the object is built and which numbers it requires.
 
     `build` makes it of what was given by name (flags of `init`, and `--number`) and the number of links per segment;
     `ConfigError` where something is missing.
@@ -158,7 +158,7 @@ class InitObjectTemplate:
 
 
 def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Mapping[str, str]) -> list[float]:
-    """The numbers that an object needs, in the order of `meanings`; `ConfigError` where one is missing."""
+    """The numbers that an object requires, in the order of `meanings`; `ConfigError` if one is missing."""
     for name, meaning in meanings.items():
         if name not in numbers:
             flag, value = (f"--{name}", " NUMBER") if name in SIZE_DESCRIPTIONS else ("--number", f" {name}=NUMBER")
@@ -167,7 +167,7 @@ def required_object_numbers(noun: str, numbers: Mapping[str, Any], meanings: Map
 
 
 def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
-    """Finite numbers in the value of a flag; `ConfigError` where they are not `count`."""
+    """Parse the comma-separated numbers in a flag's value; `ConfigError` unless they are finite and `count` many."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -179,7 +179,7 @@ def comma_separated_numbers(text: str, count: int, flag: str) -> list[float]:
 
 
 def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> dict[str, tuple[float, str]]:
-    """Start values of bending rigidity and damping, as fractions of weight times length squared, with comments."""
+    """Start values (with comment) of each segment's bending rigidity, ratio x weight x length^2, and of its damping."""
     found: dict[str, tuple[float, str]] = {}
     for s in segments:
         bend = rigidity_ratio * s.mass * _STANDARD_GRAVITY * s.length**2
@@ -190,7 +190,7 @@ def bending_start_values(segments: Sequence[Segment], rigidity_ratio: float) -> 
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectKind:
-    """A kind of flexible object, whose fields are its settings; one class in one file, registered in `OBJECT_KINDS`.
+    """Base class of the kinds of flexible objects, registered in `OBJECT_KINDS`; its fields are the object's settings.
 
     A class overrides `kind`, and `build_segments` or `build`, and what else differs; one that is a system of its own is
     a `ClampedObject` as well.
@@ -204,16 +204,16 @@ class ObjectKind:
     kind: Annotated[str, OptionInfo("what the object is")]
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """Segments of the object, parents first; `link_division` divides each link at unchanged stiffness."""
+        """Build the object's segments, parents first; each link is divided into `link_division` at equal stiffness."""
         return []
 
     def build(self, damping: float, link_division: int = 1) -> FlexibleObject:
-        """The flexible object, not yet placed, with each link divided into `link_division` links."""
+        """Build the flexible object, not yet placed, with each link divided into `link_division` links."""
         return flexible_object(self.build_segments(damping, link_division))
 
     @property
     def parent_frame_and_root_pose(self) -> tuple[str | None, Array | None]:
-        """Frame that carries the object's root (the world when None), and the root's pose in it, shape (4, 4)."""
+        """Frame that carries the object's root (None: world), and the root's pose in it, (4, 4) (None: identity)."""
         return None, None
 
     @property
@@ -223,18 +223,18 @@ class ObjectKind:
 
     @property
     def links_per_segment_or_total(self) -> int | None:
-        """Number of links per segment, in total where segments differ; None without divisible links."""
+        """Number of links per segment, or in total if segments differ; None if the object has no such segments."""
         counts = [s.links if s.link_lengths is None else len(s.link_lengths) for s in self.build_segments()]
         return None if not counts else counts[0] if len(set(counts)) == 1 else sum(counts)
 
     def link_division_parameter_factor(self, parameter: str, link_division: int) -> int:
-        """Factor on a per-joint parameter that keeps a segment's stiffness when each link is divided."""
+        """Factor on a per-joint parameter that keeps its segment's stiffness if each link is divided; 1 for others."""
         owner, _, quantity = parameter.rpartition(".")
         per_joint = {segment.name for segment in self.build_segments() if not segment.stiffness_per_curvature}
         return link_division if quantity in _PER_JOINT_QUANTITIES and owner in per_joint else 1
 
     def input_file_paths(self) -> dict[str, str]:
-        """Paths of the files that the object's settings name, by settings key."""
+        """Paths of the input files named in the object's settings, by settings key."""
         own: Any = type(self)
         return {
             key: getattr(self, option.field_name)
@@ -243,28 +243,28 @@ class ObjectKind:
         }
 
     def with_file_names_only(self) -> ObjectKind:
-        """The same object with file names in place of paths, to be compared with that of another run."""
+        """The same object with file names in place of paths, for comparison with another run's object."""
         names = {key: Path(file).name for key, file in self.input_file_paths().items()}
         return replace(self, **names)
 
 
 @runtime_checkable
 class ClampedObject(Protocol):
-    """A kind of object that is a system of its own, held by clamps that follow measured points."""
+    """Interface of objects, such as a cable, that form a whole system with clamps that follow measured points."""
 
     def topology(self) -> CableTopology:
-        """Measured vertices and clamps; `DataError` or `ModelError` where they do not fit together."""
+        """The object's vertices and clamps; `DataError` or `ModelError` if they are inconsistent."""
 
     def clamped_system(self, edge_lengths: Mapping[tuple[str, str], float], gravity: _Vector3) -> System:
-        """The whole system, from its measured edge lengths [m]."""
+        """Build the system of object and clamps from the measured edge lengths [m] and gravity [m/s^2]."""
 
     def recording_parameter_values(self, edge_lengths: Mapping[tuple[str, str], float]) -> dict[str, float]:
-        """Parameter values that one recording's edge lengths [m] give, where not all recordings share them."""
+        """Parameter values by name from one recording's edge lengths [m]; empty if all recordings share the lengths."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MountedObject(ObjectKind):
-    """An object whose root a frame carries."""
+    """Base class of objects whose root is mounted on a frame of a robot or clamp, or in the world."""
 
     gravity_fraction: Annotated[
         float, Ge(0), Le(1), OptionInfo("part of its weight that it has; its inertia is whole")
@@ -287,5 +287,5 @@ OBJECT_KINDS: Registry[type[ObjectKind]] = Registry("kind")
 
 
 def init_object_templates() -> dict[str, InitObjectTemplate]:
-    """Templates of all kinds of objects, by the word of `init --object` that selects them."""
+    """Templates of all object kinds, by their word for `init --object`."""
     return {word: template for kind in OBJECT_KINDS for word, template in OBJECT_KINDS[kind].init_templates.items()}

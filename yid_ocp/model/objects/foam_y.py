@@ -19,7 +19,7 @@ _FOOT_POSE = homogeneous_transform(np.eye(3), (0.85, 0.0, -0.93))  # of the trun
 
 
 def foam_y_segments() -> tuple[Segment, ...]:
-    """Segments of the paper's foam Y: trunk T1, branches T2 (45 degrees towards +y) and T3 (towards -y)."""
+    """Segments of the source paper's foam Y: trunk T1, and branches T2 and T3, 45 degrees towards +y and -y."""
     lean = math.radians(45.0)
     return (
         Segment("T1", 0.813, 0.064, 0.032),
@@ -29,7 +29,7 @@ def foam_y_segments() -> tuple[Segment, ...]:
 
 
 def foam_y_object(links: int = 4, gravity_fraction: float = 1.0) -> FlexibleObject:
-    """The paper's foam Y, its foot at (0.85, 0, -0.93) m; the stiffness per joint is that of four links in any case."""
+    """The source paper's foam Y with its foot at (0.85, 0, -0.93) m; joint stiffnesses do not depend on `links`."""
     segments = [replace(segment, links=links) for segment in foam_y_segments()]
     return flexible_object(segments, _FOOT_POSE, "y_object", gravity_fraction)
 
@@ -44,7 +44,7 @@ def _init_object(numbers: Mapping[str, Any], links: int) -> InitObjectConfigurat
 @OBJECT_KINDS.register("foam_y")
 @dataclass(frozen=True, kw_only=True)
 class FoamY(MountedObject):
-    """The paper's foam letter Y; its foot stands where the paper's does when there is no mount."""
+    """The source paper's foam letter Y; without a mount its foot stands where it does in the paper."""
 
     init_templates: ClassVar[Mapping[str, InitObjectTemplate]] = {"foam_y": InitObjectTemplate(4, _init_object)}
     settings_examples: ClassVar[Mapping[str, str]] = {
@@ -64,7 +64,7 @@ model:
     links: Annotated[int, Ge(1), Le(64), OptionInfo("rigid links of every tube")] = 4
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """The three tubes; the nominal stiffness per joint is that of four links, whatever `links` says."""
+        """Build the three tubes; nominal joint stiffnesses are those for four links, whatever `links` is."""
         n = link_division
         links = self.links * n
         return [

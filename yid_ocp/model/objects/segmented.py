@@ -23,7 +23,7 @@ _BRANCH_SHAPE = "NAME=LENGTH,MASS,RADIUS, or with ROLL,PITCH,YAW; NAME@PARENT gr
 
 @dataclass(frozen=True, kw_only=True)
 class FlexibleSegmentSettings:
-    """One segment (tube, branch or beam) as a chain of rigid links; its stiffness and damping are in `parameters`."""
+    """Settings of one segment (tube, branch, beam) of rigid links; stiffness and damping are set in `parameters`."""
 
     length: Annotated[float | None, Gt(0), Le(50), OptionInfo("length; not needed beside link_lengths", "m")] = None
     mass: Annotated[float, Gt(0), OptionInfo("mass of the whole segment", "kg")]
@@ -52,7 +52,7 @@ class FlexibleSegmentSettings:
     )
 
     def segment(self, name: str, damping: float, link_division: int) -> Segment:
-        """The `Segment` of a given name; `link_division` divides each link at unchanged stiffness of the segment."""
+        """Build the `Segment` with a name; each link is divided into `link_division` at equal segment stiffness."""
         if self.length is None and self.link_lengths is None:
             hint = "set length or link_lengths"
             raise ModelError(f"segment '{name}' has no length", where=f"segments.{name}", hint=hint)

@@ -60,7 +60,7 @@ parameters:
     joint_axes: Annotated[str, OptionInfo("axes of the turns at a joint, base to tip; rigid about the others")] = "xyz"
 
     def build_segments(self, damping: float = 0.0, link_division: int = 1) -> list[Segment]:
-        """The rod as one segment of its base radius; `build` gives its links the taper."""
+        """Build the rod as one segment with the base's radius; `build` then tapers its links."""
         sizes = self.length, self.mass, self.base_radius, self.links * link_division
         rod = Segment(_SEGMENT, *sizes, damping=damping, stiffness_per_curvature=True, clamped_at_base=True)
         return [replace(rod, joint_axes=self.joint_axes)]
