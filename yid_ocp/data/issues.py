@@ -53,7 +53,7 @@ class Issue:
     what: str  # the same in one sentence, with numbers
     # whether a run goes on as it would (and says so), goes on but says of no number that it is found, or stops
     weight: Severity
-    evidence_ratio: float  # what was seen over the limit from which on it counts, 1 to `MAX_EVIDENCE_RATIO`
+    evidence_ratio: float  # observed value over the detection limit, 1 to `MAX_EVIDENCE_RATIO`
     advice: str  # what to do
     # where; empty for all of them
     recording: str

@@ -81,7 +81,7 @@ class ReportedParameter:
 class EffectBase(Effect):
     """Base class of all effects: kind, location and parameters; a subclass overrides methods for what it changes."""
 
-    definitions: tuple[ParameterDefinition, ...] = ()  # those of `parameters`, at this location
+    definitions: tuple[ParameterDefinition, ...] = ()  # definitions of `parameters`, scaled for the location
     arm_joints: tuple[str, ...] = ()  # names of the arm's joints where `location` is an arm
 
     equation: ClassVar[str] = ""  # equation that the kind adds, as text
@@ -143,7 +143,7 @@ class EffectBase(Effect):
 
     @property
     def prior_ranges(self) -> dict[str, tuple[float, float]]:
-        """Expected range (low, high) of every parameter by its name, in the parameter's unit."""
+        """Expected range (low, high) of every parameter, by parameter name, in the parameter's unit."""
         return {f"{self.label}.{q.name}": q.prior_range for q in self.definitions}
 
     def reported_parameters(

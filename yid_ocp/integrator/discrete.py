@@ -86,10 +86,10 @@ class DiscreteEquations:
     z1: ca.SX
     p0: ca.SX
     lam: ca.SX  # multipliers of the step, (m, 1) [N s]
-    u: ca.SX  # motor torques held over the step [N m], or what servos are commanded [rad or m], (nu, 1)
+    u: ca.SX  # motor torques held over the step [N m], or servo commands [rad or m], (nu, 1)
     theta: ca.SX
     time_step: ca.SX  # as recorded [s]
-    h: ca.SX  # in the equations: this times `System.recorded_time_scale`
+    h: ca.SX  # true time step in the equations: `time_step` times `System.recorded_time_scale`
     momentum_balance: ca.SX  # left side of the DEL equation, (n, 1)
     internal_residual: ca.SX  # midpoint equations of the internal coordinates, (nz, 1)
     internal_residual_at_rest: ca.SX
@@ -424,9 +424,9 @@ class NlpStepConstraints:
     u: ca.SX
     theta: ca.SX
     residual: ca.SX  # zero if the step equations hold
-    residual_names: tuple[str, ...]  # of its rows: `del[JOINT]`, `internal[NAME]`, `constraint[GRASP.x]`, `p1[JOINT]`
+    residual_names: tuple[str, ...]  # row names: `del[JOINT]`, `internal[NAME]`, `constraint[GRASP.x]`, `p1[JOINT]`
     residual_jacobians: dict[str, ca.SX]
-    prescribed_effort: ca.SX  # of the prescribed coordinates at the first node [N m]
+    prescribed_effort: ca.SX  # effort of the prescribed coordinates at the first node [N m]
     effort_jacobians: dict[str, ca.SX]
 
     def parameter_jacobians(self, names: Sequence[str]) -> tuple[ca.SX, ca.SX]:

@@ -26,9 +26,9 @@ class Equilibrium:
     """A static equilibrium: state, holding torque, constraint reactions, derivatives and convergence."""
 
     state: Array  # (q, p, z), (nx,); p is half a step's pull of the constraints, so that the next step stays at rest
-    holding_torque: Array  # of the motors that hold the posture [N m], or command of its servos [rad or m], (nu,)
+    holding_torque: Array  # motor torque that holds the configuration [N m], or servo command [rad or m], (nu,)
     constraint_reactions: Array  # (m,) [N or N m]
-    state_by_theta: Array  # by the parameters asked for, (nx, len(names))
+    state_by_theta: Array  # derivative with respect to the named parameters, (nx, len(names))
     state_by_known_coordinates: Array  # driven, then prescribed, (nx, nk)
     state_by_torque: Array  # as measured, (nx, nu)
     is_converged: bool

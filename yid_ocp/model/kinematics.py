@@ -21,7 +21,7 @@ class Kinematics:
     """Poses and screws of all joints of a mechanism at a configuration, as symbolic expressions."""
 
     mechanism: Mechanism
-    joint_rotations: tuple[ca.SX, ...]  # of each joint's moving frame, to the world, each (3, 3)
+    joint_rotations: tuple[ca.SX, ...]  # from each joint's moving frame to the world, each (3, 3)
     joint_origins: tuple[ca.SX, ...]  # each (3, 1) [m]
     joint_screws: tuple[ca.SX, ...]  # S_j, the spatial velocity per unit rate of joint j, each (6, 1)
 

@@ -78,8 +78,8 @@ class Joint:
 
     name: str
     kind: Literal["revolute", "prismatic"]
-    parent_index: int  # of the parent joint, -1 for the world
-    placement: Placement  # from the parent's joint frame to this joint's frame at zero
+    parent_index: int  # index of the parent joint, -1 for the world
+    placement: Placement  # pose of this joint's frame at coordinate zero in the parent's joint frame
     axis: tuple[float, float, float]  # unit vector in the joint frame
     bodies: tuple[Inertia, ...] = ()
     lower_limit: float = -math.inf  # [rad or m]

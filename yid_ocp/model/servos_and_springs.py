@@ -178,8 +178,8 @@ class PositionServo:
     command_interpolation: _CommandInterpolation = "held"
     motor_kind: _MotorKind = "ideal"
     integral: ca.SX = field(default_factory=lambda: ca.SX(0))  # [1/s], in a system times z [rad or m]
-    derivative: ca.SX = field(default_factory=lambda: ca.SX(0))  # of a dc motor's firmware [N m s/rad]
-    dead_band: ca.SX = field(default_factory=lambda: ca.SX(0))  # either way [rad or m]
+    derivative: ca.SX = field(default_factory=lambda: ca.SX(0))  # derivative gain of a dc motor's firmware [N m s/rad]
+    dead_band: ca.SX = field(default_factory=lambda: ca.SX(0))  # half width [rad or m]
     current_limit_tightness: ca.SX = field(default_factory=lambda: ca.SX(0))  # [A^-p]
     torque_constant: float | None = None  # published one of a dc motor [N m/A]
 

@@ -103,7 +103,7 @@ class MidpointState:
     v: ca.SX  # (q_{k+1} - q_k)/h, shape (n, 1)
     z: ca.SX  # shape (nz, 1)
     z_rate: ca.SX  # shape (nz, 1)
-    u: ca.SX  # motor torques held over the step [N m], or what servos are commanded [rad or m], shape (nu, 1)
+    u: ca.SX  # motor torques held over the step [N m], or servo commands [rad or m], shape (nu, 1)
     constraint_force: ca.SX  # lam_k/h, shape (m, 1) [N or N m]
     internal_rows: Mapping[str, int]  # row of each internal coordinate in z, by name
     h: ca.SX  # length of the step [s]

@@ -54,7 +54,7 @@ class EpisodePrediction:
 
     rollout: Rollout
     equilibrium: Equilibrium | None
-    predicted_outputs: tuple[Array, ...]  # of every sample, in the sensor's unit, (M, k) each
+    predicted_outputs: tuple[Array, ...]  # predictions of every sample, in the sensor's unit, (M, k) per sensor
     output_sensitivities: tuple[Array, ...] | None  # (M, k, d) each
     equilibrium_guess: Array | None = None  # configuration at `equilibrium`, for similar parameters, (n,)
     # what the tracking filter adds to the recorded torque where encoders are measurements, (N, nu) [N m]
@@ -75,7 +75,7 @@ class InitialState:
     """Initial state of a rollout with its derivative and equilibrium, and a message if it was not found."""
 
     state: Array  # (q, p, z), (nx,)
-    state_sensitivity: Array  # by (wanted parameters, offset of the start), (nx, d)
+    state_sensitivity: Array  # with respect to (wanted parameters, state offset), (nx, d)
     equilibrium: Equilibrium | None
     failure_message: str
 
@@ -93,9 +93,9 @@ class InputErrorModel:
     The torque is off by w in a step and by b throughout [N m], the angles by v [rad].
     """
 
-    torque_std: Array  # of w, (nu,)
-    torque_bias_std: Array  # of b, (nu,)
-    angle_std: Array  # of v, (nu,)
+    torque_std: Array  # standard deviation of w, (nu,)
+    torque_bias_std: Array  # standard deviation of b, (nu,)
+    angle_std: Array  # standard deviation of v, (nu,)
     sample_of_step: IntArray  # recorded sample that each step's torque comes from: w is the same in all its steps, (N,)
     encoder_noise_steps: float  # number of steps that share one encoder sample's noise through interpolation
     has_encoder_measurements: bool
@@ -182,17 +182,17 @@ class Episode:
 
     recording: Recording
     grid: TimeGrid
-    torque: Array  # of motors, or what servos are commanded, (N, nu) [N m, rad or m]
+    torque: Array  # motor torques [N m], or servo commands [rad or m], (N, nu)
     prescribed_path: Array  # (N + 1, nc)
     initial_known_coordinates: Array  # driven, then prescribed, at node 0, (nk,)
-    measured_driven_angles: Array  # of the driven joints at every node, (N + 1, nu)
+    measured_driven_angles: Array  # measured angles of the driven joints at every node, (N + 1, nu)
     measurements: tuple[Measurements, ...]
     # recorded effort of driven, then prescribed joints, where their true angle depends on it, (N + 1, nk) [N m]
     joint_loads: Array
     # the measured ones, smooth enough to be differenced; as measured where no filter needs them, (N + 1, nu)
     smoothed_driven_angles: Array
     tracking_feedback: TrackingFeedback | None = None  # of the driven joints, its gains of the nominal parameters
-    known_parameters: Mapping[str, float] = field(default_factory=dict)  # those that differ among recordings
+    known_parameters: Mapping[str, float] = field(default_factory=dict)  # values that differ among recordings
     input_errors: InputErrorModel | None = None  # of the torques and angles that drive the rollout
     fixed_initial_state: FixedInitialState | None = None  # given or fitted to points; else it is an equilibrium
     # index of the estimation episode whose initial state this held-out part of the same recording shares

@@ -276,7 +276,7 @@ class EstimationProblem(ReprMixin):
     def cost_and_gradient(
         self, x: ArrayLike, evaluation: Evaluation | None = None, equilibrium_guesses: EquilibriumGuesses | None = None
     ) -> tuple[float, Array, Evaluation]:
-        """Return the cost, its gradient and the evaluation; by the adjoint, or with process noise by sensitivities.
+        """Return cost, gradient and evaluation; the gradient is by adjoint, with process noise by sensitivities.
 
         An `evaluation` at `x` that is known already saves the rollout, most of the work; it is returned, without a
         Jacobian.

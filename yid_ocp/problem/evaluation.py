@@ -45,7 +45,7 @@ class ResidualWhitener(Protocol):
 class ResidualVectorLayout:
     """Slices of the residual vector: measurements of all episodes, then stated priors, then weak priors."""
 
-    measurements: tuple[tuple[slice, ...], ...]  # of every episode, of every group in it
+    measurements: tuple[tuple[slice, ...], ...]  # slices by episode and sensor group
     data: slice
     stated_priors: slice
     weak_priors: slice

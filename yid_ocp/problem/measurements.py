@@ -45,7 +45,7 @@ class TimeGrid:
 
 
 def make_time_grid(recording: Recording, time_step: float, duration: float | None = None) -> TimeGrid:
-    """Time grid that covers the recording's joint samples, or its first group of points where it has no joints.
+    """Time grid that covers a recording's joint samples, or without joints its first point group.
 
     `DataError` where it is shorter than two steps, longer than `_MAX_STEPS`, or has too few samples for its length.
     """
@@ -82,7 +82,7 @@ class Measurements:
 
     sensor: Sensor
     node: IntArray  # before each sample, (M,), or (M, k) where outputs are late by different times
-    fraction: Array  # of a step beyond it, shape of `node`; predictions are interpolated linearly between two nodes
+    fraction: Array  # fraction of a step after `node`; predictions are interpolated linearly between nodes
     value: Array  # measured outputs, NaN where there is none, (M, k)
     weight: Array  # factor that turns a difference into a residual, zero where there is no measurement, (M, k)
     std: Array  # standard deviation of the noise, in the sensor's unit; NaN where it is not known, (M, k)

@@ -30,14 +30,14 @@ class CorrectedInputs:
     """Inputs of a rollout corrected by effects, with derivatives (..., d) along d parameters (None: zero)."""
 
     torque: Array  # (N, nu) [N m]
-    first_torque: Array  # of the initial equilibrium, (nu,) [N m]
+    first_torque: Array  # torque of the initial equilibrium, (nu,) [N m]
     prescribed_path: Array  # (N + 1, nc)
-    driven_angles: Array  # of the driven joints, (N + 1, nu) [rad]
+    driven_angles: Array  # angles of the driven joints at every node, (N + 1, nu) [rad]
     torque_sensitivity: Array | None = None
     first_torque_sensitivity: Array | None = None
     prescribed_path_sensitivity: Array | None = None
     driven_angles_sensitivity: Array | None = None
-    momentum_shift: Array | None = None  # what effects add to the driven joints along their measured motion, (N, nu)
+    momentum_shift: Array | None = None  # momentum that effects add to driven joints in the measured motion, (N, nu)
     momentum_shift_sensitivity: Array | None = None  # by the initial state's unknowns too, where they are asked for
 
     @property

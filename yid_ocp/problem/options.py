@@ -43,7 +43,7 @@ class MultivariateGaussianPrior:
 
 @dataclass(frozen=True)
 class ProblemOptions:
-    """Settings of an estimation problem besides model and data: initial states, feedback, weighting, priors, ...
+    """Settings of an estimation problem besides model and data: initial states, tracking filter, weighting, priors, ...
 
     Attributes
     ----------

@@ -192,7 +192,7 @@ def denoised_gear_loads(measured: Array, own: Array, nodes: IntArray, times: Arr
 
 
 def recorded_sensor_kinds(recordings: Sequence[Recording]) -> frozenset[str]:
-    """Kinds of signals in the recordings, as in `effects.signal_kinds_required_by_any_effect`.
+    """Kinds of signals, such as `joints.effort`, that recordings contain and effects can require.
 
     Each sensor mounted on a frame is one of its own, such as `wrist:FRAME`.
     """

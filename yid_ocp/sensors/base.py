@@ -210,7 +210,7 @@ class Sensor(ABC):
     Channels are named `group.point` (three outputs each) or `group.quantity.JOINT` (one output each).
     """
 
-    channel: ClassVar[ChannelKind]  # what a recording holds of it
+    channel: ClassVar[ChannelKind]  # kind of its recorded channels
     group_name: str  # key of its settings: a group of points, such as `points_camera`, or `joints.effort`
     # what a trivial prediction without a model is: zero, or the first measured value
     naive_prediction: ClassVar[Literal["zero", "stays"]] = "stays"
@@ -235,7 +235,7 @@ class Sensor(ABC):
 
     @property
     def output_names(self) -> tuple[str, ...]:
-        """Name of each scalar output: the channel's name, followed by the component if a channel has several."""
+        """Name of each scalar output: the channel's name, followed by the component's name if there are several."""
         parts = [f".{part}" for part in self.channel.components] or [""]
         return tuple(f"{name}{part}" for name in self.channel_names for part in parts)
 
@@ -320,11 +320,11 @@ class SensorDataInputs:
 
     system: System
     recording: _RecordingData
-    sensor_usage: Callable[[str], SensorOptions]  # by the key of a sensor's settings
-    node_times: Array  # of the rollout, shape (N + 1,) [s]
+    sensor_usage: Callable[[str], SensorOptions]  # sensor's options by settings key
+    node_times: Array  # times of the rollout's nodes, shape (N + 1,) [s]
     time_step: float  # between them [s]
-    effort_filter: _SmoothingFilter  # of efforts of prescribed joints
-    path_filter: _SmoothingFilter  # of the motion of prescribed joints
+    effort_filter: _SmoothingFilter  # filter of prescribed joints' efforts
+    path_filter: _SmoothingFilter  # filter of prescribed joints' motion
     joint_mass_matrices: Callable[[tuple[str, ...], Array], Array]
 
 
@@ -337,8 +337,8 @@ class SensorData:
     value: Array  # outputs in the sensor's unit, NaN where there is none, shape (M, k)
     std: Array  # standard deviations of their noise, shape (M, k)
     predictable_nodes: tuple[int, int] | None = None  # the first and the last one; all when absent
-    bias_std: Array | None = None  # of an error of every output that is constant in one recording, shape (k,)
-    noise_correlation: Array | None = None  # of the outputs of one sample, shape (M, k, k)
+    bias_std: Array | None = None  # std of every output's constant error in the recording, shape (k,)
+    noise_correlation: Array | None = None  # correlation of the outputs' noise in a sample, (M, k, k)
 
 
 SENSOR_READERS: Registry[Callable[[SensorDataInputs], list[SensorData]]] = Registry("kind of sensor")

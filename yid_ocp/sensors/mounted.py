@@ -30,8 +30,8 @@ class MountedSensor(Sensor):
     has_paper_weight = False
     point_names = ()
     names: tuple[str, ...]  # recorded ones of the sensors
-    signs: tuple[float, ...]  # of each, 1 or -1: whether it reads the opposite
-    frame_names: tuple[str, ...]  # of the model, one for each
+    signs: tuple[float, ...]  # sign of each sensor's reading, 1 or -1
+    frame_names: tuple[str, ...]  # the model's frame that each sensor is mounted on
     group_name: str
 
     @property

@@ -31,8 +31,8 @@ class FileDataSourceSummary:
     kind: str
     n_samples: int  # messages or values
     mean_rate: float  # mean rate [Hz]; NaN where it has none
-    imported_as: str = ""  # What an import makes of it, empty where it is left out
-    note: str = ""  # Why it is left out, or what should be looked at
+    imported_as: str = ""  # what the import makes of the source; empty if it is left out
+    note: str = ""  # why the source is left out, or what to check
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class FilePreview:
 
     sources: tuple[FileDataSourceSummary, ...]
     reader_options: Mapping[str, Any] = field(default_factory=dict)  # named options of the reader
-    notes: tuple[str, ...] = ()  # what else should be known, such as guesses of units
+    notes: tuple[str, ...] = ()  # remarks for the user, such as guesses of units
 
 
 READERS: Registry[_RecordingReader] = Registry("recording format")
@@ -129,7 +129,7 @@ class SelectionAndUnitOptions:
 
     joints: Sequence[str] | None = None  # `name` or `recorded=name`, in this order; all of them when absent
     points: Mapping[str, str] | None = None  # recorded name to name; all of them when absent
-    units: Mapping[str, str] | None = None  # of `t`, a joint channel or `points`, where it is not SI
+    units: Mapping[str, str] | None = None  # unit of `t`, a joint channel or `points`, if not SI
     # where `effort` is a motor's current, by joint or pattern: torque per current [N m/A], and turns of the motor per
     # turn of the joint (1 where a joint has none)
     torque_constants: Mapping[str, float] | None = None

@@ -64,9 +64,9 @@ class ClampPoseDefinition:
 class CableTopology:
     """Topology of a branched cable: vertices along the parent and child branches, and their undeformed positions."""
 
-    points_along_parent_branch: tuple[str, ...]  # from one clamp to the other; the first two and the last two are held
+    points_along_parent_branch: tuple[str, ...]  # from clamp to clamp; the clamps hold the first and last two vertices
     points_along_child_branches: Mapping[str, tuple[str, ...]]  # the first is the parent's where the child leaves
-    undeformed_positions: Mapping[str, ArrayLike]  # of every vertex at rest without load, in any frame, shape (3,) [m]
+    undeformed_positions: Mapping[str, ArrayLike]  # position of every unloaded vertex, in any frame, shape (3,) [m]
     parent_segment: str = "parent"
 
     def __post_init__(self) -> None:
