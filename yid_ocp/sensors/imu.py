@@ -5,8 +5,8 @@ from __future__ import annotations
 import casadi as ca
 
 from yid_ocp.model.system import NodeState
-from yid_ocp.sensors.base import CHANNEL_KINDS, SENSOR_READERS, ChannelKind, SensorData, SensorDataInputs
-from yid_ocp.sensors.mounted import MountedSensor, read_mounted_sensors
+from yid_ocp.sensors.base import CHANNEL_KINDS, ChannelKind
+from yid_ocp.sensors.mounted import MountedSensor, register_mounted_sensor
 
 _XYZ = ("x", "y", "z")
 _ANGULAR_VELOCITY = CHANNEL_KINDS.register("imu.angular_velocity")(
@@ -15,6 +15,7 @@ _ANGULAR_VELOCITY = CHANNEL_KINDS.register("imu.angular_velocity")(
 _SPECIFIC_FORCE = CHANNEL_KINDS.register("imu.specific_force")(ChannelKind("imu", "specific_force", "m/s^2", _XYZ))
 
 
+@register_mounted_sensor
 class _Gyroscope(MountedSensor):
     """Angular velocity of a frame against the world."""
 
@@ -25,6 +26,7 @@ class _Gyroscope(MountedSensor):
         return kinematics.frame_pose(frame).rotation.T @ (kinematics.angular_jacobian(frame) @ state.v)
 
 
+@register_mounted_sensor
 class _Accelerometer(MountedSensor):
     """Acceleration of a frame's origin minus gravity: 9.81 m/s^2 upwards at rest."""
 
@@ -35,13 +37,3 @@ class _Accelerometer(MountedSensor):
         jacobian = kinematics.position_jacobian(frame)
         acceleration = jacobian @ state.a + ca.jtimes(jacobian @ state.v, state.q, state.v)
         return kinematics.frame_pose(frame).rotation.T @ (acceleration - state.system.gravity)
-
-
-@SENSOR_READERS.register("imu.angular_velocity")
-def _read_angular_velocities(around: SensorDataInputs) -> list[SensorData]:
-    return read_mounted_sensors(around, _Gyroscope)
-
-
-@SENSOR_READERS.register("imu.specific_force")
-def _read_specific_forces(around: SensorDataInputs) -> list[SensorData]:
-    return read_mounted_sensors(around, _Accelerometer)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import partial
+from typing import ClassVar, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -12,6 +13,7 @@ from yid_ocp.arrays import Array
 from yid_ocp.errors import DataError, nearest_name_hint
 from yid_ocp.model.system import NodeState
 from yid_ocp.sensors.base import (
+    SENSOR_READERS,
     RecordedChannelGroup,
     Sensor,
     SensorData,
@@ -20,6 +22,8 @@ from yid_ocp.sensors.base import (
     sensor_reading_function,
 )
 from yid_ocp.sensors.joints import JOINT_POSITION_GROUP_NAME, smoothed_node_values
+
+_Kind = TypeVar("_Kind", bound="MountedSensor")
 
 
 @dataclass(frozen=True)
@@ -47,8 +51,13 @@ class MountedSensor(Sensor):
         raise NotImplementedError
 
 
-def read_mounted_sensors(around: SensorDataInputs, kind: type[MountedSensor]) -> list[SensorData]:
-    """Read the measurements of one kind of mounted sensor from a recording, one `SensorData` per recorded group."""
+def register_mounted_sensor(kind: type[_Kind]) -> type[_Kind]:
+    """Register the reader of a kind of mounted sensor under its channel: one `SensorData` per recorded group."""
+    SENSOR_READERS.register(f"{kind.channel.group}.{kind.channel.quantity}")(partial(_read_sensors, kind=kind))
+    return kind
+
+
+def _read_sensors(around: SensorDataInputs, kind: type[MountedSensor]) -> list[SensorData]:
     channel, found = kind.channel, []
     for group in around.recording.channel_groups:
         key = f"{group.name}.{channel.quantity}"

@@ -17,8 +17,8 @@ import casadi as ca
 from yid_ocp.model.kinematics import forward_kinematics, rigid_body_lagrangian_derivatives
 from yid_ocp.model.mechanism import Inertia, Placement
 from yid_ocp.model.system import MidpointState, NodeState, System, floating_clamp
-from yid_ocp.sensors.base import CHANNEL_KINDS, SENSOR_READERS, ChannelKind, SensorData, SensorDataInputs
-from yid_ocp.sensors.mounted import MountedSensor, read_mounted_sensors
+from yid_ocp.sensors.base import CHANNEL_KINDS, ChannelKind
+from yid_ocp.sensors.mounted import MountedSensor, register_mounted_sensor
 
 _XYZ, _SIGN = ("x", "y", "z"), {"sign": "1"}
 _FORCE = CHANNEL_KINDS.register("wrist.force")(ChannelKind("wrist", "force", "N", _XYZ, _SIGN))
@@ -26,6 +26,7 @@ _TORQUE = CHANNEL_KINDS.register("wrist.torque")(ChannelKind("wrist", "torque", 
 _N_LOCKED_JOINTS = 6
 
 
+@register_mounted_sensor
 class _WristForceSensor(MountedSensor):
     """Force on the sensor."""
 
@@ -35,6 +36,7 @@ class _WristForceSensor(MountedSensor):
         return _wrench_on_sensor(state, frame)[:3]
 
 
+@register_mounted_sensor
 class _WristTorqueSensor(MountedSensor):
     """Torque on the sensor about its frame's origin."""
 
@@ -42,16 +44,6 @@ class _WristTorqueSensor(MountedSensor):
 
     def _frame_reading(self, state: NodeState, frame: str) -> ca.SX:
         return _wrench_on_sensor(state, frame)[3:]
-
-
-@SENSOR_READERS.register("wrist.force")
-def _read_wrist_forces(around: SensorDataInputs) -> list[SensorData]:
-    return read_mounted_sensors(around, _WristForceSensor)
-
-
-@SENSOR_READERS.register("wrist.torque")
-def _read_wrist_torques(around: SensorDataInputs) -> list[SensorData]:
-    return read_mounted_sensors(around, _WristTorqueSensor)
 
 
 def _wrench_on_sensor(state: NodeState, frame: str) -> ca.SX:
